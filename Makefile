@@ -1,0 +1,38 @@
+# Two commands: `make train` and `make test`. Both install everything they need into .venv first.
+PYTHON ?= python3
+VENV ?= .venv
+RUN ?= runs/train
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: train test lint clean
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$(PYTHON) is older than 3.11: call make with PYTHON=python3.11 (or newer)"; exit 1; }
+	@$(PYTHON) -m ensurepip --version >/dev/null 2>&1 || \
+		{ echo "$(PYTHON) cannot make virtual environments; on Debian or Ubuntu run: apt-get install -y python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# jax[cuda13] is added where nvidia-smi answers.
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@if nvidia-smi -L >/dev/null 2>&1; then extra=cuda; else extra=; fi; \
+		$(PIP) install --quiet -c constraints.txt -e ".$${extra:+[$$extra]}"
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(PIP) install --quiet -c constraints.txt -e ".[dev,ros]"
+	@touch $@
+
+train: $(VENV)/.installed
+	$(BIN)/python -m whill_mjx.train --out $(RUN)
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -q
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy whill_mjx sysid dreamer bridge benchmarks
+
+clean:
+	rm -rf $(VENV)

@@ -1,0 +1,1 @@
+"""One script per claim; each writes benchmarks/results/<name>.json."""

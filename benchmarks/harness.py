@@ -1,0 +1,89 @@
+"""Timing and result files shared by the benchmarks."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def device_name() -> str:
+    """The accelerator as the runtime reports it, or "cpu, CORES cores, MODEL"."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return str(device.device_kind)
+    model = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    return f"cpu, {len(os.sched_getaffinity(0))} cores, {model}"
+
+
+def time_calls(call: Callable[[], Any], repeats: int = 5, warm_up: int = 1) -> list[float]:
+    """Seconds of each of `repeats` calls, after `warm_up` untimed ones; every call is waited for."""
+    for _ in range(warm_up):
+        jax.block_until_ready(call())
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def figure(repeats: list[float], unit: str, device: str | None = None) -> dict[str, Any]:
+    """One entry of "figures": the median of `repeats` and the repeats themselves."""
+    value = statistics.median(repeats)
+    return {"value": value, "unit": unit, "device": device or device_name(), "repeats": list(repeats)}
+
+
+def record(stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS) -> Path:
+    """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{stem}.json"
+    old = json.loads(path.read_text()) if path.exists() else {}
+    versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
+    stamp = {"command": " ".join(["python", "-m", _module_name(), *sys.argv[1:]]), "versions": versions,
+             "commit": _commit(), "date": datetime.date.today().isoformat()}
+    merged = {**old.get("figures", {}), **{name: {**value, **stamp} for name, value in figures.items()}}
+    content = {"claim": claim, **stamp, "figures": merged}
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content, indent=1) + "\n")
+    os.replace(temporary, path)
+    return path
+
+
+def _module_name() -> str:
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return spec.name if spec else Path(sys.argv[0]).name
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "absent"
+
+
+def _commit() -> str:
+    if "COMMIT" in os.environ:  # for machines that hold the tree without its history
+        return os.environ["COMMIT"]
+    answer = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent)
+    return answer.stdout.strip() if answer.returncode == 0 else "unknown"

@@ -1,0 +1,1 @@
+"""DreamerV3, trained wholly on the device."""

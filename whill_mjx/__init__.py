@@ -1,0 +1,1 @@
+"""Batched simulator of micromobility vehicles on MuJoCo MJX."""
