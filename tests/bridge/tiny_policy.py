@@ -1,0 +1,73 @@
+"""A hand-made policy file for the bridge's tests: no JAX, no exporter.
+
+Action: v = mean brightness in [-1, 1]; omega = mean red minus mean blue. The state counts the steps and keeps the last
+action.
+"""
+
+import hashlib
+import json
+
+import numpy as np
+
+LOW, HIGH = [0.0, -0.6], [0.3, 0.6]
+
+
+def build_onnx(size=64, poison=False):
+    """Return the network's bytes. With `poison`, its state becomes infinite although the action stays finite."""
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    def constant(name, values):
+        return numpy_helper.from_array(np.asarray(values, np.float32), name)
+
+    node = helper.make_node
+    nodes = [
+        node("Cast", ["image"], ["x"], to=TensorProto.FLOAT),
+        node("Reshape", ["x", "flat"], ["pixels"]),
+        node("ReduceMean", ["pixels", "axis"], ["mean"], keepdims=1),
+        node("Div", ["mean", "scale"], ["unit"]),
+        node("MatMul", ["unit", "mix"], ["mixed"]),
+        node("Reshape", ["mixed", "two"], ["pair"]),
+        node("Add", ["pair", "shift"], ["action"]),
+        node("Add", ["carry_count", "one"], ["next_count"]),
+        node("Identity", ["action"], ["next_last"]),
+    ]
+    initializers = [
+        numpy_helper.from_array(np.array([-1, 3]), "flat"), numpy_helper.from_array(np.array([0]), "axis"),
+        numpy_helper.from_array(np.array([2]), "two"), constant("scale", 255.0),
+        constant("mix", [[2 / 3, 1.0], [2 / 3, 0.0], [2 / 3, -1.0]]), constant("shift", [-1.0, 0.0]),
+        constant("one", [np.inf if poison else 1.0]),
+    ]
+
+    def value(name, shape, kind=TensorProto.FLOAT):
+        return helper.make_tensor_value_info(name, kind, shape)
+
+    image = value("image", [size, size, 3], TensorProto.UINT8)
+    graph = helper.make_graph(nodes, "tiny", [image, value("carry_count", [1]), value("carry_last", [2])],
+                              [value("action", [2]), value("next_count", [1]), value("next_last", [2])], initializers)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    checker.check_model(model)
+    return model.SerializeToString()
+
+
+def write(path, size=64, poison=False, **changes):
+    """Write the policy folder and return it; `changes` replace top-level fields of policy.json."""
+    path.mkdir(parents=True)
+    (path / "policy.onnx").write_bytes(build_onnx(size, poison))
+    np.savez(path / "weights.npz", mix=np.zeros(3))
+    hashes = {name: hashlib.sha256((path / name).read_bytes()).hexdigest() for name in ("policy.onnx", "weights.npz")}
+    table = {
+        "schema": 1, "kind": "micromobility-policy",
+        "image": {"height": size, "width": size, "channels": 3, "encoding": "rgb8"},
+        "action": {"names": ["v", "omega"], "units": ["m/s", "rad/s"], "low": LOW, "high": HIGH},
+        "rate_hz": 10, "action_repeat": 1,
+        "carry": [{"name": "count", "shape": [1], "dtype": "float32"},
+                  {"name": "last", "shape": [2], "dtype": "float32"}],
+        "onnx": {"opset": 18, "inputs": ["image", "carry_count", "carry_last"],
+                 "outputs": ["action", "next_count", "next_last"]},
+        "camera": {}, "task": "test", "vehicle_sha256": "",
+        "files": hashes,
+        "created": "2026-01-01T00:00:00+00:00", "parity": {"steps": 0, "max_abs_action_difference": 0.0},
+        **changes,
+    }
+    (path / "policy.json").write_text(json.dumps(table))
+    return path
