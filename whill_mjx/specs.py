@@ -1,8 +1,8 @@
 """Measured constants of the vehicles, each with its source.
 
-Lengths in m, masses in kg, speeds in m/s and rad/s. The chassis frame (the paper's model origin) lies midway between the
-axles at wheel-centre height: x forward, y left, z up. It is not the rear axle: the paper's centre of mass at x = -0.265 m
-would lie behind that axle and tip the chair.
+Lengths in m, masses in kg, speeds in m/s and rad/s. The chassis frame (the paper's model origin) lies at the middle of the
+overall length, at wheel-centre height: x forward, y left, z up. It is not the rear axle: the paper's centre of mass at
+x = -0.265 m would lie behind that axle and tip the chair.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ class VehicleSpec:
     """"differential" (one driven axle, free front wheels) or "skid" (all wheels driven per side)."""
     driven_axle: str = "rear"
     """"rear" or "front": where the driven wheels, and so the reference point, are (differential drive only)."""
+    rear_axle_x: float | None = None
+    """Position of the rear axle in the chassis frame [m]; None puts the origin midway between the axles."""
     wheel_inertia: float = 0.02
     """Spin inertia of the driven wheels of one side, motor included [kg m^2]."""
     body_length: float = 0.985
@@ -63,18 +65,29 @@ class VehicleSpec:
             raise ValueError(f"vehicle {self.name!r}: driven_axle is {self.driven_axle!r}; use 'rear' or 'front'.")
 
     @property
+    def rear_x(self) -> float:
+        """Position of the rear axle in the chassis frame [m]."""
+        return -self.wheelbase / 2 if self.rear_axle_x is None else self.rear_axle_x
+
+    @property
+    def front_x(self) -> float:
+        """Position of the front axle in the chassis frame [m]."""
+        return self.rear_x + self.wheelbase
+
+    @property
     def reference_x(self) -> float:
         """Position of the reference point (driven-axle centre; vehicle centre for skid drive) in the chassis frame [m]."""
         if self.drive == "skid":
-            return 0.0
-        return -self.wheelbase / 2 if self.driven_axle == "rear" else self.wheelbase / 2
+            return (self.rear_x + self.front_x) / 2
+        return self.rear_x if self.driven_axle == "rear" else self.front_x
 
 
 # Wheel radius and track: WHILL/ros_whill WHILL.h (0.1325, 0.496). Wheelbase: modelc.xacro (0.60, crude model).
 # Mass with battery about 52 kg and the overall size: recalled from the maker's sheet, not verified; fit or weigh.
+# Rear axle 0.36 m behind the middle of the overall length: an assumption (0.13 m of the chair lie behind the axle).
 # Limits: the paper's +-1 m/s and +-1 rad/s; the vehicle itself accepts -0.556 to 1.667 m/s and +-1.68 rad/s.
 WHILL_CR = VehicleSpec(
-    name="whill_cr", wheel_radius=0.1325, track=0.496, wheelbase=0.60, mass=52.0,
+    name="whill_cr", wheel_radius=0.1325, track=0.496, wheelbase=0.60, mass=52.0, rear_axle_x=-0.36,
     body_length=0.985, body_width=0.554, body_height=0.9,
 )
 # Clearpath Husky A200: radius and track from its run configuration (0.165, 0.55); 50 kg and 0.99 x 0.67 m from the data sheet.

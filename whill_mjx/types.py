@@ -2,9 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known of a parameter before any data: its unit, the range a fit may search, and where it has no effect."""
+
+    unit: str
+    low: float
+    high: float
+    neutral: float
+    description: str = ""
+
+
+def parameter(unit: str, low: float, high: float, neutral: float, description: str = "") -> Any:
+    """Field of a pytree of parameters: a scalar leaf with its `Parameter` beside it; the default is the neutral value."""
+    return struct.field(default=neutral, metadata={"parameter": Parameter(unit, low, high, neutral, description)})
+
+
+def parameters_of(holder: Any) -> dict[str, Parameter]:
+    """The parameters of an effect or a `Body` by field name."""
+    return {field.name: field.metadata["parameter"] for field in fields(holder) if "parameter" in field.metadata}
 
 
 @struct.dataclass
@@ -14,26 +38,37 @@ class Geometry:
     contact_x: jax.Array  # (4,) rear left, rear right, front left, front right
     contact_y: jax.Array  # (4,)
     wheel_radius: jax.Array  # (2,) driven left, right
+    driven: jax.Array  # (4,) 1 where the contact's wheel is driven, 0 where it rolls freely
+
+
+@struct.dataclass
+class World:
+    """Surroundings as the effects of place `world` leave them."""
+
+    geometry: Geometry
+    gravity: jax.Array  # (3,) world frame [m/s^2]
+    wind: jax.Array  # (3,) world frame [m/s]
 
 
 @struct.dataclass
 class Motion:
     """What an effect may look at: the present motion of one instance in the chassis frame."""
 
-    geometry: Geometry
+    world: World
     mass: jax.Array  # () kg
+    heading: jax.Array  # () rad
+    ground_axes: jax.Array  # (3, 3) rows: forward along the ground, left along the ground, ground normal; chassis frame
     rotation: jax.Array  # (3, 3) chassis to world
-    position: jax.Array  # (3,) chassis origin in the world [m]
     velocity: jax.Array  # (3,) of the chassis origin, chassis frame [m/s]
     angular_velocity: jax.Array  # (3,) chassis frame [rad/s]
     contact_vx: jax.Array  # (4,) forward speed of the chassis at the contact patches [m/s]
     contact_vy: jax.Array  # (4,) leftward speed at the contact patches [m/s]
     normal_force: jax.Array  # (4,) suspension force at the contact patches [N]
     spin: jax.Array  # (2,) speed of the driven wheels, left and right [rad/s]
-    wheel_speed: jax.Array  # (4,) forward speed of the wheel at each contact, spin * radius where driven [m/s]
-    ground_contact: jax.Array  # (4,) 1 where the wheel is driven, 0 where it rolls freely
-    gravity: jax.Array  # (3,) world frame [m/s^2]
-    wind: jax.Array  # (3,) world frame [m/s]
+    drive_torque: jax.Array  # (2,) motor torque on the driven wheels [N m]; zero for the paper's drive
+    wheel_inertia: jax.Array  # () spin inertia of the driven wheels of one side [kg m^2]
+    wheel_radius: float = struct.field(pytree_node=False)  # nominal [m]
+    track: float = struct.field(pytree_node=False)  # nominal [m]
     dt: float = struct.field(pytree_node=False)  # physics step [s]
 
 
@@ -85,17 +120,20 @@ class VehicleState:
     qpos: jax.Array  # (9,) position, quaternion, wheel angles left and right
     qvel: jax.Array  # (8,) velocity (world), angular velocity (chassis), wheel speeds
     memory: tuple  # one entry per effect
-    odometry: Odometry
+    encoder: Odometry  # integrated from the wheel speeds with nominal radius and track
+    odometry: Odometry  # the same after the sensing effects: what the vehicle reports
     diverged: jax.Array  # () bool: the state became non-finite at some time
 
 
 @struct.dataclass
 class Body:
-    """Mass and geometry of one instance; scale factors are relative to the spec's nominal values."""
+    """Mass distribution of one instance, wheels included."""
 
-    mass: jax.Array  # () kg
-    yaw_inertia: jax.Array  # () about the centre of mass [kg m^2]
-    com: jax.Array  # (3,) centre of mass from the chassis origin [m]
+    mass: jax.Array = parameter("kg", 1.0, 1000.0, 0.0, "total mass, rider and load included")
+    yaw_inertia: jax.Array = parameter("kg m^2", 0.001, 1000.0, 0.0, "about the centre of mass")
+    com_x: jax.Array = parameter("m", -0.3, 0.3, 0.0, "centre of mass ahead of the chassis origin")
+    com_y: jax.Array = parameter("m", -0.1, 0.1, 0.0, "centre of mass to the left of the chassis origin")
+    com_z: jax.Array = parameter("m", -0.2, 0.6, 0.0, "centre of mass above the chassis origin")
 
 
 @struct.dataclass

@@ -1,0 +1,98 @@
+"""What an effect is, and how a tuple of effects acts together.
+
+An effect is a frozen pytree whose leaves are its own parameters. It acts at one place, and has one method named after it:
+
+    command(memory, command (2,), motion)   -> memory, command     delay, dead zone, limiter
+    actuation(memory, Drive, motion)        -> memory, Drive       controller, lag, saturation
+    force(memory, motion)                   -> memory, Wrench      friction, slip, drag
+    world(memory, World)                    -> memory, World       slope, wind, true geometry
+    sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
+
+Effects of one place act in the order of the tuple; forces add up. At its neutral values an effect vanishes exactly.
+`init()` gives the memory it starts with.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.types import Motion, Wrench
+
+PLACES = ("command", "actuation", "force", "world", "sensing")
+
+
+class Effect:
+    """Base of all effects: no memory unless `init` says so."""
+
+    name: str = ""
+
+    def init(self) -> Any:
+        """Memory at the start of a drive."""
+        return ()
+
+
+def place_of(effect: Effect) -> str:
+    """The one place where `effect` acts; TypeError if it has none or several."""
+    places = [place for place in PLACES if hasattr(effect, place)]
+    if len(places) != 1:
+        raise TypeError(f"effect {type(effect).__name__} acts at {places}; an effect has exactly one of {PLACES}.")
+    return places[0]
+
+
+def apply_chain(effects: tuple, memory: tuple, place: str, value: Any, *context: Any) -> tuple[tuple, Any]:
+    """Pass `value` through every effect of `place` in order; returns the new memory and value."""
+    memory_list = list(memory)
+    for index, effect in enumerate(effects):
+        if place_of(effect) == place:
+            memory_list[index], value = getattr(effect, place)(memory_list[index], value, *context)
+    return tuple(memory_list), value
+
+
+def sum_forces(effects: tuple, memory: tuple, motion: Motion) -> tuple[tuple, Wrench]:
+    """Sum of the wrenches of all effects of place `force`, and the new memory."""
+    memory_list = list(memory)
+    total = Wrench.zero()
+    for index, effect in enumerate(effects):
+        if place_of(effect) == "force":
+            memory_list[index], wrench = effect.force(memory_list[index], motion)
+            total = total + wrench
+    return tuple(memory_list), total
+
+
+def contact_wrench(motion: Motion, forward: jax.Array, left: jax.Array, normal: jax.Array | float = 0.0) -> Wrench:
+    """Wrench of forces (4,) [N] at the contact patches, along the ground axes forward, left and normal."""
+    geometry = motion.world.geometry
+    axes = motion.ground_axes
+    normal = jnp.broadcast_to(normal, (4,))
+    fx, fy, fz = (forward * axes[0, i] + left * axes[1, i] + normal * axes[2, i] for i in range(3))  # each (4,)
+    x, y, z = geometry.contact_x, geometry.contact_y, -motion.wheel_radius
+    return Wrench(
+        fx.sum(), fy.sum(), fz.sum(),
+        (y * fz - z * fy).sum(), (z * fx - x * fz).sum(), (x * fy - y * fx).sum(),
+        jnp.zeros(2),
+    )  # fmt: skip
+
+
+def per_side(values: jax.Array) -> jax.Array:
+    """Sums (2,) over the left and the right contacts of values (4,)."""
+    return jnp.stack([values[0] + values[2], values[1] + values[3]])
+
+
+def to_contacts(values: jax.Array) -> jax.Array:
+    """Values (2,) of the left and right side at each of the four contacts (4,)."""
+    return jnp.stack([values[0], values[1], values[0], values[1]])
+
+
+def driven_mean(motion: Motion, values: jax.Array) -> jax.Array:
+    """Mean (2,) over the driven contacts of each side of values (4,)."""
+    driven = motion.world.geometry.driven
+    return per_side(values * driven) / per_side(driven)
+
+
+def side_forces(motion: Motion, force: jax.Array) -> jax.Array:
+    """Forces (4,) at the contacts for the drive force (2,) of each side, shared by the driven contacts."""
+    driven = motion.world.geometry.driven
+    return to_contacts(force) * driven / (driven.sum() / 2)

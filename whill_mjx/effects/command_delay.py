@@ -1,0 +1,46 @@
+"""Transport delay of commands."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, parameter
+
+SLOTS = 8  # changes of the command that may be under way at once; older ones are taken as arrived
+
+
+@struct.dataclass
+class CommandMemory:
+    """The latest changes of the command, newest first."""
+
+    value: jax.Array  # (SLOTS, 2) the command after the change
+    age: jax.Array  # (SLOTS,) time since it was sent [s]
+
+
+@struct.dataclass
+class CommandDelay(Effect):
+    """A command acts `delay` after it is sent: u(t) = u_sent(t - delay).
+
+    Changes are kept with their age, so any delay is possible and the derivative with respect to it is defined: within one
+    physics step before its time a change is blended in linearly.
+    """
+
+    name = "command_delay"
+    delay: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time from sending a command to its effect")
+
+    def init(self) -> CommandMemory:
+        return CommandMemory(jnp.zeros((SLOTS, 2)), jnp.full(SLOTS, 1e3))
+
+    def command(self, memory: CommandMemory, command: jax.Array, motion: Motion) -> tuple[CommandMemory, jax.Array]:
+        """Delayed command (2,)."""
+        changed = (command != memory.value[0]).any()
+        value = jnp.where(changed, jnp.concatenate([command[None], memory.value[:-1]]), memory.value)
+        age = jnp.where(changed, jnp.concatenate([jnp.zeros(1), memory.age[:-1]]), memory.age)
+        arrived = jnp.clip((age - self.delay) / motion.dt + 1.0, 0.0, 1.0)
+        delayed = value[-1]
+        for slot in range(SLOTS - 2, -1, -1):  # from the oldest change to the newest
+            delayed = delayed + arrived[slot] * (value[slot] - delayed)
+        return CommandMemory(value, age + motion.dt), delayed

@@ -1,0 +1,30 @@
+"""Low-pass of the reported speeds."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, Odometry, parameter
+
+
+@struct.dataclass
+class OdometryLag(Effect):
+    """First-order low-pass of the reported v and omega; the pose, from encoder counts, is not filtered.
+
+    Source: the maker's driver documentation (motor speed is low-pass filtered; use angle and counter instead).
+    """
+
+    name = "odometry_lag"
+    time_constant: jax.Array = parameter("s", 0.0, 0.3, 0.0, "time constant of the low-pass")
+
+    def init(self) -> jax.Array:
+        return jnp.zeros(2)  # filtered v and omega
+
+    def sensing(self, memory: jax.Array, reading: Odometry, motion: Motion) -> tuple[jax.Array, Odometry]:
+        """Reading with filtered v and omega."""
+        raw = jnp.stack([reading.v, reading.omega])
+        filtered = raw + (memory - raw) * self.time_constant / (self.time_constant + motion.dt)
+        return filtered, reading.replace(v=filtered[0], omega=filtered[1])

@@ -1,0 +1,62 @@
+"""The paper's drive: a PID per wheel gives an acceleration, mapped to a force on the chassis."""
+
+from __future__ import annotations
+
+import jax
+from flax import struct
+
+from whill_mjx.control import PidMemory, pid, pid_memory
+from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.types import Drive, Motion, Wrench, parameter
+
+
+@struct.dataclass
+class PidDrive(Effect):
+    """F = m/2 PID(v_target - v_wheel) on each side, the mass being shared equally. Source: reference paper, Table II."""
+
+    name = "pid_drive"
+    kp: jax.Array = parameter("1/s", 0.5, 60.0, 0.0, "proportional gain")
+    ki: jax.Array = parameter("1/s^2", 0.0, 20.0, 0.0, "integral gain")
+    kd: jax.Array = parameter("-", 0.0, 0.9, 0.0, "derivative gain")
+    integral_limit: jax.Array = parameter("m", 0.0, 3.0, 0.0, "anti-windup limit of the integral")
+
+    def init(self) -> PidMemory:
+        return pid_memory()
+
+    def actuation(self, memory: PidMemory, drive: Drive, motion: Motion) -> tuple[PidMemory, Drive]:
+        """Adds the force (2,) of each side [N]."""
+        speed = motion.spin * motion.wheel_radius
+        memory, acceleration = pid(
+            self.kp, self.ki, self.kd, self.integral_limit, memory, drive.target, speed, motion.dt
+        )
+        return memory, drive.replace(force=drive.force + motion.mass / 2 * acceleration)
+
+
+@struct.dataclass
+class ForwardSlip(Effect):
+    """Traction that reaches the ground: F -> eta F. Source: reference paper, Table II (forward slip multiplier)."""
+
+    name = "forward_slip"
+    eta: jax.Array = parameter("-", 0.3, 1.2, 1.0, "forward slip multiplier")
+
+    def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
+        """Scales the force (2,) of each side."""
+        return memory, drive.replace(force=self.eta * drive.force)
+
+
+@struct.dataclass
+class RollingContact(Effect):
+    """Driven wheels roll without slip: the torque that makes their speed that of the ground after one step.
+
+    The paper's model has no wheel-spin state; with this effect its wheels follow the body, one physics step late.
+    `grip` = 0 is neutral (the wheels are left alone), 1 is rolling without slip.
+    """
+
+    name = "rolling_contact"
+    grip: jax.Array = parameter("-", 0.0, 1.0, 0.0, "share of the speed difference removed in one step")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench with a torque on the driven wheels only."""
+        ground_speed = driven_mean(motion, motion.contact_vx) / motion.world.geometry.wheel_radius
+        torque = self.grip * motion.wheel_inertia * (ground_speed - motion.spin) / motion.dt
+        return memory, Wrench.zero().replace(spin_torque=torque)

@@ -1,0 +1,25 @@
+"""Rolling resistance."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect, contact_wrench
+from whill_mjx.types import Motion, Wrench, parameter
+
+REST_SPEED = 0.02  # [m/s], smooths the change of sign at rest
+
+
+@struct.dataclass
+class RollingResistance(Effect):
+    """F = -mu_r N tanh(v / v0) at each contact, smooth at rest. Source: reference paper, Table II."""
+
+    name = "rolling_resistance"
+    mu_r: jax.Array = parameter("-", 0.0, 0.08, 0.0, "rolling resistance coefficient")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench of the losses at the four contacts."""
+        loss = -self.mu_r * motion.normal_force * jnp.tanh(motion.contact_vx / REST_SPEED)
+        return memory, contact_wrench(motion, loss, jnp.zeros(4))

@@ -1,0 +1,44 @@
+"""Friction-limited slip between wheels and ground."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect, contact_wrench, per_side, to_contacts
+from whill_mjx.types import Motion, Wrench, parameter
+
+
+@struct.dataclass
+class SlipTraction(Effect):
+    """Slip force of driven wheels, on a friction circle: F = mu N s / sqrt(|s|^2 + s0^2), s the sliding velocity.
+
+    s = (r spin - v_x, -v_y) at each driven contact; s0 is the sliding speed at which the force has 1/sqrt(2) of its limit. The
+    wheel gets the reaction -r F_x. The stiff wheel speed is advanced implicitly: F_x is taken at the speed the wheel will
+    have after the step, so that any s0 is stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
+    """
+
+    name = "slip_traction"
+    mu: jax.Array = parameter("-", 0.05, 1.5, 0.0, "friction coefficient of driven wheels")
+    slip_speed: jax.Array = parameter("m/s", 0.01, 0.5, 0.05, "sliding speed of half grip, s0")
+    mu_free: jax.Array = parameter("-", 0.0, 1.0, 0.0, "sideways friction coefficient of passive wheels")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench of the slip forces, and their reaction on the driven wheels."""
+        geometry = motion.world.geometry
+        radius = geometry.wheel_radius  # (2,)
+        slide_x = to_contacts(radius * motion.spin) - motion.contact_vx
+        slide_y = -motion.contact_vy
+        grip = self.mu * motion.normal_force * geometry.driven
+        speed = jnp.sqrt(slide_x**2 + slide_y**2 + self.slip_speed**2)
+        stiffness = grip / speed  # [N s/m]
+        # Implicit step of the spin: I (w' - w) / dt = T - r C (r w' - v_x), C held.
+        total, carried = per_side(stiffness), per_side(stiffness * motion.contact_vx)
+        relaxation = motion.dt / motion.wheel_inertia
+        spin = (motion.spin + relaxation * (motion.drive_torque + radius * carried)) / (1 + relaxation * radius**2 * total)
+        forward = stiffness * (to_contacts(radius * spin) - motion.contact_vx)
+        free = self.mu_free * motion.normal_force * (1 - geometry.driven)
+        left = stiffness * slide_y + free * slide_y / jnp.sqrt(slide_y**2 + self.slip_speed**2)
+        wrench = contact_wrench(motion, forward, left)
+        return memory, wrench.replace(spin_torque=-radius * per_side(forward))

@@ -1,0 +1,31 @@
+"""The physical drive: torque control of each wheel's speed."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Drive, Motion, parameter
+
+
+@struct.dataclass
+class TorqueDrive(Effect):
+    """T = clip(kp e + ki integral of e, +-limit) with e = v_target / r - spin; the integral stops in saturation."""
+
+    name = "torque_drive"
+    kp: jax.Array = parameter("N m s/rad", 0.1, 200.0, 0.0, "proportional gain")
+    ki: jax.Array = parameter("N m/rad", 0.0, 500.0, 0.0, "integral gain")
+    limit: jax.Array = parameter("N m", 1.0, 2000.0, float("inf"), "largest torque of one side")
+
+    def init(self) -> jax.Array:
+        return jnp.zeros(2)  # integral of the speed error [rad]
+
+    def actuation(self, memory: jax.Array, drive: Drive, motion: Motion) -> tuple[jax.Array, Drive]:
+        """Adds the motor torque (2,) [N m]."""
+        error = drive.target / motion.wheel_radius - motion.spin
+        wanted = self.kp * error + self.ki * memory
+        torque = jnp.clip(wanted, -self.limit, self.limit)
+        free = (jnp.abs(wanted) < self.limit) | (wanted * error < 0)  # integrate only where it does not wind up
+        return memory + jnp.where(free, error, 0.0) * motion.dt, drive.replace(torque=drive.torque + torque)

@@ -1,0 +1,25 @@
+"""Scrub of wide contact patches."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, Wrench, parameter
+
+REST_RATE = 0.05  # [rad/s], smooths the change of sign at rest
+
+
+@struct.dataclass
+class YawScrub(Effect):
+    """Torque against turning: T_z = -T_s tanh(omega / omega_0). Typical 2 to 15 N m for a powered chair (estimate)."""
+
+    name = "yaw_scrub"
+    torque: jax.Array = parameter("N m", 0.0, 200.0, 0.0, "scrub torque")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench with a yaw torque only."""
+        yaw_rate = (motion.ground_axes[2] * motion.angular_velocity).sum()
+        return memory, Wrench.zero().replace(tz=-self.torque * jnp.tanh(yaw_rate / REST_RATE))

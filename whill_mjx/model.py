@@ -1,0 +1,66 @@
+"""Builds the MuJoCo model of a vehicle once and keeps what compiled code needs of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from whill_mjx.config import VehicleConfig
+from whill_mjx.specs import VehicleSpec
+
+ASSET = Path(__file__).parent / "assets" / "whill_cr.xml"
+CHASSIS = 1  # body ids, in the order of the asset
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleModel:
+    """Static part of a vehicle: spec, time steps and the MuJoCo model. Closed over by compiled functions."""
+
+    spec: VehicleSpec
+    config: VehicleConfig
+    mujoco: mujoco.MjModel
+    """The model for C MuJoCo, with nominal mass."""
+    mjx: Any
+    """The same for MJX (mjx.Model)."""
+    data: Any
+    """An mjx.Data of the right shapes; only qpos, qvel and qfrc_applied of it are ever set."""
+
+
+def mujoco_model(spec: VehicleSpec, config: VehicleConfig | None = None) -> mujoco.MjModel:
+    """C MuJoCo model of `spec`: the asset with the spec's geometry and mass put in."""
+    config = config or VehicleConfig()
+    editable = mujoco.MjSpec.from_file(str(ASSET))
+    editable.modelname = spec.name
+    editable.option.timestep = config.physics_dt
+    chassis = editable.body("chassis")
+    chassis.pos = [0.0, 0.0, spec.wheel_radius]
+    chassis.mass = spec.mass
+    chassis.inertia = list(box_inertia(spec))
+    for name, side in (("left_wheel", 1.0), ("right_wheel", -1.0)):
+        editable.body(name).pos = [spec.reference_x, side * spec.track / 2, 0.0]
+        editable.joint(name).armature = spec.wheel_inertia
+    return editable.compile()
+
+
+def box_inertia(spec: VehicleSpec) -> tuple[float, float, float]:
+    """Roll, pitch and yaw inertia of a uniform box of the vehicle's mass and size [kg m^2]: a first guess."""
+    length, width, height = spec.body_length, spec.body_width, spec.body_height
+    squares = np.array([width**2 + height**2, length**2 + height**2, length**2 + width**2])
+    roll, pitch, yaw = spec.mass / 12.0 * squares
+    return float(roll), float(pitch), float(yaw)
+
+
+@lru_cache(maxsize=16)
+def build_model(spec: VehicleSpec, config: VehicleConfig | None = None) -> VehicleModel:
+    """The static model of `spec`; built once per (spec, config)."""
+    from mujoco import mjx  # prints to stdout when imported, so only on demand
+
+    config = config or VehicleConfig()
+    host = mujoco_model(spec, config)
+    device = mjx.put_model(host)
+    return VehicleModel(spec, config, host, device, mjx.make_data(device))

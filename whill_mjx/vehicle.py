@@ -1,0 +1,229 @@
+"""One vehicle through time: command -> drive -> forces -> rigid bodies (`mjx.step`) -> odometry."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.effects.base import (
+    apply_chain,
+    contact_wrench,
+    side_forces,
+    sum_forces,
+)
+from whill_mjx.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
+from whill_mjx.model import VehicleModel, box_inertia
+from whill_mjx.types import Drive, Geometry, Motion, Odometry, VehicleParams, VehicleState, World, Wrench
+
+STATIC_SAG = 0.005  # [m] suspension and tyre compression under the static load
+DAMPING_RATIO = 0.5  # [-] of the suspension
+SMOOTH_LOAD = 0.04  # share of the static load over which a contact loses it smoothly when it lifts
+GRAVITY = 9.81  # [m/s^2]
+
+
+def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
+    """Advance one instance by one physics step.
+
+    Args:
+        model: static model.
+        params: physical parameters of this instance.
+        state: from `place` or the previous step.
+        command: (2,) v [m/s] and omega [rad/s] in force during this step.
+
+    Returns:
+        The next state. A non-finite result is replaced by the previous state and flagged `diverged`.
+    """
+    memory, force, motion = forces(model, params, state, command)
+    qpos, qvel = integrate(model, params, motion.world, state, force)
+    healthy = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
+    qpos, qvel = jnp.where(healthy, qpos, state.qpos), jnp.where(healthy, qvel, state.qvel)
+    encoder = advance_odometry(state.encoder, qvel[6:8], model)
+    memory, reading = apply_chain(params.effects, memory, "sensing", encoder, motion)
+    return VehicleState(qpos, qvel, memory, encoder, reading, state.diverged | ~healthy)
+
+
+def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
+    """Advance one instance by one control period with one command (2,) held."""
+
+    def body(state: VehicleState, _: None) -> tuple[VehicleState, None]:
+        return substep(model, params, state, command), None
+
+    return jax.lax.scan(body, state, None, length=model.config.substeps)[0]
+
+
+def forces(
+    model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array
+) -> tuple[tuple, jax.Array, Motion]:
+    """All forces on one instance at its present state.
+
+    Returns:
+        New memory of the effects; the generalised force (8,) as MuJoCo's qfrc_applied; the motion it was computed from.
+    """
+    effects = params.effects
+    memory, world = apply_chain(effects, state.memory, "world", nominal_world(model))
+    motion = measure(model, params, world, state)
+    memory, command = apply_chain(effects, memory, "command", command, motion)
+    target = wheel_speeds(command, model.spec.track)
+    memory, signal = apply_chain(effects, memory, "actuation", _no_drive(target), motion)
+    motion = dataclasses.replace(motion, drive_torque=signal.torque)
+    memory, wrench = sum_forces(effects, memory, motion)
+    wrench = wrench + contact_wrench(motion, side_forces(motion, signal.force), jnp.zeros(4), motion.normal_force)
+    return memory, generalised_force(motion, wrench), motion
+
+
+def integrate(
+    model: VehicleModel, params: VehicleParams, world: World, state: VehicleState, force: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """qpos (9,) and qvel (8,) after one `mjx.step` under the generalised force (8,)."""
+    from mujoco import mjx
+
+    data = model.data.replace(qpos=state.qpos, qvel=state.qvel, qfrc_applied=force)
+    data = mjx.step(instance_model(model, params, world), data)
+    return data.qpos, data.qvel
+
+
+def instance_model(model: VehicleModel, params: VehicleParams, world: World):
+    """The mjx.Model with this instance's mass distribution and gravity."""
+    body = params.body
+    roll, pitch, _ = box_inertia(model.spec)
+    scale = body.mass / model.spec.mass
+    inertia = jnp.stack([roll * scale, pitch * scale, body.yaw_inertia])
+    com = jnp.stack([body.com_x, body.com_y, body.com_z])
+    nominal = model.mjx
+    return nominal.replace(
+        body_mass=jnp.concatenate([nominal.body_mass[:1], body.mass[None], nominal.body_mass[2:]]),
+        body_inertia=jnp.concatenate([nominal.body_inertia[:1], inertia[None], nominal.body_inertia[2:]]),
+        body_ipos=jnp.concatenate([nominal.body_ipos[:1], com[None], nominal.body_ipos[2:]]),
+        opt=nominal.opt.replace(gravity=world.gravity),
+    )
+
+
+def nominal_world(model: VehicleModel) -> World:
+    """Level ground, no wind, and the spec's geometry."""
+    spec = model.spec
+    rear, front, half_track = spec.rear_x, spec.front_x, spec.track / 2
+    if spec.drive == "skid":
+        driven = (1.0, 1.0, 1.0, 1.0)
+    else:
+        driven = (1.0, 1.0, 0.0, 0.0) if spec.driven_axle == "rear" else (0.0, 0.0, 1.0, 1.0)
+    geometry = Geometry(
+        contact_x=jnp.array([rear, rear, front, front]),
+        contact_y=jnp.array([half_track, -half_track, half_track, -half_track]),
+        wheel_radius=jnp.full(2, spec.wheel_radius),
+        driven=jnp.array(driven),
+    )
+    return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3))
+
+
+def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
+    """The present motion in the chassis frame, with the suspension's forces. The ground is the plane z = 0."""
+    spec = model.spec
+    geometry = world.geometry
+    rotation = rotation_from_quaternion(state.qpos[3:7])
+    velocity = rotation.T @ state.qvel[:3]
+    rate = state.qvel[3:6]
+    normal = rotation[2]  # world z in the chassis frame
+    forward = jnp.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    forward = forward / jnp.sqrt((forward * forward).sum())
+    left = jnp.cross(normal, forward)
+
+    x, y, z = geometry.contact_x, geometry.contact_y, -spec.wheel_radius
+    point_velocity = (
+        velocity[0] + rate[1] * z - rate[2] * y,
+        velocity[1] + rate[2] * x - rate[0] * z,
+        velocity[2] + rate[0] * y - rate[1] * x,
+    )  # each (4,), chassis frame
+
+    def along(axis: jax.Array) -> jax.Array:
+        return sum(axis[i] * point_velocity[i] for i in range(3))
+
+    height = state.qpos[2] + normal[0] * x + normal[1] * y  # of the wheel centres [m]
+    stiffness, damping = suspension(params.body.mass)
+    smooth = SMOOTH_LOAD * params.body.mass * GRAVITY / 4  # [N]
+    load = stiffness * (spec.wheel_radius - height) - damping * along(normal)
+    return Motion(
+        world=world,
+        mass=params.body.mass,
+        heading=heading(rotation),
+        ground_axes=jnp.stack([forward, left, normal]),
+        rotation=rotation,
+        velocity=velocity,
+        angular_velocity=rate,
+        contact_vx=along(forward),
+        contact_vy=along(left),
+        normal_force=smooth * jax.nn.softplus(load / smooth),
+        spin=state.qvel[6:8],
+        drive_torque=jnp.zeros(2),
+        wheel_inertia=jnp.asarray(spec.wheel_inertia),
+        wheel_radius=spec.wheel_radius,
+        track=spec.track,
+        dt=model.config.physics_dt,
+    )
+
+
+def suspension(mass: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Stiffness [N/m] and damping [N s/m] of each of the four contacts: STATIC_SAG under a quarter of the weight."""
+    stiffness = mass * GRAVITY / (4 * STATIC_SAG)
+    return stiffness, 2 * DAMPING_RATIO * jnp.sqrt(stiffness * mass / 4)
+
+
+def generalised_force(motion: Motion, wrench: Wrench) -> jax.Array:
+    """qfrc_applied (8,): force in the world frame, torque about the origin in the chassis frame, wheel torques."""
+    force = motion.rotation @ jnp.stack([wrench.fx, wrench.fy, wrench.fz])
+    torque = jnp.stack([wrench.tx, wrench.ty, wrench.tz])
+    return jnp.concatenate([force, torque, motion.drive_torque + wrench.spin_torque])
+
+
+def advance_odometry(odometry: Odometry, spin: jax.Array, model: VehicleModel) -> Odometry:
+    """Wheel odometry one physics step on, from wheel speeds (2,) [rad/s], with nominal radius and track."""
+    radius, track, dt = model.spec.wheel_radius, model.spec.track, model.config.physics_dt
+    v = radius * (spin[0] + spin[1]) / 2
+    omega = radius * (spin[1] - spin[0]) / track
+    middle = odometry.yaw + omega * dt / 2
+    return Odometry(
+        x=odometry.x + v * jnp.cos(middle) * dt,
+        y=odometry.y + v * jnp.sin(middle) * dt,
+        yaw=odometry.yaw + omega * dt,
+        v=v,
+        omega=omega,
+    )
+
+
+def place(
+    model: VehicleModel,
+    params: VehicleParams,
+    x: jax.Array | float,
+    y: jax.Array | float,
+    yaw: jax.Array | float,
+    v: jax.Array | float = 0.0,
+    omega: jax.Array | float = 0.0,
+) -> VehicleState:
+    """State with the reference point at (x, y) [m], heading yaw [rad] and twist (v [m/s], omega [rad/s]).
+
+    The chassis rests on its suspension: it tilts towards its centre of mass (small angles), and the wheels roll.
+    """
+    spec, body = model.spec, params.body
+    middle = (spec.rear_x + spec.front_x) / 2  # of the four contacts
+    pitch = 4 * STATIC_SAG * (body.com_x - middle) / spec.wheelbase**2
+    roll = -4 * STATIC_SAG * body.com_y / spec.track**2
+    height = spec.wheel_radius - STATIC_SAG + pitch * middle
+    x, y, yaw, v, omega = (jnp.asarray(value, dtype=body.mass.dtype) for value in (x, y, yaw, v, omega))
+    forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+    # The origin lies reference_x behind (or ahead of) the reference point, which moves with v along the heading.
+    origin = jnp.stack([x, y]) - forward * spec.reference_x
+    sideways = -omega * spec.reference_x  # speed of the origin to the left
+    velocity = v * forward + sideways * jnp.stack([-forward[1], forward[0]])
+    qpos = jnp.concatenate([origin, height * jnp.ones(1), quaternion_from_angles(roll, pitch, yaw), jnp.zeros(2)])
+    spin = wheel_speeds(jnp.stack([v, omega]), spec.track) / spec.wheel_radius
+    zero = jnp.zeros_like(v)
+    qvel = jnp.concatenate([velocity, jnp.stack([zero, zero, zero, omega]), spin])
+    odometry = Odometry(zero, zero, zero, v, omega)
+    memory = tuple(effect.init() for effect in params.effects)
+    return VehicleState(qpos, qvel, memory, odometry, odometry, jnp.zeros((), bool))
+
+
+def _no_drive(target: jax.Array) -> Drive:
+    """Signal at the head of the actuation chain."""
+    return Drive(target=target, force=jnp.zeros(2), torque=jnp.zeros(2))
