@@ -1,0 +1,204 @@
+"""Checkpoints of a run: written whole or not at all, checked on reading, the last two kept.
+
+    FOLDER/<env_steps>/state      arrays, by orbax
+                       meta.json  configuration, counters, and length and checksum of every file
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer.config import DreamerConfig
+
+KEEP = 2
+SCHEMA = 1
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used."""
+
+
+Rows = tuple[str, int, int]
+
+
+def save(
+    folder: Path, state: Any, config: DreamerConfig, env_steps: int, wall_s: float = 0.0, rows: Rows | None = None
+) -> Path:
+    """Write a checkpoint and return its path; older ones beyond the last two are removed afterwards.
+
+    Args:
+        folder: of all checkpoints.
+        state: pytree of arrays; typed random keys are allowed.
+        config: saved beside it and compared on reading.
+        env_steps: names the checkpoint.
+        wall_s: time trained so far [s].
+        rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
+            used ones, so that a replay that is not full costs no more than it holds.
+    """
+    import orbax.checkpoint as ocp
+
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
+    target = folder / f"{env_steps:012d}"
+    try:
+        arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
+        with ocp.PyTreeCheckpointer() as writer:
+            writer.save((temporary / "state").resolve(), {k: v for k, v in arrays.items() if v.size})
+        meta = {
+            "schema": SCHEMA,
+            "env_steps": env_steps,
+            "wall_s": wall_s,
+            "config": dataclasses.asdict(config),
+            "files": {name: _fingerprint(temporary / name) for name in _files(temporary)},
+        }
+        (temporary / "meta.json").write_text(json.dumps(meta, indent=1))
+        if target.exists():
+            shutil.rmtree(target)
+        os.replace(temporary, target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    for old in complete(folder)[:-KEEP]:
+        shutil.rmtree(old, ignore_errors=True)
+    return target
+
+
+def complete(folder: Path) -> list[Path]:
+    """Checkpoints in `folder`, oldest first."""
+    return sorted(path for path in folder.glob("[0-9]*") if (path / "meta.json").is_file())
+
+
+def remove(path: Path) -> None:
+    """Delete one checkpoint."""
+    shutil.rmtree(path)
+
+
+def restore(folder: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]] | None:
+    """State and meta.json of the newest usable checkpoint, or None where there is none at all.
+
+    A damaged checkpoint is passed over with a warning if an older one is whole.
+
+    Args:
+        folder: of all checkpoints.
+        template: a state of the wanted structure; gives shapes, dtypes and what is not stored.
+        config: must equal the saved one.
+
+    Raises:
+        CheckpointError: no usable one, or one of another configuration; names the file, the rule and the remedy.
+    """
+    paths = complete(folder)
+    for path in reversed(paths):
+        try:
+            return load(path, template, config)
+        except Damaged as error:
+            if path == paths[0]:
+                raise CheckpointError(str(error)) from error
+            warnings.warn(f"{error} Going on from the one before it.", stacklevel=2)
+    return None
+
+
+class Damaged(CheckpointError):
+    """A checkpoint whose files are not what was written."""
+
+
+def load(path: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]]:
+    """Read one checkpoint. Arguments and errors as for `restore`."""
+    import orbax.checkpoint as ocp
+
+    meta = _read_meta(path)
+    _check_config(path, meta["config"], config)
+    for name, expected in meta["files"].items():
+        if not (path / name).is_file() or _fingerprint(path / name) != expected:
+            raise Damaged(
+                f"{path / name}: length or checksum is not what was written, so the file is damaged. "
+                f"Delete {path} and resume from an older checkpoint, or start in a new folder."
+            )
+    with ocp.PyTreeCheckpointer() as reader:
+        arrays = reader.restore((path / "state").resolve())
+    leaves = {name: _from_numpy(path, name, leaf, arrays) for name, leaf in _named_leaves(template).items()}
+    return jax.tree.unflatten(jax.tree.structure(template), list(leaves.values())), meta
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads((path / "meta.json").read_text())
+        if meta["schema"] == SCHEMA and {"config", "files", "env_steps", "wall_s"} <= set(meta):
+            return meta
+        problem = f"schema {meta['schema']} is not {SCHEMA}, or an entry is missing"
+    except (ValueError, KeyError, TypeError) as error:
+        problem = f"not readable as JSON with the expected entries ({error})"
+    raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")
+
+
+def _check_config(path: Path, saved: dict[str, Any], config: DreamerConfig) -> None:
+    current = json.loads(json.dumps(dataclasses.asdict(config)))
+    names = sorted(set(saved) | set(current))
+    changed = [f"{n}: saved {saved.get(n)}, now {current.get(n)}" for n in names if saved.get(n) != current.get(n)]
+    if changed:
+        raise CheckpointError(
+            f"{path / 'meta.json'}: the run was made with another configuration ({'; '.join(changed)}). A run is "
+            "resumed with its own configuration: restore those values, or start in a new folder."
+        )
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    paths = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in paths}
+
+
+def _is_key(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _to_numpy(leaf: Any, name: str, rows: Rows | None) -> np.ndarray:
+    if rows is not None and name.startswith(rows[0]) and np.shape(leaf)[:1] == (rows[2],):
+        leaf = leaf[: rows[1]]
+    return np.asarray(jax.device_get(jax.random.key_data(leaf) if _is_key(leaf) else leaf))
+
+
+def _from_numpy(path: Path, name: str, leaf: Any, arrays: dict[str, Any]) -> Any:
+    plain = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    shape = np.shape(plain)
+    if int(np.prod(shape)) == 0:
+        return leaf
+    if name not in arrays:
+        raise CheckpointError(
+            f"{path / 'state'}: no array '{name}', which this program needs. The environment or the program has "
+            "changed since: resume with the version that wrote it, or start in a new folder."
+        )
+    value = np.asarray(arrays[name])
+    dtype = np.asarray(plain).dtype if not hasattr(plain, "dtype") else plain.dtype
+    if value.shape[1:] != shape[1:] or value.ndim != len(shape) or value.shape[:1] > shape[:1] or value.dtype != dtype:
+        raise CheckpointError(
+            f"{path / 'state'}: array '{name}' is {value.dtype}{value.shape} where {dtype}{shape} is needed. The "
+            "environment has changed since: use the same one, or start in a new folder."
+        )
+    if value.shape != shape:
+        value = np.concatenate([value, np.zeros((shape[0] - value.shape[0], *shape[1:]), value.dtype)])
+    # A copy of its own: the state is donated, and memory shared with numpy must not be.
+    array = jnp.array(value, copy=True)
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else array
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def _fingerprint(path: Path) -> list[int]:
+    """Length [byte] and CRC-32 of a file."""
+    checksum, length = 0, 0
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 24):
+            checksum, length = zlib.crc32(chunk, checksum), length + len(chunk)
+    return [length, checksum]

@@ -1,0 +1,202 @@
+"""Hyperparameters of DreamerV3 and the presets by size."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+
+@dataclass(frozen=True)
+class DreamerConfig:
+    """All numbers of the learner; the defaults are size12m. Source: danijar/dreamerv3 configs.yaml, May 2026."""
+
+    deter: int = 2048
+    """Width D of the deterministic state."""
+    hidden: int = 256
+    """Width of the layers around the recurrent core."""
+    units: int = 256
+    """Width of the heads' layers."""
+    stoch: int = 32
+    """Number S of categorical latents."""
+    classes: int = 16
+    """Classes C of each latent; at most 256."""
+    blocks: int = 8
+    """Blocks G of the block-diagonal recurrent weights."""
+    encoder: Literal["conv", "patch"] = "conv"
+    """Image layers: four 5x5 convolution stages, or one linear layer on square patches (cheap on a CPU)."""
+    depth: int = 16
+    """Channel multiplier of the convolutions."""
+    mults: tuple[int, ...] = (2, 3, 4, 4)
+    """Channels of each stage in units of depth."""
+    kernel: int = 5
+    """Convolution kernel size."""
+    patch: int = 8
+    """Patch side [pixel]."""
+    patch_units: int = 32
+    """Features of one patch."""
+    reward_layers: int = 1
+    """Layers of the reward head."""
+    continue_layers: int = 1
+    """Layers of the continue head."""
+    policy_layers: int = 3
+    """Layers of the actor."""
+    value_layers: int = 3
+    """Layers of the critic."""
+    bins: int = 255
+    """Two-hot bins of reward and value; odd, so that one bin is exactly zero."""
+    unimix: float = 0.01
+    """Uniform share mixed into every categorical."""
+    min_std: float = 0.1
+    """Smallest standard deviation of the policy."""
+    max_std: float = 1.0
+    """Largest standard deviation of the policy."""
+    policy_outscale: float = 0.01
+    """Scale of the actor's output weights at the start."""
+
+    batch_size: int = 16
+    """Sequences B in a batch."""
+    batch_length: int = 64
+    """Trained steps T of a sequence; one more is sampled for its stored latent."""
+    train_ratio: float = 512.0
+    """Replayed steps per control step, control steps summed over instances."""
+    learning_starts: int = 1024
+    """Control steps with random actions before the first update (and at least batch_length + 1 per instance)."""
+    replay_capacity: int = 1_000_000
+    """Control steps kept, summed over instances."""
+    online: bool = True
+    """Train on each fresh sequence once before sampling uniformly."""
+    steps_per_iter: int = 1
+    """Steps of each instance in one dispatch."""
+
+    horizon: float = 333.0
+    """Effective horizon [steps]; discount 1 - 1/horizon, contained in the continue head."""
+    imag_horizon: int = 15
+    """Imagined steps."""
+    return_lambda: float = 0.95
+    """Lambda of the returns."""
+    entropy_scale: float = 3e-4
+    """Weight of the actor's entropy."""
+    slow_rate: float = 0.02
+    """Rate at which the slow critic follows."""
+    slow_reg: float = 1.0
+    """Weight of the pull towards the slow critic."""
+    replay_value_scale: float = 0.3
+    """Weight of the critic's loss on replayed sequences."""
+    return_norm_rate: float = 0.01
+    """Rate of the running return percentiles."""
+    return_percentiles: tuple[float, float] = (0.05, 0.95)
+    """Percentiles whose distance scales the advantage."""
+    dyn_scale: float = 1.0
+    """Weight of the dynamics loss."""
+    rep_scale: float = 0.1
+    """Weight of the representation loss."""
+    recon_scale: float = 1.0
+    """Weight of the image loss."""
+    reward_scale: float = 1.0
+    """Weight of the reward loss."""
+    continue_scale: float = 1.0
+    """Weight of the continue loss."""
+    free_nats: float = 1.0
+    """Floor of each KL term [nat], after summing over latents."""
+
+    lr: float = 4e-5
+    """Learning rate. Small networks on small budgets like more, such as 3e-4."""
+    warmup: int = 1000
+    """Updates over which the learning rate rises linearly."""
+    agc: float = 0.3
+    """Adaptive clipping: largest update norm relative to the parameter norm, per tensor."""
+    agc_min_norm: float = 1e-3
+    """Smallest parameter norm used by the clipping."""
+    beta1: float = 0.9
+    """Momentum after the scaling."""
+    beta2: float = 0.999
+    """Decay of the squared gradients."""
+    eps: float = 1e-20
+    """Added to the root of the squared gradients."""
+
+    compute_dtype: Literal["bfloat16", "float32"] = "bfloat16"
+    """Type of matrix products and recurrent states; parameters, norms, losses and returns are float32."""
+    scan_unroll: int = 8
+    """Steps of the recurrences unrolled into one loop body: more is faster on a GPU, 1 is best on a CPU."""
+
+    def __post_init__(self) -> None:
+        rules = (
+            (self.deter % self.blocks == 0, "deter", f"must be divisible by blocks ({self.blocks})"),
+            (self.bins % 2 == 1, "bins", "must be odd: the middle bin is zero"),
+            (self.patch_units % self.blocks == 0, "patch_units", f"must be divisible by blocks ({self.blocks})"),
+            (self.depth * self.mults[-1] % self.blocks == 0, "depth", "must give a last stage divisible by blocks"),
+            (2 <= self.classes <= 256, "classes", "must lie in 2..256: indices are stored as bytes"),
+            (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
+            (self.train_ratio > 0, "train_ratio", "must be positive"),
+            (self.batch_length >= 2, "batch_length", "must be at least 2"),
+            (self.steps_per_iter >= 1, "steps_per_iter", "must be at least 1"),
+            (self.kernel == 5, "kernel", "must be 5: the 2x2-block form of the convolutions is written for it"),
+        )
+        for ok, field, rule in rules:
+            if not ok:
+                raise ValueError(f"DreamerConfig.{field} = {getattr(self, field)!r}: it {rule}. Change {field}.")
+
+    @property
+    def dtype(self) -> DTypeLike:
+        """compute_dtype as a dtype."""
+        return jnp.dtype(self.compute_dtype)
+
+    @property
+    def stoch_size(self) -> int:
+        """Width S * C of the flattened latent."""
+        return self.stoch * self.classes
+
+    @property
+    def discount(self) -> float:
+        """Discount per step."""
+        return 1.0 - 1.0 / self.horizon
+
+    @property
+    def replayed_per_update(self) -> int:
+        """Steps replayed by one update."""
+        return self.batch_size * self.batch_length
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "size1m": dict(deter=512, hidden=64, units=64, classes=4, depth=4),
+    "size12m": dict(),
+    "size25m": dict(deter=3072, hidden=384, units=384, classes=24, depth=24),
+    "size50m": dict(deter=4096, hidden=512, units=512, classes=32, depth=32),
+    "size100m": dict(deter=6144, hidden=768, units=768, classes=48, depth=48),
+    "cpu": dict(
+        deter=256,
+        hidden=128,
+        units=128,
+        classes=8,
+        encoder="patch",
+        batch_size=8,
+        batch_length=32,
+        train_ratio=64.0,
+        replay_capacity=60_000,
+        lr=3e-4,
+        warmup=200,
+        value_layers=2,
+        policy_layers=2,
+        compute_dtype="float32",
+        scan_unroll=1,
+    ),
+}
+
+
+def preset(name: str, **overrides: Any) -> DreamerConfig:
+    """Configuration of a named size.
+
+    Args:
+        name: size1m, size12m, size25m, size50m, size100m or cpu.
+        overrides: fields to replace, such as lr=3e-4.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset {name!r} does not exist. Choose one of {', '.join(PRESETS)}.")
+    return dataclasses.replace(DreamerConfig(**PRESETS[name]), **overrides)

@@ -1,0 +1,95 @@
+"""Evaluation without bias: exactly one episode per instance and round, however long it takes."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer import agent as agents
+from dreamer.config import DreamerConfig
+from dreamer.types import FunctionalEnv, Params
+
+
+def evaluate(
+    env: FunctionalEnv,
+    config: DreamerConfig,
+    params: Params,
+    key: jax.Array,
+    episodes: int,
+    mode: bool = True,
+    max_steps: int = 100_000,
+) -> dict[str, np.ndarray]:
+    """Results of `episodes` episodes.
+
+    Each instance plays one episode per round and is then ignored, so that short episodes do not count more often.
+
+    Args:
+        env: vector environment.
+        config: sizes.
+        params: of the agent.
+        key: consumed.
+        episodes: how many; rounds of `env.num_envs`, the last one cut to its first instances.
+        mode: act deterministically, as on the vehicle.
+        max_steps: a round ends here even if an instance has not finished.
+
+    Returns:
+        Arrays (episodes,): return, length [steps], finished, and every metric of the environment on the last frame.
+
+    Raises:
+        ValueError: episodes is not positive.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes = {episodes}: it must be at least 1. Pass a positive number.")
+    play = _compiled(env, config, mode, max_steps)
+    keys = jax.random.split(key, -(-episodes // env.num_envs))
+    rounds = [jax.device_get(play(params, round_key)) for round_key in keys]
+    return {name: np.concatenate([result[name] for result in rounds])[:episodes] for name in rounds[0]}
+
+
+@lru_cache(maxsize=8)
+def _compiled(env: FunctionalEnv, config: DreamerConfig, mode: bool, max_steps: int) -> Any:
+    return jax.jit(lambda params, key: play_round(env, config, params, key, mode, max_steps))
+
+
+def play_round(
+    env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Array, mode: bool, max_steps: int
+) -> dict[str, jax.Array]:
+    """The first episode of every instance: arrays (N,) as in `evaluate`."""
+    reset_key, run_key = jax.random.split(key)
+    env_state, transition = env.reset(reset_key)
+    zeros = jnp.zeros((env.num_envs,), jnp.float32)
+    start = {
+        "return": zeros,
+        "length": jnp.zeros((env.num_envs,), jnp.int32),
+        "finished": zeros.astype(bool),
+        **{name: zeros for name in transition.metrics},
+    }
+    carry = agents.init_carry(config, env.num_envs, env.action_dim)
+
+    def running(loop: tuple) -> jax.Array:
+        return (loop[0] < max_steps) & ~jnp.all(loop[-1]["finished"])
+
+    def advance(loop: tuple) -> tuple:
+        step, env_state, transition, carry, result = loop
+        step_key = jax.random.fold_in(run_key, step)
+        carry, action = agents.act(config, params, carry, transition.obs, transition.is_first, step_key, mode)
+        action = jnp.clip(action, -1.0, 1.0)
+        env_state, transition = env.step(env_state, action)
+        active = ~result["finished"]
+        ends = active & transition.is_last
+        new = {
+            "return": result["return"] + active * transition.reward,
+            "length": result["length"] + active,
+            "finished": result["finished"] | transition.is_last,
+            **{
+                name: jnp.where(ends, value.astype(jnp.float32), result[name])
+                for name, value in transition.metrics.items()
+            },
+        }
+        return step + 1, env_state, transition, carry, new
+
+    return jax.lax.while_loop(running, advance, (jnp.zeros((), jnp.int32), env_state, transition, carry, start))[-1]

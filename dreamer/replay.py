@@ -1,0 +1,211 @@
+"""Replay memory on the device: one ring of rows, each row holding the same step of all N instance streams.
+
+Row t, column n is one step of stream n: the frame, what came with it, the action taken AFTER it, and the latent state
+inferred from it. A sampled window is consecutive rows of one column between the oldest and the newest row, so it
+crosses neither the write head nor another stream. It may hold an episode's end and the next one's start; `is_first`
+marks that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from dreamer import distributions as dist
+from dreamer.config import DreamerConfig
+from dreamer.rssm import Latent
+from dreamer.types import Transition
+
+
+@struct.dataclass
+class Replay:
+    """The memory, with L rows."""
+
+    obs: jax.Array
+    """(L, N, H, W, C) uint8."""
+    reward: jax.Array
+    """(L, N) float32."""
+    is_first: jax.Array
+    """(L, N) bool; is_last and is_terminal alike."""
+    is_last: jax.Array
+    is_terminal: jax.Array
+    action: jax.Array
+    """(L, N, A) float32 taken after the frame."""
+    deter: jax.Array
+    """(L, N, D) in the compute type, refreshed by the updates."""
+    stoch: jax.Array
+    """(L, N, S) uint8 class indices, refreshed alike."""
+    written: jax.Array
+    """() int32 rows written since the start; row t lies at t modulo L."""
+    online_next: jax.Array
+    """() int32 next fresh sequence: generation * N + stream."""
+
+
+@struct.dataclass
+class Batch:
+    """T steps of B sequences, T leading."""
+
+    obs: jax.Array
+    """(T, B, H, W, C) uint8."""
+    prev_action: jax.Array
+    """(T, B, A) action taken before the frame."""
+    reward: jax.Array
+    """(T, B)."""
+    is_first: jax.Array
+    """(T, B) bool; is_last and is_terminal alike."""
+    is_last: jax.Array
+    is_terminal: jax.Array
+    start: Latent
+    """(B, ...) stored state of the step before the first."""
+
+
+@struct.dataclass
+class Window:
+    """Where a batch came from."""
+
+    row: jax.Array
+    """(T + 1, B) int32 physical rows, the context step first."""
+    stream: jax.Array
+    """(B,) int32."""
+
+
+def rows_for(config: DreamerConfig, num_envs: int) -> int:
+    """Rows L that hold `replay_capacity` steps of `num_envs` streams.
+
+    Raises:
+        ValueError: too few rows for one sequence.
+    """
+    rows = config.replay_capacity // num_envs
+    if rows < 2 * config.batch_length + 1:
+        raise ValueError(
+            f"replay_capacity = {config.replay_capacity} gives {rows} steps to each of {num_envs} instances; at least "
+            f"{2 * config.batch_length + 1} (2 * batch_length + 1) are needed. Raise it to "
+            f"{num_envs * (2 * config.batch_length + 1)} or use fewer instances."
+        )
+    return rows
+
+
+def init(config: DreamerConfig, num_envs: int, obs_shape: tuple[int, int, int], action_dim: int) -> Replay:
+    """An empty memory."""
+    shape = (rows_for(config, num_envs), num_envs)
+    return Replay(
+        obs=jnp.zeros((*shape, *obs_shape), jnp.uint8),
+        reward=jnp.zeros(shape, jnp.float32),
+        is_first=jnp.zeros(shape, bool),
+        is_last=jnp.zeros(shape, bool),
+        is_terminal=jnp.zeros(shape, bool),
+        action=jnp.zeros((*shape, action_dim), jnp.float32),
+        deter=jnp.zeros((*shape, config.deter), config.dtype),
+        stoch=jnp.zeros((*shape, config.stoch), jnp.uint8),
+        written=jnp.zeros((), jnp.int32),
+        online_next=jnp.zeros((), jnp.int32),
+    )
+
+
+def size(replay: Replay) -> jax.Array:
+    """() rows that hold data."""
+    return jnp.minimum(replay.written, replay.reward.shape[0])
+
+
+def write(config: DreamerConfig, replay: Replay, transition: Transition, action: jax.Array, latent: Latent) -> Replay:
+    """Append one row.
+
+    Args:
+        config: sizes.
+        replay: memory, best donated.
+        transition: frames (N, ...).
+        action: (N, A) taken after them.
+        latent: (N, ...) inferred from them.
+    """
+    row = replay.written % replay.reward.shape[0]
+
+    def put(memory: jax.Array, value: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_update_index_in_dim(memory, value.astype(memory.dtype), row, 0)
+
+    return dataclasses.replace(
+        replay,
+        obs=put(replay.obs, transition.obs),
+        reward=put(replay.reward, transition.reward),
+        is_first=put(replay.is_first, transition.is_first),
+        is_last=put(replay.is_last, transition.is_last),
+        is_terminal=put(replay.is_terminal, transition.is_terminal),
+        action=put(replay.action, action),
+        deter=put(replay.deter, latent.deter),
+        stoch=put(replay.stoch, to_index(config, latent.stoch)),
+        written=replay.written + 1,
+    )
+
+
+def sample(config: DreamerConfig, replay: Replay, key: jax.Array) -> tuple[Replay, Batch, Window]:
+    """Draw a batch: fresh sequences as long as there are any, then uniformly over streams and positions.
+
+    Fresh sequences do not overlap: generation c of a stream ends at its row (c + 1) * T. When more are produced than
+    trained, only the newest generation waits; older ones stay within the uniform draw.
+
+    Args:
+        config: sizes.
+        replay: at least batch_length + 1 rows.
+        key: consumed.
+
+    Returns:
+        The memory with the queue advanced, the batch, and its place.
+    """
+    rows, streams = replay.reward.shape
+    length = config.batch_length
+    filled = size(replay)
+    stream_key, start_key = jax.random.split(key)
+    stream = jax.random.randint(stream_key, (config.batch_size,), 0, streams)
+    oldest = replay.written - filled
+    start = oldest + jax.random.randint(start_key, (config.batch_size,), 0, filled - length)
+    online_next = replay.online_next
+    if config.online:
+        generations = (replay.written - 1) // length
+        first = jnp.maximum(online_next, (generations - 1) * streams)
+        ticket = first + jnp.arange(config.batch_size)
+        fresh = ticket < generations * streams
+        stream = jnp.where(fresh, ticket % streams, stream)
+        start = jnp.where(fresh, ticket // streams * length, start)
+        online_next = jnp.minimum(first + config.batch_size, jnp.maximum(first, generations * streams))
+    row = (start + jnp.arange(length + 1)[:, None]) % rows
+    window = Window(row, stream)
+    return dataclasses.replace(replay, online_next=online_next), gather(config, replay, window), window
+
+
+def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
+    """The batch that lies at a window."""
+
+    def take(memory: jax.Array, row: jax.Array) -> jax.Array:
+        return memory.at[row, window.stream].get(mode="promise_in_bounds")
+
+    context, trained = window.row[0], window.row[1:]
+    index = take(replay.stoch, context).astype(jnp.int32)
+    stoch = dist.one_hot(index, config.classes).reshape(index.shape[0], -1).astype(replay.deter.dtype)
+    return Batch(
+        obs=take(replay.obs, trained),
+        prev_action=take(replay.action, window.row[:-1]),
+        reward=take(replay.reward, trained),
+        is_first=take(replay.is_first, trained),
+        is_last=take(replay.is_last, trained),
+        is_terminal=take(replay.is_terminal, trained),
+        start=Latent(take(replay.deter, context), stoch),
+    )
+
+
+def write_back(config: DreamerConfig, replay: Replay, window: Window, latent: Latent) -> Replay:
+    """Replace the stored states of a window's trained steps by latent (T, B, ...).
+
+    Where two windows overlap, one of their states is kept.
+    """
+    place = (window.row[1:], window.stream)
+    deter = replay.deter.at[place].set(latent.deter.astype(replay.deter.dtype), mode="promise_in_bounds")
+    index = to_index(config, latent.stoch)
+    stoch = replay.stoch.at[place].set(index, mode="promise_in_bounds")
+    return dataclasses.replace(replay, deter=deter, stoch=stoch)
+
+
+def to_index(config: DreamerConfig, stoch: jax.Array) -> jax.Array:
+    """One-hot (..., S * C) -> class indices (..., S) uint8."""
+    return jnp.argmax(stoch.reshape(*stoch.shape[:-1], config.stoch, config.classes), -1).astype(jnp.uint8)

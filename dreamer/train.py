@@ -1,0 +1,237 @@
+"""The host's side of a training run: dispatch iterations, log, evaluate, checkpoint, resume."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dreamer import checkpoint
+from dreamer.agent import AgentState
+from dreamer.config import DreamerConfig
+from dreamer.evaluate import evaluate
+from dreamer.iteration import TrainState, compile_iteration, init_state, train_iteration
+from dreamer.progress import Progress
+from dreamer.types import FunctionalEnv, Params
+
+__all__ = ["TrainResult", "TrainState", "evaluate", "init_state", "train", "train_iteration"]
+
+EvalFn = Callable[[Params, int], dict[str, float]]
+MetricsFn = Callable[[dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a finished run leaves behind; the files in `out` hold the rest."""
+
+    out: Path
+    """Folder of the run."""
+    agent: AgentState
+    """Trained agent."""
+    env_steps: int
+    """Control steps summed over instances."""
+    updates: int
+    """Gradient steps."""
+    wall_s: float
+    """Time of the run [s], all its parts together, compilation included."""
+    last_metrics: dict[str, float]
+    """The last logged line."""
+
+
+class Meter:
+    """Sums the metrics of iterations until they are logged."""
+
+    def __init__(self) -> None:
+        self._sums: list[dict[str, jax.Array]] = []
+        self._since = time.monotonic()
+
+    def add(self, metrics: dict[str, jax.Array]) -> None:
+        """Queue one iteration's sums, without waiting for the device."""
+        self._sums.append(metrics)
+
+    def wait_for_previous(self) -> None:
+        """Let the device be at most one iteration behind the host."""
+        if len(self._sums) > 1:
+            jax.block_until_ready(self._sums[-2])
+
+    def read(self, config: DreamerConfig, steps_per_iter: int) -> dict[str, float]:
+        """Means since the last reading, and rates; starts anew."""
+        fetched = jax.device_get(self._sums)
+        sums = {name: float(np.sum([x[name] for x in fetched])) for name in fetched[0]} if fetched else {}
+        now = time.monotonic()
+        seconds, self._since = max(now - self._since, 1e-9), now
+        updates, episodes = sums.pop("updates", 0.0), sums.pop("episodes", 0.0)
+        steps = len(self._sums) * steps_per_iter
+        self._sums = []
+        line = {
+            "env_steps_per_s": steps / seconds,
+            "updates_per_s": updates / seconds,
+            "replayed_steps_per_s": updates * config.replayed_per_update / seconds,
+            "updates_per_env_step": updates / max(steps, 1),
+            "episodes": episodes,
+        }
+        goals, goal_sum = sums.pop("update/goal_frames", 0.0), sums.pop("update/goal_reward_sum", 0.0)
+        if goals:
+            line["goal_reward_predicted"] = goal_sum / goals
+        for name, value in sums.items():
+            count = episodes if name.startswith("episode/") else updates
+            if count:
+                line[name.replace("update/", "")] = value / count
+        return line
+
+
+def train(
+    env: FunctionalEnv,
+    config: DreamerConfig,
+    out: Path | str,
+    total_steps: int,
+    seed: int,
+    *,
+    eval_fn: EvalFn | None = None,
+    eval_every: int = 10_000,
+    checkpoint_every_s: float = 600.0,
+    log_every_s: float = 5.0,
+    resume: bool = True,
+    progress: bool = True,
+    on_metrics: MetricsFn | None = None,
+) -> TrainResult:
+    """Train until `total_steps` control steps, summed over instances, are done.
+
+    `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
+    again goes on from its last checkpoint as if nothing had happened.
+
+    Args:
+        env: vector environment.
+        config: hyperparameters.
+        out: folder of the run.
+        total_steps: when to stop; a resumed run may get more.
+        seed: of everything random.
+        eval_fn: (params, env_steps) -> figures, logged as eval/...
+        eval_every: control steps between evaluations; one more happens at the end.
+        checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
+        log_every_s: time between log lines [s].
+        resume: go on from the newest checkpoint in `out`, if there is one; otherwise start anew and overwrite.
+        progress: show a bar on stderr.
+        on_metrics: called with every logged line.
+
+    Raises:
+        ValueError: environment and configuration do not fit, or the checkpoint does not belong to them.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    state, wall_before = _first_state(env, config, out, seed, resume)
+    began = time.monotonic()
+    steps_per_iter = env.num_envs * config.steps_per_iter
+    env_steps = int(state.env_steps)
+    log = _Log(out / "metrics.jsonl", env_steps, on_metrics)
+    iterate = compile_iteration(env, config, state)
+    bar = Progress(total_steps, env_steps, progress)
+    meter, saved_at = Meter(), time.monotonic()
+
+    def wall_s() -> float:
+        return wall_before + time.monotonic() - began
+
+    def write_log(state: TrainState, evaluated: bool) -> None:
+        line = {"env_steps": env_steps, "updates": int(state.agent.updates), "wall_s": wall_s()}
+        line |= meter.read(config, steps_per_iter)
+        if evaluated and eval_fn is not None:
+            line |= {f"eval/{name}": float(value) for name, value in eval_fn(state.agent.params, env_steps).items()}
+        log.write(line)
+        bar.show(env_steps, _headline(line))
+
+    logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
+    try:
+        while env_steps < total_steps:
+            state, metrics = iterate(state)
+            env_steps += steps_per_iter
+            meter.add(metrics)
+            meter.wait_for_previous()
+            now = time.monotonic()
+            finished = env_steps >= total_steps
+            evaluate_now = eval_fn is not None and (finished or env_steps // eval_every > evaluated_at)
+            if finished or evaluate_now or now - logged_at >= log_every_s:
+                write_log(state, evaluate_now)
+                logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
+            if finished or now - saved_at >= checkpoint_every_s:
+                save_state(out, state, config, wall_s())
+                saved_at = time.monotonic()
+    except KeyboardInterrupt:
+        save_state(out, state, config, wall_s())
+        raise
+    finally:
+        bar.close()
+    return TrainResult(out, state.agent, env_steps, int(state.agent.updates), wall_s(), log.last)
+
+
+def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: float) -> Path:
+    """Write a checkpoint of the whole run; of the replay only what is filled."""
+    rows = state.replay.reward.shape[0]
+    used = max(1, min(rows, int(state.replay.written)))
+    folder = out / "checkpoints"
+    return checkpoint.save(folder, state, config, int(state.env_steps), wall_s, rows=("replay.", used, rows))
+
+
+def _first_state(
+    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int, resume: bool
+) -> tuple[TrainState, float]:
+    """State to start from and the time [s] already spent."""
+    state = jax.jit(lambda: init_state(env, config, seed))()
+    if resume:
+        restored = checkpoint.restore(out / "checkpoints", state, config)
+        if restored is not None:
+            return restored[0], float(restored[1]["wall_s"])
+    else:
+        for path in checkpoint.complete(out / "checkpoints"):
+            checkpoint.remove(path)
+    _write_atomically(out / "config.json", json.dumps({**asdict(config), "seed": seed}, indent=1) + "\n")
+    return state, 0.0
+
+
+def _headline(line: dict[str, Any]) -> dict[str, str]:
+    """The figures a watcher wants to see."""
+    names = {
+        "replayed_steps_per_s": "replay/s",
+        "updates_per_s": "upd/s",
+        "updates_per_env_step": "upd/step",
+        "episode/return": "return",
+    }
+    return {short: f"{line[name]:.3g}" for name, short in names.items() if name in line}
+
+
+class _Log:
+    """metrics.jsonl, without the lines a resumed run is about to write again."""
+
+    def __init__(self, path: Path, env_steps: int, on_metrics: MetricsFn | None) -> None:
+        self._path, self._on_metrics = path, on_metrics
+        self.last: dict[str, float] = {}
+        kept = []
+        for text in path.read_text().splitlines() if path.exists() else []:
+            try:
+                line = json.loads(text)
+            except ValueError:
+                continue  # cut off by the kill
+            if line["env_steps"] <= env_steps:
+                kept.append(text)
+                self.last = line
+        _write_atomically(path, "".join(text + "\n" for text in kept))
+
+    def write(self, line: dict[str, float]) -> None:
+        """Append one line."""
+        with self._path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        self.last = line
+        if self._on_metrics is not None:
+            self._on_metrics(line)
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)

@@ -1,0 +1,49 @@
+"""Data that crosses the border between an environment and the learner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+from flax import struct
+
+EnvState = Any
+Params = dict[str, Any]
+Carry = dict[str, jax.Array]
+"""Recurrent state: deter (..., D), stoch (..., S * C) and the action (..., A) that led here."""
+
+
+@struct.dataclass
+class Transition:
+    """What N environment instances emit at one control step."""
+
+    obs: jax.Array
+    """(N, H, W, C) uint8 image."""
+    reward: jax.Array
+    """(N,) float32, earned by the action that led to this frame; 0 on the first frame."""
+    is_first: jax.Array
+    """(N,) bool, first frame of an episode: the incoming action is meaningless."""
+    is_last: jax.Array
+    """(N,) bool, terminated or truncated. The next step call resets the instance and ignores its action."""
+    is_terminal: jax.Array
+    """(N,) bool, terminated only: the one flag that zeroes the bootstrap value."""
+    metrics: dict[str, jax.Array]
+    """(N,) floats that are only watched, read on the last frame of an episode."""
+
+
+@dataclass(frozen=True)
+class FunctionalEnv:
+    """A vector environment as two pure functions. Compared by identity of the functions, so it can be static."""
+
+    num_envs: int
+    """Instances N."""
+    obs_shape: tuple[int, int, int]
+    """(H, W, C) of one image."""
+    action_dim: int
+    """A, each component in [-1, 1]."""
+    reset: Callable[[jax.Array], tuple[EnvState, Transition]]
+    """key -> state and first frames."""
+    step: Callable[[EnvState, jax.Array], tuple[EnvState, Transition]]
+    """state, action (N, A) in [-1, 1] -> state and next frames."""

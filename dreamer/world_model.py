@@ -1,0 +1,111 @@
+"""World model: encoder, recurrent model, decoder, reward and continue heads, and their joint loss."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from dreamer import distributions as dist
+from dreamer import image, nets, rssm
+from dreamer.config import DreamerConfig
+from dreamer.replay import Batch
+from dreamer.rssm import Latent
+from dreamer.types import Params
+
+
+def init(config: DreamerConfig, obs_shape: tuple[int, int, int], action_dim: int, key: jax.Array) -> Params:
+    """Parameters named enc, dyn, dec, reward and continue."""
+    keys = jax.random.split(key, 5)
+    features = config.deter + config.stoch_size
+    return {
+        "enc": image.init_encoder(config, obs_shape, keys[0]),
+        "dyn": rssm.init(config, image.token_size(config, obs_shape), action_dim, keys[1]),
+        "dec": image.init_decoder(config, obs_shape, keys[2]),
+        "reward": init_head(config, keys[3], features, config.reward_layers, config.bins, outscale=0.0),
+        "continue": init_head(config, keys[4], features, config.continue_layers, 1),
+    }
+
+
+def init_head(
+    config: DreamerConfig, key: jax.Array, inputs: int, layers: int, outputs: int, outscale: float = 1.0
+) -> Params:
+    """An MLP and a linear output named out."""
+    mlp_key, out_key = jax.random.split(key)
+    params = nets.init_mlp(mlp_key, inputs, config.units, layers)
+    return {**params, "out": nets.init_linear(out_key, config.units, outputs, outscale)}
+
+
+def head(params: Params, features: jax.Array) -> jax.Array:
+    """Outputs (..., K) float32 of a head from features (..., F)."""
+    return nets.linear(params["out"], nets.mlp(params, features)).astype(jnp.float32)
+
+
+def predict_reward(params: Params, features: jax.Array) -> jax.Array:
+    """Expected reward (...) earned on the way into a state."""
+    return dist.twohot_mean(head(params["reward"], features))
+
+
+def predict_continue(params: Params, features: jax.Array) -> jax.Array:
+    """Probability (...) that the episode goes on times the discount, which the head has learned with it."""
+    return jax.nn.sigmoid(head(params["continue"], features)[..., 0])
+
+
+def continue_target(config: DreamerConfig, is_terminal: jax.Array) -> jax.Array:
+    """Target (...) of the continue head: the discount, or 0 where the task ended. Time-outs do not end the task."""
+    return config.discount * (1.0 - is_terminal.astype(jnp.float32))
+
+
+def kl_losses(config: DreamerConfig, post: jax.Array, prior: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Dynamics and representation loss (...) [nat] of probabilities (..., S, C).
+
+    Each is summed over the latents first and then floored at the free nats, so that small terms share one allowance.
+    """
+    stop = jax.lax.stop_gradient
+    dyn = dist.categorical_kl(stop(post), prior)
+    rep = dist.categorical_kl(post, stop(prior))
+    return jnp.maximum(dyn, config.free_nats), jnp.maximum(rep, config.free_nats)
+
+
+def loss(
+    config: DreamerConfig, params: Params, batch: Batch, key: jax.Array
+) -> tuple[dict[str, jax.Array], Latent, dict[str, jax.Array]]:
+    """Losses (T, B) by name, weighted; posterior states (T, B, ...); metrics.
+
+    Args:
+        config: sizes and weights.
+        params: from `init`.
+        batch: replayed sequences, T leading.
+        key: consumed by the latents' samples.
+    """
+    steps = batch.reward.shape
+    tokens = image.encode(config, params["enc"], batch.obs)
+    uniform = jax.random.uniform(key, (*steps, config.stoch))
+    latent, post = rssm.observe(
+        config, params["dyn"], batch.start, batch.prev_action, tokens, batch.is_first, uniform
+    )
+    prior = rssm.prior_probs(config, params["dyn"], latent.deter)
+    dyn, rep = kl_losses(config, post, prior)
+    features = latent.features()
+    flat = Latent(latent.deter.reshape(-1, config.deter), latent.stoch.reshape(-1, config.stoch_size))
+    frames = batch.obs.reshape(-1, *batch.obs.shape[2:])
+    recon = image.reconstruction_loss(config, params["dec"], flat.deter, flat.stoch, frames).reshape(steps)
+    reward_logits = head(params["reward"], features)
+    reward = dist.cross_entropy(reward_logits, dist.twohot(batch.reward, config.bins))
+    continue_logit = head(params["continue"], features)[..., 0]
+    continuation = dist.bernoulli_loss(continue_logit, continue_target(config, batch.is_terminal))
+    losses = {
+        "dyn": config.dyn_scale * dyn,
+        "rep": config.rep_scale * rep,
+        "recon": config.recon_scale * recon,
+        "reward": config.reward_scale * reward,
+        "continue": config.continue_scale * continuation,
+    }
+    goal = (batch.is_terminal & (batch.reward > 0)).astype(jnp.float32)
+    predicted = dist.twohot_mean(jax.lax.stop_gradient(reward_logits))
+    metrics = {
+        "kl": jnp.mean(dist.categorical_kl(post, prior)),
+        "post_entropy": jnp.mean(jnp.sum(-post * jnp.log(post), (-2, -1))),
+        "goal_reward_sum": jnp.sum(goal * predicted),
+        "goal_frames": jnp.sum(goal),
+    }
+    return losses, latent, metrics

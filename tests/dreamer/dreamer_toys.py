@@ -1,0 +1,98 @@
+"""Small environments with known answers, and a tiny agent for them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from dreamer.config import DreamerConfig, preset
+from dreamer.types import FunctionalEnv, Transition
+
+SHAPE = (16, 16, 3)
+
+
+def tiny_config(**overrides: Any) -> DreamerConfig:
+    """A configuration that compiles in seconds."""
+    sizes = dict(
+        deter=32, hidden=16, units=16, stoch=4, classes=4, blocks=4, patch_units=8, depth=2, batch_size=4,
+        batch_length=8, imag_horizon=5, learning_starts=32, replay_capacity=800, train_ratio=16.0, warmup=20,
+        value_layers=1, policy_layers=1,
+    )
+    return preset("cpu", **{**sizes, **overrides})
+
+
+@struct.dataclass
+class ToyState:
+    """Position of each instance, step within the episode, and whether the next step resets."""
+
+    key: jax.Array
+    place: jax.Array
+    count: jax.Array
+    reset_next: jax.Array
+
+
+def shade(level: jax.Array) -> jax.Array:
+    """(N,) in [0, 1] -> uniformly grey images (N, 16, 16, 3) uint8."""
+    pixel = jnp.round(255 * level).astype(jnp.uint8)
+    return jnp.broadcast_to(pixel[:, None, None, None], (level.shape[0], *SHAPE))
+
+
+def corridor_env(num_envs: int, length: int = 4, limit: int = 12) -> FunctionalEnv:
+    """A corridor: a positive action moves one cell on, a negative one back; the last cell pays 1 and ends the task.
+
+    Each step costs 0.05, so the best return is 1 - 0.05 * (length - 1). Episodes are cut off after `limit` steps.
+    """
+
+    def emit(state: ToyState, moved: jax.Array, first: jax.Array) -> Transition:
+        goal = (state.place == length) & ~first
+        timeout = (state.count >= limit) & ~goal & ~first
+        reward = jnp.where(goal, 1.0, jnp.where(first, 0.0, -0.05))
+        return Transition(
+            obs=shade(state.place / length), reward=reward.astype(jnp.float32), is_first=first, is_last=goal | timeout,
+            is_terminal=goal, metrics={"success": goal.astype(jnp.float32)},
+        )
+
+    def reset(key: jax.Array) -> tuple[ToyState, Transition]:
+        zeros = jnp.zeros((num_envs,), jnp.int32)
+        state = ToyState(key, zeros, zeros, zeros.astype(bool))
+        return state, emit(state, zeros, jnp.ones((num_envs,), bool))
+
+    def step(state: ToyState, action: jax.Array) -> tuple[ToyState, Transition]:
+        first = state.reset_next
+        move = jnp.where(action[:, 0] > 0, 1, -1)
+        place = jnp.where(first, 0, jnp.clip(state.place + move, 0, length))
+        count = jnp.where(first, 0, state.count + 1)
+        new = ToyState(state.key, place, count, first)
+        transition = emit(new, move, first)
+        return ToyState(state.key, place, count, transition.is_last), transition
+
+    return FunctionalEnv(num_envs, SHAPE, 1, reset, step)
+
+
+def counting_env(num_envs: int, limits: tuple[int, ...]) -> FunctionalEnv:
+    """Instance n ends (by time-out) after limits[n] steps and pays 1 per step: length and return are limits[n]."""
+    limit = jnp.array(limits)
+
+    def emit(state: ToyState, first: jax.Array) -> Transition:
+        last = (state.count >= limit) & ~first
+        reward = jnp.where(first, 0.0, 1.0)
+        return Transition(
+            obs=shade((state.count % 2).astype(jnp.float32)), reward=reward, is_first=first, is_last=last,
+            is_terminal=jnp.zeros_like(last), metrics={"mark": state.count.astype(jnp.float32)},
+        )
+
+    def reset(key: jax.Array) -> tuple[ToyState, Transition]:
+        zeros = jnp.zeros((num_envs,), jnp.int32)
+        state = ToyState(key, zeros, zeros, zeros.astype(bool))
+        return state, emit(state, jnp.ones((num_envs,), bool))
+
+    def step(state: ToyState, action: jax.Array) -> tuple[ToyState, Transition]:
+        first = state.reset_next
+        new = ToyState(state.key, state.place, jnp.where(first, 0, state.count + 1), first)
+        transition = emit(new, first)
+        return ToyState(new.key, new.place, new.count, transition.is_last), transition
+
+    return FunctionalEnv(num_envs, SHAPE, 2, reset, step)
