@@ -1,0 +1,134 @@
+"""Bounded Levenberg-Marquardt from several starts at once, with forward-mode Jacobians.
+
+All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
+start, of which the best is taken. Steps are in unit coordinates; a step that leaves the box is cut at its wall and the
+parameters at a wall whose gradient points outwards are held.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.objective import Objective
+from sysid.result import FitResult, Progress
+from sysid.space import Space, is_delay
+
+DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
+"""Factors on each start's damping that are tried in one iteration."""
+MAX_STEP = 0.3  # of the range, in one iteration
+HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
+
+
+def fit(
+    objective: Objective, space: Space, *, starts: np.ndarray | None = None, iterations: int = 30,
+    tolerance: float = 1e-4, robust: bool = False, frozen: tuple[str, ...] = (), progress: Progress | None = None,
+) -> FitResult:
+    """Minimise the weighted least squares over `space`.
+
+    Args:
+        objective: residuals and Jacobians in unit coordinates of `space`.
+        starts: (S, P) unit coordinates; the initial values by default.
+        tolerance: a start has converged when its cost falls by less than this share, twice in a row.
+        robust: Huber instead of squares.
+        frozen: names that keep each start's value.
+    """
+    u = np.array([space.to_unit(space.initial)] if starts is None else starts, float)
+    free = np.array([name not in frozen for name in space.names])
+    count, damping, calm = len(u), np.full(len(u), 1e-2), np.zeros(len(u), int)
+    cost = np.full(count, np.inf)
+    initial = np.inf
+    history: list[float] = []
+    for iteration in range(iterations):
+        residual, jacobian = objective.jacobian(u)
+        weight = huber_weight(residual) if robust else np.ones_like(residual)
+        cost = robust_cost(residual, robust) / objective.counted
+        if iteration == 0:
+            initial = float(cost[0])
+        gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
+        hessian = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
+        candidates = np.stack([
+            np.stack([_step(u[n], gradient[n], hessian[n], damping[n] * factor, free) for factor in DAMPINGS])
+            for n in range(count)])  # (S, D, P)
+        tried = objective.residuals(candidates.reshape(-1, space.size))
+        tried = tried.reshape(count, len(DAMPINGS), *residual.shape[1:])
+        costs = np.stack([robust_cost(one, robust) for one in tried]) / objective.counted
+        best = costs.argmin(axis=1)
+        for n in range(count):
+            new = costs[n, best[n]]
+            if new < cost[n]:
+                calm[n] = calm[n] + 1 if cost[n] - new < tolerance * cost[n] else 0
+                u[n], cost[n] = candidates[n, best[n]], new
+                damping[n] = np.clip(damping[n] * DAMPINGS[best[n]], 1e-7, 1e4)
+            else:
+                calm[n] += 1
+                damping[n] = min(damping[n] * 100.0, 1e4)
+        history.append(float(cost.min()))
+        if progress is not None:
+            progress(1, f"cost {cost.min():.4g}")
+        if (calm >= 2).all():
+            break
+    order = np.argsort(cost)
+    return FitResult(u=u[order[0]], cost=float(cost[order[0]]), initial_cost=initial,
+                     evaluations=len(history) * count * (1 + len(DAMPINGS)), starts=u[order], start_costs=cost[order],
+                     history=np.array(history))
+
+
+def profile_delays(
+    objective: Objective, space: Space, u: np.ndarray, points: int = 16
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Cost over a grid of each delay-type parameter, the others held at u (P,).
+
+    Returns:
+        Per delay its name, the grid (G,) in unit coordinates and the costs (G,).
+    """
+    profiles = []
+    for index, name in enumerate(space.names):
+        if is_delay(name):
+            grid = np.linspace(0.0, 1.0, points)
+            at = np.tile(u, (len(grid), 1))
+            at[:, index] = grid
+            profiles.append((name, grid, objective.weighted_cost(at)))
+    return profiles
+
+
+def random_starts(space: Space, count: int, seed: int) -> np.ndarray:
+    """(S, P): the initial values, then points drawn uniformly in unit coordinates, away from the walls."""
+    draws = np.random.default_rng(seed).uniform(0.05, 0.95, (count, space.size))
+    draws[0] = space.to_unit(space.initial)
+    return draws
+
+
+def huber_weight(residual: np.ndarray) -> np.ndarray:
+    """Weight of the squares whose minimum is that of the Huber loss."""
+    return np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
+
+
+def robust_cost(residual: np.ndarray, robust: bool) -> np.ndarray:
+    """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K)."""
+    if not robust:
+        return np.square(residual).sum((-1, -2))
+    size = np.abs(residual)
+    return np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2).sum((-1, -2))
+
+
+def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float, free: np.ndarray) -> np.ndarray:
+    """The damped Gauss-Newton point of one start, within the box."""
+    active = free & ~((u <= 0.0) & (gradient > 0)) & ~((u >= 1.0) & (gradient < 0))
+    new = u.copy()
+    for _ in range(3):  # cutting at a wall may let another parameter reach its own
+        index = np.flatnonzero(active)
+        if len(index) == 0:
+            return new
+        block = hessian[np.ix_(index, index)]
+        scale = np.diag(block) + 1e-6 * max(float(np.diag(hessian).max()), 1e-12)
+        step = -np.linalg.solve(block + damping * np.diag(scale), gradient[index])
+        step = np.clip(step, -MAX_STEP, MAX_STEP)
+        new = u.copy()
+        new[index] = u[index] + step
+        outside = (new < 0.0) | (new > 1.0)
+        new = np.clip(new, 0.0, 1.0)
+        if not outside.any():
+            break
+        # Hold what hit its wall at once; what merely reached it keeps the cut step.
+        active &= ~(outside & ((u <= 1e-6) | (u >= 1 - 1e-6)))
+    return new

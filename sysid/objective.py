@@ -1,0 +1,185 @@
+"""What is minimised: the paper's J (sum of position RMSE), and a weighted least-squares residual over all channels.
+
+The residual of a channel is divided by its noise scale: the spread between replicates where the log has them, else a
+stated default that is replaced by the residual's own size after a first fit. The start pose of a trial is itself
+measured with noise; its three errors enter the residual linearly, so they are solved for in closed form with that
+noise as prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.metrics import replicate_noise
+from sysid.rollout import Measured, Replay, Simulated
+from sysid.space import Space
+
+DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
+"""x, y [m], yaw [rad] and x, y, yaw, v [m/s], omega [rad/s]; only their ratio matters until they are re-estimated."""
+MIN_NOISE = 1e-3  # keeps a noiseless channel from dominating
+HUGE = 1e3  # residual, in noise scales, of a sample of a diverged simulation
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation per channel, and where it comes from."""
+
+    pose: np.ndarray  # (3,)
+    odometry: np.ndarray  # (5,)
+    source: str  # "replicates", "defaults" or "residuals"
+
+    def as_dict(self) -> dict[str, float]:
+        names = ["ground_truth.x", "ground_truth.y", "ground_truth.yaw",
+                 "odometry.x", "odometry.y", "odometry.yaw", "odometry.v", "odometry.omega"]
+        return {name: float(value) for name, value in zip(names, [*self.pose, *self.odometry], strict=True)}
+
+
+def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
+    """Noise from the replicates among `trials`; channels without replicates keep the defaults."""
+    found = replicate_noise(trials)
+    if found is None:
+        return Noise(DEFAULT_NOISE["ground_truth"], DEFAULT_NOISE["odometry"], "defaults")
+
+    def known(channel: str) -> np.ndarray:
+        return np.where(np.isfinite(found[channel]), np.maximum(found[channel], MIN_NOISE), DEFAULT_NOISE[channel])
+
+    pose, odometry = known("ground_truth"), known("odometry")
+    pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))  # along and across the start heading: a later turn swaps them
+    odometry[:2] = np.sqrt(np.mean(odometry[:2] ** 2))
+    return Noise(pose, odometry, "replicates")
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Errors of N parameter sets against B trials, in unit coordinates of `space`."""
+
+    replay: Replay
+    space: Space
+    trials: tuple[Trial, ...]
+    measured: Measured
+    noise: Noise
+
+    @property
+    def counted(self) -> int:
+        """Number of measured values."""
+        return int(self.measured.pose_mask.sum() + self.measured.odometry_mask.sum())
+
+    def with_noise(self, noise: Noise) -> Objective:
+        return replace(self, noise=noise)
+
+    def simulate(self, u: np.ndarray) -> Simulated:
+        """Replay at unit coordinates (N, P)."""
+        return self.replay.simulate(self.space.to_values(u))
+
+    def paper_cost(self, u: np.ndarray) -> np.ndarray:
+        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one."""
+        simulated = self.simulate(u)
+        outside = self.measured.pose_mask[..., 0].sum() > 0
+        values, target, mask = (
+            (simulated.pose, self.measured.pose, self.measured.pose_mask) if outside
+            else (simulated.odometry, self.measured.odometry, self.measured.odometry_mask))
+        error = np.square(values[..., :2] - target[..., :2]).sum(-1) * mask[..., 0]
+        samples = np.maximum(mask[..., 0].sum(-1), 1)
+        cost = np.sqrt(error.sum(-1) / samples).sum(-1)
+        return np.where(self._bad(simulated).any(-1) | ~np.isfinite(cost), HUGE, cost)
+
+    def weighted_cost(self, u: np.ndarray) -> np.ndarray:
+        """Mean squared residual (N,), 1 at the noise level."""
+        return np.square(self.residuals(u)).sum((-1, -2)) / self.counted
+
+    def residuals(self, u: np.ndarray) -> np.ndarray:
+        """(N, B, K) whitened residuals; masked samples are 0. K counts pose, odometry and start-pose terms."""
+        simulated = self.simulate(u)
+        residual, _ = self._whiten(simulated, None)
+        return residual
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (N, B, K) and their derivatives by u (N, B, K, P)."""
+        simulated, derivative = self.replay.jacobian(self.space.to_values(u))
+        residual, jacobian = self._whiten(simulated, derivative)
+        assert jacobian is not None
+        return residual, jacobian * self.space.slope(u)[:, None, None, :]
+
+    def residual_noise(self, u: np.ndarray) -> Noise:
+        """Noise re-estimated as the size of the residual (robustly) at one point u (P,)."""
+        simulated = self.simulate(u[None])
+        scales = []
+        for values, target, mask in ((simulated.pose[0], self.measured.pose, self.measured.pose_mask),
+                                     (simulated.odometry[0], self.measured.odometry, self.measured.odometry_mask)):
+            error = np.abs(values - target)
+            known = [error[..., c][mask[..., c] > 0] for c in range(error.shape[-1])]
+            scales.append(np.array([1.4826 * np.median(one) if len(one) else np.nan for one in known]))
+        pose = np.where(np.isfinite(scales[0]), np.maximum(scales[0], MIN_NOISE), self.noise.pose)
+        odometry = np.where(np.isfinite(scales[1]), np.maximum(scales[1], MIN_NOISE), self.noise.odometry)
+        pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))
+        return Noise(pose, odometry, "residuals")
+
+    def channel_residuals(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """Whitened residual (B, M) of each channel at one point u (P,), nan where not measured."""
+        residual = self.residuals(u[None])[0]
+        pose_size = self.measured.pose[0].size
+        pose = residual[:, :pose_size].reshape(self.measured.pose.shape)
+        odometry_size = self.measured.odometry[0].size
+        odometry = residual[:, pose_size : pose_size + odometry_size].reshape(self.measured.odometry.shape)
+        columns = [*np.where(self.measured.pose_mask > 0, pose, np.nan).transpose(2, 0, 1),
+                   *np.where(self.measured.odometry_mask > 0, odometry, np.nan).transpose(2, 0, 1)]
+        return dict(zip(self.noise.as_dict(), columns, strict=True))
+
+    def _bad(self, simulated: Simulated) -> np.ndarray:
+        finite = np.isfinite(simulated.pose).all((-1, -2)) & np.isfinite(simulated.odometry).all((-1, -2))
+        return np.asarray((simulated.diverged > 0.5) | ~finite)  # (N, B)
+
+    def _whiten(self, simulated: Simulated, derivative: Simulated | None) -> tuple[np.ndarray, np.ndarray | None]:
+        measured, noise = self.measured, self.noise
+        count, trials = simulated.pose.shape[:2]
+        bad = self._bad(simulated)[:, :, None]
+        pose_weight, odometry_weight = measured.pose_mask / noise.pose, measured.odometry_mask / noise.odometry
+
+        def flat(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+            return np.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
+                                   odometry.reshape(count, trials, -1, *odometry.shape[4:])], axis=2)
+
+        weights = flat(np.broadcast_to(pose_weight, simulated.pose.shape),
+                       np.broadcast_to(odometry_weight, simulated.odometry.shape)) > 0
+        residual = flat((simulated.pose - measured.pose) * pose_weight,
+                        (simulated.odometry - measured.odometry) * odometry_weight)
+        residual = np.where(bad, HUGE * weights, residual)
+        jacobian = None
+        if derivative is not None:
+            jacobian = flat(derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None])
+            jacobian = np.where(bad[..., None] | ~np.isfinite(jacobian), 0.0, jacobian)
+        return self._solve_start(simulated, residual, jacobian)
+
+    def _solve_start(
+        self, simulated: Simulated, residual: np.ndarray, jacobian: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
+
+        A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
+        linear map of r that is applied to the Jacobian as well.
+        """
+        sigma = np.array([[t.start.position_sigma, t.start.position_sigma, t.start.yaw_sigma] for t in self.trials])
+        if not (sigma > 0).any():
+            return residual, jacobian
+        sigma = np.maximum(sigma, 1e-9)  # (B, 3)
+        start = np.array([[t.start.x, t.start.y] for t in self.trials])
+        weight = self.measured.pose_mask / self.noise.pose  # (B, M, 3)
+        arm = np.nan_to_num(simulated.pose[..., :2] - start[:, None, :])  # (N, B, M, 2)
+        design = np.zeros((*simulated.pose.shape, 3))  # (N, B, M, 3 of the pose, 3 of the start error)
+        design[..., 0, 0] = design[..., 1, 1] = design[..., 2, 2] = 1.0
+        design[..., 0, 2], design[..., 1, 2] = -arm[..., 1], arm[..., 0]
+        design = (design * weight[..., None]).reshape(*residual.shape[:2], -1, 3)
+        size = design.shape[2]
+        normal = np.einsum("nbki,nbkj->nbij", design, design) + np.einsum("bi,ij->bij", sigma**-2.0, np.eye(3))
+        gain = -np.linalg.solve(normal, design.swapaxes(-1, -2))  # (N, B, 3, K)
+        error = np.einsum("nbik,nbk->nbi", gain, residual[:, :, :size])
+        residual = np.concatenate([residual, error / sigma], axis=2)
+        residual[:, :, :size] += np.einsum("nbki,nbi->nbk", design, error)
+        if jacobian is not None:
+            slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, :size])
+            jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
+            jacobian[:, :, :size] += np.einsum("nbki,nbip->nbkp", design, slope)
+        return residual, jacobian

@@ -1,0 +1,28 @@
+"""What a search returns, and how it reports its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Progress = Callable[[int, str], None]
+"""Called with the number of evaluations just done and a short remark."""
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Best point of a search, in unit coordinates."""
+
+    u: np.ndarray  # (P,)
+    cost: float
+    initial_cost: float
+    """Cost of the first candidate, the initial values."""
+    evaluations: int
+    starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(S, P) end points of the search: the best candidates of TPE, the end of each start of LM."""
+    start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(S,) cost of each of them, where known."""
+    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Best cost so far after each evaluation or iteration."""

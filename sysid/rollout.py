@@ -1,0 +1,241 @@
+"""Open-loop replay of a log, batched over trials and parameter sets: the only compiled entry point of this package.
+
+Commands are resampled to the physics grid (each holds until the next), trials are padded to one length with masks, the
+motion is recorded every few physics steps and interpolated at the measurements' own times. The vehicle comes in as
+three functions of one instance (`Plant`), so that a test can put a small model in its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sysid.log import OdometryStream, PoseStream, Trial
+from sysid.metrics import Prediction, command_in_force
+from whill_mjx.config import VehicleConfig
+from whill_mjx.specs import VehicleSpec
+
+RECORD_DT = 0.025  # s between recorded states; linear interpolation at 1 m/s^2 is then off by 0.1 mm at most
+POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
+YAW_COLUMNS = (2, 5)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A vehicle as pure functions of one instance."""
+
+    place: Callable[[Any, jax.Array], Any]
+    """(params, start (5,) x, y, yaw, v, omega) -> state."""
+    substep: Callable[[Any, Any, jax.Array], Any]
+    """(params, state, command (2,)) -> state after one physics step."""
+    observe: Callable[[Any], jax.Array]
+    """state -> (9,): x, y, yaw of the reference point; x, y, yaw, v, omega of the odometry; 1 if it diverged."""
+    dt: float
+    """Physics step [s]."""
+
+
+def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
+    """The simulator's vehicle as a `Plant`; its parameters are `VehicleParams`."""
+    from whill_mjx.kinematics import reference_pose
+    from whill_mjx.model import build_model
+    from whill_mjx.vehicle import place, substep
+
+    config = config or VehicleConfig()
+    model = build_model(spec, config)
+
+    def observe(state: Any) -> jax.Array:
+        odometry = state.odometry
+        return jnp.stack([*reference_pose(model, state.qpos), odometry.x, odometry.y, odometry.yaw, odometry.v,
+                          odometry.omega, state.diverged.astype(state.qpos.dtype)])
+
+    return Plant(lambda params, start: place(model, params, *start),
+                 lambda params, state, command: substep(model, params, state, command), observe, config.physics_dt)
+
+
+@struct.dataclass
+class Batch:
+    """Trials on a common grid; B trials, R records of K physics steps, M measurements (padded)."""
+
+    command: jax.Array  # (B, R, K, 2) m/s, rad/s
+    start: jax.Array  # (B, 5) x, y, yaw, v, omega
+    pose_index: jax.Array  # (B, M) int, record before each pose measurement
+    pose_weight: jax.Array  # (B, M) share of the record after it
+    odometry_index: jax.Array  # (B, L)
+    odometry_weight: jax.Array  # (B, L)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measurements of a batch (host arrays); masked samples are 0."""
+
+    pose: np.ndarray  # (B, M, 3)
+    pose_mask: np.ndarray  # (B, M, 3)
+    odometry: np.ndarray  # (B, L, 5)
+    odometry_mask: np.ndarray  # (B, L, 5)
+
+
+@struct.dataclass
+class Simulated:
+    """Simulated values at the measurements' times."""
+
+    pose: jax.Array  # (B, M, 3)
+    odometry: jax.Array  # (B, L, 5)
+    diverged: jax.Array  # (B,) above 0.5 where the state became non-finite
+
+
+def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_DT) -> tuple[Batch, Measured]:
+    """Resample and pad trials; ValueError when there is none."""
+    if not trials:
+        raise ValueError("no trials to simulate. Check the selections of training and held-out trials.")
+    stride = max(round(record_dt / dt), 1)
+    record = stride * dt
+    records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
+    poses = [_pose_table(trial.ground_truth) for trial in trials]
+    odometries = [_odometry_table(trial.odometry) for trial in trials]
+    command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
+    start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
+    pose_t, pose, pose_mask = _pad(poses)
+    odometry_t, odometry, odometry_mask = _pad(odometries)
+    pose_index, pose_weight = _grid(pose_t, record, records)
+    odometry_index, odometry_weight = _grid(odometry_t, record, records)
+    floats = [command.reshape(len(trials), records, stride, 2), start]
+    command_array, start_array = (jnp.asarray(array, jnp.result_type(float)) for array in floats)
+    batch = Batch(command_array, start_array, jnp.asarray(pose_index), jnp.asarray(pose_weight, jnp.result_type(float)),
+                  jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)))
+    return batch, Measured(pose, pose_mask, odometry, odometry_mask)
+
+
+def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
+    """Replay all trials of a batch with one parameter set. Differentiable in forward mode."""
+    return jax.vmap(lambda one: _simulate_one(plant, params, one))(batch)
+
+
+class Replay:
+    """Compiled replay of one batch for many parameter sets: `values` (N, P) go in, host arrays come out."""
+
+    def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
+        """`set_values` turns values (P,) into the vehicle's parameters."""
+
+        def one(values: jax.Array, batch: Batch) -> Simulated:
+            return simulate(plant, set_values(values), batch)
+
+        def one_jacobian(values: jax.Array, batch: Batch) -> tuple[Simulated, Simulated]:
+            """Values and their derivatives along each parameter: forward mode, directions batched."""
+            tangents = jnp.eye(values.shape[0], dtype=values.dtype)
+            output, derivative = jax.vmap(
+                lambda tangent: jax.jvp(lambda v: one(v, batch), (values,), (tangent,)), out_axes=(None, -1))(tangents)
+            return output, derivative
+
+        self._batch = batch
+        self._simulate = jax.jit(jax.vmap(one, in_axes=(0, None)))
+        self._jacobian = jax.jit(jax.vmap(one_jacobian, in_axes=(0, None)))
+
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """Replay with each of values (N, P); leaves gain the axis N in front."""
+        return jax.tree.map(np.asarray, self._simulate(jnp.asarray(values, jnp.result_type(float)), self._batch))
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replay and derivatives (a last axis P) for each of values (N, P)."""
+        return jax.tree.map(np.asarray, self._jacobian(jnp.asarray(values, jnp.result_type(float)), self._batch))
+
+
+def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Prediction]:
+    """Per trial what `metrics.score` compares, from the padded arrays of one parameter set (no axis N)."""
+    results = []
+    for i, trial in enumerate(trials):
+        truth = odometry = None
+        if trial.ground_truth is not None:
+            pose = np.asarray(simulated.pose[i, : len(trial.ground_truth.t)], float)
+            truth = PoseStream(trial.ground_truth.t, *pose.T)
+        if trial.odometry is not None:
+            table = np.asarray(simulated.odometry[i, : len(trial.odometry.t)], float)
+            odometry = OdometryStream(trial.odometry.t, *table.T)
+        results.append(Prediction(truth, odometry))
+    return results
+
+
+def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
+    state = plant.place(params, one.start)
+    first = plant.observe(state)
+
+    def physics(state: Any, command: jax.Array) -> tuple[Any, None]:
+        return plant.substep(params, state, command), None
+
+    def record(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
+        state, _ = jax.lax.scan(physics, state, commands)
+        return state, plant.observe(state)
+
+    _, later = jax.lax.scan(record, state, one.command)
+    path = jnp.concatenate([first[None], later])  # (R + 1, 9)
+    for column in YAW_COLUMNS:
+        path = path.at[:, column].set(_unwrap(path[:, column]))
+    # The measured yaw may count full turns from another origin than the simulated one.
+    path = path.at[:, 2].add(jax.lax.stop_gradient(_turns(one.start[2] - first[2])))
+
+    def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
+        before, after = path[index, columns], path[index + 1, columns]
+        return before + weight[:, None] * (after - before)
+
+    return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
+                     path[-1, 8])
+
+
+def _turns(angle: jax.Array) -> jax.Array:
+    return 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def _unwrap(angle: jax.Array) -> jax.Array:
+    """Angle (T,) without jumps; the full turns are constants to differentiation."""
+    jumps = jax.lax.stop_gradient(_turns(jnp.diff(angle)))
+    return angle - jnp.concatenate([jnp.zeros(1, angle.dtype), jnp.cumsum(jumps)])
+
+
+def _held_commands(trial: Trial, steps: int, dt: float) -> np.ndarray:
+    """(S, 2) command in force in the middle of each physics step; before the first command the start's speeds hold."""
+    middle = (np.arange(steps) + 0.5) * dt
+    held = command_in_force(trial.command, middle)
+    v = np.where(held >= 0, trial.command.v[held], trial.start.v)
+    omega = np.where(held >= 0, trial.command.omega[held], trial.start.omega)
+    return np.stack([v, omega], axis=-1)
+
+
+def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.ndarray]:
+    index = np.clip(np.floor(t / record + 1e-9).astype(int), 0, records - 1)
+    return index, np.clip(t / record - index, 0.0, 1.0)
+
+
+def _pad(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (B, M), values (B, M, C) and mask (B, M, C) of tables of different length; nan values are masked."""
+    longest = max(max(len(t) for t, _ in tables), 1)
+    width = tables[0][1].shape[1]
+    time = np.zeros((len(tables), longest))
+    values, mask = np.zeros((len(tables), longest, width)), np.zeros((len(tables), longest, width))
+    for i, (t, table) in enumerate(tables):
+        time[i, : len(t)] = t
+        known = np.isfinite(table)
+        values[i, : len(t)] = np.where(known, table, 0.0)
+        mask[i, : len(t)] = known
+    return time, values, mask
+
+
+def _pose_table(stream: PoseStream | None) -> tuple[np.ndarray, np.ndarray]:
+    if stream is None:
+        return np.zeros(0), np.zeros((0, 3))
+    return stream.t, np.stack([stream.x, stream.y, stream.yaw], axis=-1)
+
+
+def _odometry_table(stream: OdometryStream | None) -> tuple[np.ndarray, np.ndarray]:
+    if stream is None:
+        return np.zeros(0), np.zeros((0, 5))
+    absent = np.full(len(stream.t), np.nan)
+    pose = [absent if values is None else values for values in (stream.x, stream.y, stream.yaw)]
+    return stream.t, np.stack([*pose, stream.v, stream.omega], axis=-1)
+
+

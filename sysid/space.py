@@ -1,0 +1,101 @@
+"""Which parameters are searched, between which bounds, and on which scale.
+
+The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 20.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+LOG_SPAN = 20.0
+# Parameters that no driving log tells, or that only act through another one; they keep their value unless named.
+FIXED = {
+    "air_drag.area": "acts only as a product with air_drag.c_d",
+    "pid_drive.integral_limit": "never reached in ordinary driving",
+    "rolling_contact.grip": "part of the model, not of the vehicle",
+    "body.mass": "acts only as a ratio to forces that are fitted; weigh the vehicle",
+    "body.com_z": "has next to no effect on level ground",
+}
+
+
+@dataclass(frozen=True)
+class Space:
+    """P searched parameters."""
+
+    names: tuple[str, ...]
+    low: np.ndarray  # (P,)
+    high: np.ndarray  # (P,)
+    initial: np.ndarray  # (P,)
+    log: np.ndarray  # (P,) bool
+    fixed: tuple[tuple[str, str], ...] = ()
+    """Names that keep their value, each with the reason."""
+
+    def __post_init__(self) -> None:
+        for name, low, high, value in zip(self.names, self.low, self.high, self.initial, strict=True):
+            if not low < high:
+                raise ValueError(f"{name}: bounds {low:g} to {high:g}; low must be below high.")
+            if not low <= value <= high:
+                raise ValueError(f"{name}: initial value {value:g} is outside {low:g} to {high:g}. Widen the bounds.")
+            if not np.isfinite([low, high, value]).all():
+                raise ValueError(f"{name}: bounds {low:g} to {high:g} and value {value:g} must be finite.")
+
+    @property
+    def size(self) -> int:
+        return len(self.names)
+
+    def to_values(self, u: np.ndarray) -> np.ndarray:
+        """Values (..., P) of unit coordinates (..., P), which are clipped to [0, 1]."""
+        u = np.clip(u, 0.0, 1.0)
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        return np.where(self.log, low * (high / low) ** u, self.low + u * (self.high - self.low))
+
+    def to_unit(self, values: np.ndarray) -> np.ndarray:
+        """Unit coordinates (..., P) of values (..., P)."""
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        clipped = np.clip(values, self.low, self.high)
+        logarithm = np.log(np.where(self.log, clipped, 1.0) / low) / np.log(high / low)
+        return np.where(self.log, logarithm, (clipped - self.low) / (self.high - self.low))
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """d value / d u (..., P)."""
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
+
+    def subset(self, keep: Sequence[str]) -> Space:
+        """The space of the named parameters only."""
+        index = [self.names.index(name) for name in keep]
+        return replace(self, names=tuple(keep), low=self.low[index], high=self.high[index],
+                       initial=self.initial[index], log=self.log[index])
+
+
+def make_space(params: Any, names: Sequence[str] | None = None) -> Space:
+    """Space of a vehicle's parameters, with their described bounds.
+
+    Args:
+        params: `VehicleParams`; their values are where the search starts.
+        names: what to search; by default everything but `FIXED`.
+    """
+    from whill_mjx.parameters import describe, get_values
+
+    about = describe(params)
+    if names is None:
+        names = [name for name in about if name not in FIXED]
+    unknown = sorted(set(names) - set(about))
+    if unknown:
+        raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")
+    low = np.array([about[name].low for name in names], float)
+    high = np.array([about[name].high for name in names], float)
+    initial = np.asarray(get_values(params, names), float)
+    low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range
+    log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
+    kept = [(name, FIXED.get(name, "not selected")) for name in about if name not in names]
+    return Space(tuple(names), low, high, initial, log, tuple(kept))
+
+
+def is_delay(name: str) -> bool:
+    """Whether a parameter shifts time: its error landscape has steps, so it is profiled on a grid as well."""
+    return "delay" in name or "latency" in name
