@@ -15,8 +15,6 @@ from bridge.image import ImageError, to_rgb8
 from bridge.policy import Policy
 from bridge.safety import Command, SafetyConfig, Supervisor
 
-EARLY = 0.25
-"""Share of a period by which a frame may come early and still start the next policy step."""
 BACKSTOP = 1.25
 """Periods without a command after which the last one is sent again (while its frame is young) or zero."""
 BLIND_FRAMES = 5
@@ -34,6 +32,7 @@ class Controller:
         self._clock = clock  # only for the duration of a policy step
         self._period = 1 / policy.contract.rate_hz
         self._due = -np.inf
+        self._arrived = -np.inf
         self._sent = -np.inf
         self._last = Command(0.0, 0.0, "no frame yet")
         self._ticks = 0
@@ -86,10 +85,11 @@ class Controller:
     def _is_due(self, now: float) -> bool:
         """Return whether a policy step may start, and if so plan the next one.
 
-        The plan follows half of each deviation. So a camera near the policy's rate is never skipped however its clock
-        drifts, and a faster camera is thinned out to the policy's rate on average.
+        The frame nearest to the plan is taken, and the plan follows half of each deviation. So a camera near the
+        policy's rate is never skipped however its clock drifts, and a faster one is thinned out to the policy's rate.
         """
-        if now < self._due - EARLY * self._period:
+        interval, self._arrived = min(now - self._arrived, self._period), now
+        if now < self._due - interval / 2:
             return False
         self._due = (now if now - self._due > self._period else (now + self._due) / 2) + self._period
         return True

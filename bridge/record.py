@@ -1,0 +1,203 @@
+"""Records one drive as a trial of a driving-log dataset, which `sysid.fit` reads.
+
+    python -m bridge.record logs/monday figure_eight_1
+
+Rows are written as they come into a hidden folder beside the trial, which gets the trial's name when the recording
+ends; a killed recorder leaves the hidden folder with all rows but the last second's.
+"""
+
+import argparse
+import math
+import os
+import re
+import sys
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from bridge import ros
+
+COLUMNS = {
+    "command": ("t", "v", "omega"),
+    "odometry": ("t", "x", "y", "yaw", "v", "omega"),
+    "ground_truth": ("t", "x", "y", "yaw"),
+}
+
+
+class TrialWriter:
+    """Writes the streams of one trial; times count from the first row of any stream."""
+
+    def __init__(self, dataset: str | Path, trial: str) -> None:
+        """Open the trial for writing.
+
+        Raises:
+            ValueError: the trial exists already, or its name is no plain file name.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", trial):
+            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
+                             "Choose another name, like circle_1.")
+        self.folder = Path(dataset) / "trials" / trial
+        if self.folder.exists():
+            raise ValueError(f"{self.folder}: exists already; a recording never replaces another. Choose another name.")
+        self._partial = self.folder.with_name(f".{trial}.partial-{os.getpid()}")
+        self._partial.mkdir(parents=True)
+        self._files: dict[str, IO[str]] = {}
+        self._origin: float | None = None
+        self._first_pose: tuple[float, float, float] | None = None
+        self._yaw: float | None = None
+        self.rows = dict.fromkeys(COLUMNS, 0)
+
+    def command(self, t: float, v: float, omega: float) -> None:
+        """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
+        self._add("command", t, v, omega)
+
+    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float) -> None:
+        """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped."""
+        if self._first_pose is None or self._yaw is None:
+            self._first_pose, self._yaw = (x, y, yaw), yaw
+        x0, y0, yaw0 = self._first_pose
+        self._yaw += math.remainder(yaw - self._yaw, 2 * math.pi)
+        dx, dy = x - x0, y - y0
+        along = math.cos(yaw0) * dx + math.sin(yaw0) * dy
+        left = -math.sin(yaw0) * dx + math.cos(yaw0) * dy
+        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega)
+
+    def ground_truth(self, t: float, x: float, y: float, yaw: float) -> None:
+        """Add an outside measurement of the drive-axle centre in the room."""
+        self._add("ground_truth", t, x, y, yaw)
+
+    def flush(self) -> None:
+        """Hand the rows so far to the operating system."""
+        for file in self._files.values():
+            file.flush()
+
+    def close(self) -> Path:
+        """End the recording: give the trial its name and return its folder."""
+        for file in self._files.values():
+            file.flush()
+            os.fsync(file.fileno())
+            file.close()
+        os.replace(self._partial, self.folder)
+        return self.folder
+
+    def _add(self, stream: str, t: float, *values: float) -> None:
+        if not all(math.isfinite(value) for value in (t, *values)):
+            return  # a log holds measurements; a fit cannot use a hole with a number's name
+        if stream not in self._files:
+            self._files[stream] = open(self._partial / f"{stream}.csv", "w", encoding="utf-8")
+            self._files[stream].write(",".join(COLUMNS[stream]) + "\n")
+        if self._origin is None:
+            self._origin = t
+        self._files[stream].write(f"{t - self._origin:.4f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
+        self.rows[stream] += 1
+
+
+def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
+    """Write dataset.toml unless the dataset has one: what was driven, and its nominal geometry."""
+    path = dataset / "dataset.toml"
+    if path.exists():
+        return
+    mass = f"mass = {options.mass}                # kg, nominal\n" if options.mass else ""
+    text = (
+        "schema = 1\n"
+        f"vehicle = {toml_text(options.vehicle)}\n"
+        f"wheel_radius = {options.wheel_radius}      # m, nominal\n"
+        f"track = {options.track}              # m, nominal, between drive wheels\n"
+        f"wheelbase = {options.wheelbase}           # m, drive axle to front axle\n"
+        f"{mass}"
+        f"command_limits = [{options.v_limit}, {options.omega_limit}]  # m/s, rad/s\n"
+        'reference_point = "drive axle centre"\n'
+        f"odometry = {toml_text(options.odometry_topic)}\n"
+        f"ground_truth = {toml_text(options.ground_truth_topic)}\n"
+        "held_out = []   # trials to be predicted, never fitted\n"
+    )
+    temporary = path.with_name(".dataset.toml.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def toml_text(text: str) -> str:
+    """Return the text as a TOML basic string."""
+    return '"' + "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in text) + '"'
+
+
+class RecordNode:
+    """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
+
+    def __init__(self, node: Any, writer: TrialWriter, options: argparse.Namespace) -> None:
+        from geometry_msgs.msg import Twist
+        from nav_msgs.msg import Odometry
+
+        self.writer = writer
+        self._started = time.monotonic()
+        self._seconds = options.seconds
+        node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable(10))
+        node.create_subscription(Odometry, options.odometry_topic, self._on_odometry, ros.best_effort())
+        node.create_subscription(Odometry, options.ground_truth_topic, self._on_ground_truth, ros.best_effort())
+        node.create_timer(1.0, writer.flush)
+
+    def finished(self) -> bool:
+        """Return whether the recording time is over."""
+        return bool(self._seconds) and time.monotonic() - self._started > self._seconds
+
+    def _on_command(self, message: Any) -> None:
+        self.writer.command(time.monotonic(), message.linear.x, message.angular.z)
+
+    def _on_odometry(self, message: Any) -> None:
+        speed = message.twist.twist
+        self.writer.odometry(time.monotonic(), *planar_pose(message), speed.linear.x, speed.angular.z)
+
+    def _on_ground_truth(self, message: Any) -> None:
+        self.writer.ground_truth(time.monotonic(), *planar_pose(message))
+
+
+def planar_pose(message: Any) -> tuple[float, float, float]:
+    """Return x [m], y [m], yaw [rad] of nav_msgs/Odometry."""
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+    return position.x, position.y, yaw
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """Return the options of the command line. The geometry's defaults are those of the WHILL Model CR."""
+    parser = argparse.ArgumentParser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
+    parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
+    parser.add_argument("trial", help="name of the trial, like circle_1")
+    parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
+    parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
+    parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
+    parser.add_argument("--vehicle", default="WHILL Model CR")
+    parser.add_argument("--wheel-radius", type=float, default=0.1325, help="[m]")
+    parser.add_argument("--track", type=float, default=0.496, help="[m]")
+    parser.add_argument("--wheelbase", type=float, default=0.45, help="[m]")
+    parser.add_argument("--mass", type=float, help="[kg], where known")
+    parser.add_argument("--v-limit", type=float, default=1.0, help="[m/s]")
+    parser.add_argument("--omega-limit", type=float, default=1.0, help="[rad/s]")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Record until the time is over, SIGTERM or Ctrl-C; return 2 where nothing can be written, 3 without odometry."""
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parse_arguments(own)
+    try:
+        writer = TrialWriter(options.dataset, options.trial)
+        write_dataset_file(options.dataset, options)
+    except (ValueError, OSError) as error:
+        print(f"bridge.record: {error}", file=sys.stderr)
+        return 2
+    try:
+        with ros.node_session("bridge_record", ros_arguments) as node:
+            ros.spin(node, RecordNode(node, writer, options).finished)
+    finally:
+        folder = writer.close()
+        print(f"bridge.record: {folder}: rows {writer.rows}", file=sys.stderr)
+    if not writer.rows["odometry"]:
+        print(f"bridge.record: {folder}/odometry.csv: no message came on {options.odometry_topic}, and a fit needs "
+              "odometry. Name the vehicle's topic with --odometry-topic.", file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

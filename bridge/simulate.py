@@ -1,0 +1,285 @@
+"""The simulator behind the vehicle's topics, so that the policy node cannot tell it from the chair.
+
+    python -m bridge.simulate --task corridor --episodes 10
+
+Time runs like the wall clock. The command received by the middle of a control period drives the whole period; an image
+shows its end. Between two episodes the camera is silent for RESET_SILENCE, which is longer than the age the policy node
+tolerates: so it stops, forgets, and no frame of an episode can reach the next one.
+"""
+
+import argparse
+import array
+import importlib
+import json
+import math
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from bridge import ros
+
+RESET_SILENCE = 0.5
+COMMAND_EXPIRY = 0.2
+"""The chair's controller forgets a command after this time [s]."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is known at the end of a control period."""
+
+    image: np.ndarray
+    """(H, W, 3) uint8 rgb8."""
+    x: float
+    """Drive-axle centre in the room [m]."""
+    y: float
+    """[m]"""
+    yaw: float
+    """[rad]"""
+    v: float
+    """True forward speed [m/s]."""
+    omega: float
+    """True yaw rate [rad/s]."""
+    collided: bool = False
+    reached_goal: bool = False
+    done: bool = False
+    odometry: tuple[float, float, float, float, float] | None = None
+    """x, y, yaw, v, omega as the vehicle's own odometry reports them; None where the simulator has none."""
+
+
+class SimulatedVehicle(Protocol):
+    """Any simulator that can be driven one control period at a time."""
+
+    period: float
+    """Control period [s]."""
+
+    def reset(self, seed: int) -> Frame:
+        """Begin an episode."""
+
+    def step(self, v: float, omega: float) -> Frame:
+        """Advance one control period with the command v [m/s], omega [rad/s]."""
+
+
+@dataclass
+class Episode:
+    """Outcome of one episode, for the results file."""
+
+    seed: int
+    steps: int = 0
+    collided: bool = False
+    reached_goal: bool = False
+    x: float = 0.0
+    y: float = 0.0
+    commands: int = 0
+
+
+class SimulateNode:
+    """Serves one simulated vehicle on the ROS graph."""
+
+    def __init__(self, node: Any, vehicle: SimulatedVehicle, options: argparse.Namespace) -> None:
+        from geometry_msgs.msg import Twist
+        from nav_msgs.msg import Odometry
+        from sensor_msgs.msg import Image
+        from std_msgs.msg import Bool
+
+        self.node, self.vehicle, self.options = node, vehicle, options
+        self._types = (Image, Odometry, Bool)
+        self._image = node.create_publisher(Image, ros.IMAGE_TOPIC, ros.best_effort())
+        self._truth = node.create_publisher(Odometry, ros.GROUND_TRUTH_TOPIC, ros.best_effort())
+        self._odometry = node.create_publisher(Odometry, ros.ODOMETRY_TOPIC, ros.best_effort())
+        self._collision = node.create_publisher(Bool, ros.COLLISION_TOPIC, ros.reliable(10))
+        node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
+        self.episodes: list[Episode] = []
+        self.command_log: list[tuple[float, float, float]] = []
+        self.delays: list[float] = []
+        """Seconds from publishing an image to receiving the first command after it."""
+        self._asked: float | None = None
+        vehicle.reset(options.seed)
+        vehicle.step(0.0, 0.0)  # compiles, where the simulator does
+        self._half = 0
+        self._ready_at = self._begin_at = time.monotonic()
+        self._frame: Frame | None = None
+        self._next: Frame | None = None
+        self.finished_at: float | None = None
+        node.create_timer(vehicle.period / 2, self._on_half_period)
+
+    def finished(self) -> bool:
+        """Return whether all episodes are over, and the time to linger has passed."""
+        return self.finished_at is not None and time.monotonic() - self.finished_at > self.options.linger
+
+    def results(self) -> dict[str, Any]:
+        """Return the episodes, and what came on the command topic."""
+        times = [t for t, _, _ in self.command_log]
+        moving = [i for i, (_, v, omega) in enumerate(self.command_log) if v or omega]
+        return {
+            "episodes": [vars(episode) for episode in self.episodes],
+            "commands": len(times),
+            "command_times": times,
+            "stops_at_end": len(times) - 1 - moving[-1] if moving else len(times),
+            "frame_to_command_s": self.delays,
+        }
+
+    def _on_command(self, message: Any) -> None:
+        now = time.monotonic()
+        self.command_log.append((now, message.linear.x, message.angular.z))
+        if self._asked is not None:
+            self.delays.append(now - self._asked)
+            self._asked = None
+        if self._frame is not None:
+            self.episodes[-1].commands += 1
+
+    def _on_half_period(self) -> None:
+        self._half += 1
+        if self.finished_at is not None:
+            return
+        if self._frame is None:
+            if time.monotonic() >= self._begin_at and self._half % 2 == 0 and self._has_driver():
+                self._begin()
+        elif self._half % 2:
+            self._next = self.vehicle.step(*self._command())
+            self._publish_pose(_halfway(self._frame, self._next))
+        elif self._next is not None:
+            self._show(self._next)
+
+    def _has_driver(self) -> bool:
+        """Return whether somebody looks and steers, or the time to wait for that is over. Discovery takes up to 2 s."""
+        if time.monotonic() - self._ready_at > self.options.wait or self.episodes:
+            return True
+        return self._image.get_subscription_count() > 0 and self.node.count_publishers(ros.COMMAND_TOPIC) > 0
+
+    def _begin(self) -> None:
+        seed = self.options.seed + len(self.episodes)
+        self.episodes.append(Episode(seed))
+        self._next = None
+        self._collision.publish(self._types[2](data=False))
+        self._show(self.vehicle.reset(seed))
+        self.episodes[-1].steps = 0
+
+    def _show(self, frame: Frame) -> None:
+        """Publish the end of a period, and end the episode where it is over."""
+        self._frame = frame
+        self._publish_image(frame.image)
+        self._publish_pose(frame)
+        episode = self.episodes[-1]
+        episode.steps += 1
+        if not frame.done:
+            return
+        episode.collided, episode.reached_goal = bool(frame.collided), bool(frame.reached_goal)
+        episode.x, episode.y = float(frame.x), float(frame.y)
+        if frame.collided:
+            self._collision.publish(self._types[2](data=True))
+        self._frame = None
+        self._begin_at = time.monotonic() + RESET_SILENCE
+        self.node.get_logger().info(f"episode {len(self.episodes)}: {episode}")
+        if len(self.episodes) == self.options.episodes:
+            self.finished_at = time.monotonic()
+        if self.options.results:
+            write_json(Path(self.options.results), self.results())
+
+    def _command(self) -> tuple[float, float]:
+        """Return the command in force: the last one, zero where it has expired or is not finite."""
+        if not self.command_log:
+            return 0.0, 0.0
+        received, v, omega = self.command_log[-1]
+        if time.monotonic() - received > COMMAND_EXPIRY or not (math.isfinite(v) and math.isfinite(omega)):
+            return 0.0, 0.0
+        return v, omega
+
+    def _publish_image(self, image: np.ndarray) -> None:
+        message = self._types[0]()
+        if self.options.image_size:
+            image = enlarge(image, self.options.image_size)
+        message.height, message.width = image.shape[:2]
+        message.encoding, message.step = "rgb8", image.shape[1] * 3
+        message.header.frame_id = "camera_front"
+        message.data = array.array("B", image.tobytes())  # an ndarray would be copied byte by byte
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        self._asked = time.monotonic()
+        self._image.publish(message)
+
+    def _publish_pose(self, frame: Frame) -> None:
+        self._truth.publish(self._pose_message((frame.x, frame.y, frame.yaw, frame.v, frame.omega), "map"))
+        if frame.odometry is not None:
+            self._odometry.publish(self._pose_message(frame.odometry, "odom"))
+
+    def _pose_message(self, values: tuple[float, float, float, float, float], frame_id: str) -> Any:
+        x, y, yaw, v, omega = (float(value) for value in values)
+        message = self._types[1]()
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        message.header.frame_id, message.child_frame_id = frame_id, "base_link"
+        message.pose.pose.position.x, message.pose.pose.position.y = x, y
+        message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = v, omega
+        return message
+
+
+def _halfway(a: Frame, b: Frame) -> Frame:
+    """Return the frame in the middle of two; angles go the short way round."""
+    def middle(p: tuple[float, ...], q: tuple[float, ...]) -> tuple[float, ...]:
+        turn = math.remainder(q[2] - p[2], 2 * math.pi)
+        return (p[0] + q[0]) / 2, (p[1] + q[1]) / 2, p[2] + turn / 2, (p[3] + q[3]) / 2, (p[4] + q[4]) / 2
+
+    x, y, yaw, v, omega = middle((a.x, a.y, a.yaw, a.v, a.omega), (b.x, b.y, b.yaw, b.v, b.omega))
+    odometry = None if a.odometry is None or b.odometry is None else middle(a.odometry, b.odometry)
+    return Frame(a.image, x, y, yaw, v, omega, odometry=odometry)  # type: ignore[arg-type]  # five numbers each
+
+
+def enlarge(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the image at (height, width) by repeating pixels, as a camera of that size would send it."""
+    rows = np.arange(size[0]) * image.shape[0] // size[0]
+    columns = np.arange(size[1]) * image.shape[1] // size[1]
+    return image[rows[:, None], columns]
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file in one piece."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(json.dumps(content) + "\n")
+    os.replace(temporary, path)
+
+
+def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
+    """Return the simulator that `--simulator MODULE:FACTORY` names."""
+    module, _, name = options.simulator.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SystemExit(f"bridge.simulate: --simulator {options.simulator}: {error}. It must be MODULE:FACTORY, "
+                         "called with task and vehicle. Correct it or leave it out.") from error
+    return factory(task=options.task, vehicle=options.vehicle)
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(prog="bridge.simulate", description="Serve the simulator on the vehicle's topics.")
+    parser.add_argument("--task", default="corridor")
+    parser.add_argument("--vehicle", help="vehicle file; default: the task's own vehicle")
+    parser.add_argument("--episodes", type=int, default=0, help="end after so many; 0: never")
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode; each next one adds 1")
+    parser.add_argument("--wait", type=float, default=10.0, help="wait so long for a driver before the first one [s]")
+    parser.add_argument("--linger", type=float, default=1.0, help="listen for so long after the last episode [s]")
+    parser.add_argument("--results", help="JSON file for the outcome of the episodes")
+    parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
+    parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node until its episodes are over, SIGTERM or Ctrl-C."""
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parse_arguments(own)
+    vehicle = make_vehicle(options)
+    with ros.node_session("bridge_simulate", ros_arguments) as node:
+        simulate = SimulateNode(node, vehicle, options)
+        ros.spin(node, simulate.finished)
+        if options.results:
+            write_json(Path(options.results), simulate.results())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

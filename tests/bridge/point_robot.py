@@ -1,0 +1,42 @@
+"""A point on a plane instead of a chair: its camera image is one colour that changes as it moves."""
+
+import math
+
+import numpy as np
+
+from bridge.simulate import Frame
+
+
+class PointRobot:
+    """Drives from x = 0; the goal is at x = 0.3 m, so at 0.3 m/s it is reached in about a second."""
+
+    period = 0.1
+    goal = 0.3
+
+    def __init__(self, task="", vehicle=None):
+        self.reset(0)
+
+    def reset(self, seed):
+        self.x = self.y = self.yaw = 0.0
+        self.steps = 0
+        return self._frame(0.0, 0.0)
+
+    def step(self, v, omega):
+        self.yaw += omega * self.period
+        self.x += v * self.period * math.cos(self.yaw)
+        self.y += v * self.period * math.sin(self.yaw)
+        self.steps += 1
+        return self._frame(v, omega)
+
+    def _frame(self, v, omega):
+        image = np.full((64, 64, 3), 255, np.uint8)
+        image[0, self.steps % 64] = 254 - self.steps % 100  # each frame differs, as a real camera's do
+        reached = self.x >= self.goal
+        return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=reached or self.steps >= 100,
+                     odometry=(self.x, self.y, self.yaw, v, omega))
+
+
+class EndlessRobot(PointRobot):
+    """Never arrives within a test."""
+
+    goal = 100.0

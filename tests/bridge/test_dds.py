@@ -1,0 +1,159 @@
+"""Whole drives of separate processes over real DDS, on a domain of their own."""
+
+import csv
+import importlib.util
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import tiny_policy
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed")
+counter = itertools.count()
+
+
+class Graph:
+    """Processes of one ROS domain that end with the test."""
+
+    def __init__(self, folder):
+        self.folder, self.processes = folder, {}
+        domain = 1 + (os.getpid() * 7 + next(counter)) % 100
+        python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log")}
+
+    def start(self, name, *arguments):
+        log = open(self.folder / f"{name}.log", "w")
+        command = [sys.executable, "-m", f"bridge.{name}", *map(str, arguments)]
+        self.processes[name] = subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=log, stderr=log)
+        log.close()
+
+    def log(self, name):
+        return (self.folder / f"{name}.log").read_text()
+
+    def end(self, name, number=signal.SIGTERM):
+        """Send a signal and return the exit code."""
+        self.processes[name].send_signal(number)
+        return self.wait(name)
+
+    def wait(self, name, seconds=60):
+        try:
+            return self.processes[name].wait(seconds)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"{name} did not end in {seconds} s: {self.log(name)}")
+
+    def wait_for(self, name, text, seconds=60):
+        """Wait until a process has said something."""
+        end = time.monotonic() + seconds
+        while text not in self.log(name):
+            assert time.monotonic() < end and self.processes[name].poll() is None, f"{name}: {self.log(name)}"
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def graph(tmp_path):
+    graph = Graph(tmp_path)
+    yield graph
+    for process in graph.processes.values():
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def policy(tmp_path):
+    return tiny_policy.write(tmp_path / "tiny")
+
+
+def column(path, name):
+    with open(path, encoding="utf-8", newline="") as file:
+        return [float(row[name]) for row in csv.DictReader(file)]
+
+
+def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph, policy, tmp_path):
+    results = tmp_path / "results.json"
+    graph.start("record", tmp_path / "logs", "straight_1")
+    graph.start("drive", policy)
+    graph.wait_for("drive", "standing: no frame yet")
+    graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 2, "--linger", 1.5,
+                "--results", results)
+    assert graph.wait("simulate") == 0, graph.log("simulate")
+    assert graph.end("drive") == 0, graph.log("drive")
+    assert graph.end("record") == 0, graph.log("record")
+
+    outcome = json.loads(results.read_text())
+    assert [(episode["reached_goal"], episode["collided"]) for episode in outcome["episodes"]] == [(True, False)] * 2
+    for episode in outcome["episodes"]:
+        assert 0.6 * episode["steps"] <= episode["commands"] <= 1.6 * episode["steps"]  # one command per 100 ms period
+    assert outcome["stops_at_end"] >= 5  # the camera went silent: the bridge stopped by itself
+
+    trial = tmp_path / "logs" / "trials" / "straight_1"
+    speeds, times = column(trial / "command.csv", "v"), column(trial / "command.csv", "t")
+    assert max(speeds) == pytest.approx(0.3, abs=1e-3) and speeds[-5:] == [0.0] * 5
+    assert times == sorted(times)
+    distance = column(trial / "odometry.csv", "x")
+    assert max(distance) == pytest.approx(max(column(trial / "ground_truth.csv", "x")), abs=0.05)
+    rows_per_command = len(distance) / sum(v > 0 for v in speeds)
+    assert rows_per_command > 1.2  # 20 Hz against 10 Hz
+    assert (tmp_path / "logs" / "dataset.toml").is_file()
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
+def test_vehicle_is_stopped_however_the_policy_node_ends(graph, policy, tmp_path, number, code):
+    results = tmp_path / "results.json"
+    if number == signal.SIGKILL:
+        graph.start("guard")
+    graph.start("simulate", "--simulator", "point_robot:EndlessRobot", "--results", results)
+    graph.start("drive", policy)
+    graph.wait_for("drive", "driving")
+    if number == signal.SIGKILL:
+        graph.wait_for("guard", "guarding")
+    time.sleep(0.5)
+    assert graph.end("drive", number) == code, graph.log("drive")
+    time.sleep(1.0)
+    assert graph.end("simulate") == 0, graph.log("simulate")
+    outcome = json.loads(results.read_text())
+    assert outcome["commands"] > outcome["stops_at_end"] >= 5
+
+
+def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):
+    graph.start("simulate", "--simulator", "point_robot:EndlessRobot")
+    graph.start("drive", policy)
+    graph.wait_for("drive", "driving")
+    code = ("import rclpy, time; from geometry_msgs.msg import Twist; rclpy.init(); "
+            "node = rclpy.create_node('joystick'); "
+            "publisher = node.create_publisher(Twist, '/whill/controller/cmd_vel', 1); time.sleep(60)")
+    graph.processes["joystick"] = subprocess.Popen([sys.executable, "-c", code], env=graph.environment)
+    graph.wait_for("drive", "another node publishes commands")
+    assert "joystick" in graph.log("drive")
+
+
+def test_missing_camera_is_named(graph, policy):
+    graph.start("drive", policy)
+    graph.wait_for("drive", "no publisher on /sensing/camera/front/image_raw")
+
+
+def test_large_best_effort_images_arrive_with_the_shipped_profile(graph, policy, tmp_path):
+    graph.start("drive", policy)
+    graph.wait_for("drive", "standing: no frame yet")
+    graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 1, "--image-size", 720, 1280,
+                "--results", tmp_path / "results.json")
+    assert graph.wait("simulate") == 0, graph.log("simulate")
+    (episode,) = json.loads((tmp_path / "results.json").read_text())["episodes"]
+    assert episode["reached_goal"] and episode["commands"] >= 0.6 * episode["steps"]
+
+
+@pytest.mark.parametrize("damage", ["missing", "hash"])
+def test_refused_policy_ends_the_node_with_an_error_before_it_joins_the_graph(graph, policy, damage):
+    if damage == "hash":
+        (policy / "policy.onnx").write_bytes(b"x")
+    graph.start("drive", policy if damage == "hash" else policy.with_name("nowhere"))
+    assert graph.wait("drive") == 2
+    assert ("SHA-256" if damage == "hash" else "does not exist") in graph.log("drive")

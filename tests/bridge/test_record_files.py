@@ -1,0 +1,114 @@
+"""The recorder's files: the dataset format, whole trials only."""
+
+import argparse
+import csv
+import math
+import tomllib
+
+import pytest
+
+from bridge.guard import Watchdog
+from bridge.record import TrialWriter, parse_arguments, toml_text, write_dataset_file
+from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
+
+pytestmark = pytest.mark.quick
+
+
+def read(path):
+    with open(path, encoding="utf-8", newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def test_trial_has_the_columns_of_the_format_and_one_time_origin(tmp_path):
+    writer = TrialWriter(tmp_path, "circle_1")
+    writer.command(1000.0, 0.5, -0.2)
+    writer.odometry(1000.05, 0.0, 0.0, 0.0, 0.1, 0.0)
+    writer.ground_truth(1000.1, 3.0, 4.0, 1.5)
+    assert not (tmp_path / "trials" / "circle_1").exists()  # not before it is whole
+    folder = writer.close()
+    assert read(folder / "command.csv") == [{"t": 0.0, "v": 0.5, "omega": -0.2}]
+    assert read(folder / "odometry.csv") == [{"t": 0.05, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0}]
+    assert read(folder / "ground_truth.csv") == [{"t": 0.1, "x": 3.0, "y": 4.0, "yaw": 1.5}]
+
+
+def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
+    writer = TrialWriter(tmp_path, "spin_1")
+    for i in range(100):  # two turns on a circle that starts at (5, 6) heading east of north
+        yaw = 1.0 + 0.13 * i
+        wrapped = math.remainder(yaw, 2 * math.pi)
+        x, y = 5 + math.sin(yaw) - math.sin(1.0), 6 - math.cos(yaw) + math.cos(1.0)
+        writer.odometry(i * 0.05, x, y, wrapped, 1.0, 1.0)
+    rows = read(writer.close() / "odometry.csv")
+    for i, row in enumerate(rows):
+        turn = 0.13 * i
+        assert row["yaw"] == pytest.approx(turn, abs=1e-5)
+        assert (row["x"], row["y"]) == pytest.approx((math.sin(turn), 1 - math.cos(turn)), abs=1e-5)
+
+
+def test_values_that_are_not_finite_are_left_out(tmp_path):
+    writer = TrialWriter(tmp_path, "a")
+    writer.command(0.0, math.nan, 0.0)
+    writer.command(0.1, 0.2, 0.0)
+    assert len(read(writer.close() / "command.csv")) == 1
+
+
+def test_recording_never_replaces_a_trial(tmp_path):
+    TrialWriter(tmp_path, "a").close()
+    with pytest.raises(ValueError, match="exists already"):
+        TrialWriter(tmp_path, "a")
+
+
+@pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a b"])
+def test_trial_name_that_is_no_folder_name_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="names a folder"):
+        TrialWriter(tmp_path, name)
+
+
+def test_dataset_file_is_valid_and_an_existing_one_is_kept(tmp_path):
+    options = parse_arguments([str(tmp_path), "a", "--vehicle", 'the "blue" \\ chair\n'])
+    write_dataset_file(tmp_path, options)
+    table = tomllib.loads((tmp_path / "dataset.toml").read_text(encoding="utf-8"))
+    assert table["schema"] == 1 and table["track"] == 0.496 and table["held_out"] == []
+    assert table["vehicle"] == 'the "blue" \\ chair\n' and "mass" not in table
+    write_dataset_file(tmp_path, argparse.Namespace(**{**vars(options), "track": 9.0}))
+    assert tomllib.loads((tmp_path / "dataset.toml").read_text(encoding="utf-8"))["track"] == 0.496
+
+
+@pytest.mark.parametrize("text", ["plain", '"', "\\", "\\u0041", "a\tb", "\x7f", "日本"])
+def test_any_text_survives_the_dataset_file(text):
+    assert tomllib.loads(f"a = {toml_text(text)}")["a"] == text
+
+
+def test_own_dds_profile_is_used_unless_the_user_chose_one():
+    environment = {}
+    assert use_dds_profile(environment) == str(PROFILE) == environment["FASTRTPS_DEFAULT_PROFILES_FILE"]
+    assert PROFILE.is_file() and "33554432" in PROFILE.read_text()
+    for variable in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
+        environment = {variable: "mine.xml"}
+        assert use_dds_profile(environment) == "mine.xml" and environment == {variable: "mine.xml"}
+
+
+def test_ros_arguments_are_passed_on():
+    assert split_ros_arguments(["a", "--b", "--ros-args", "-r", "x:=y"]) == (["a", "--b"], ["--ros-args", "-r", "x:=y"])
+    assert split_ros_arguments(["a"]) == (["a"], [])
+
+
+def test_guard_sends_zeros_only_after_a_motion_was_followed_by_silence():
+    guard = Watchdog()
+    assert not any(guard.tick(t / 100) for t in range(100))  # nothing was ever commanded
+    guard.command(1.0, True)
+    sent = [t for t in range(100, 200) if guard.tick(t / 100)]
+    assert sent[0] in (117, 118) and len(sent) == 10 and guard.stops == 1
+    guard.command(2.0, True)
+    guard.command(2.1, False)  # the policy node stopped by itself
+    assert not any(guard.tick(2.1 + t / 100) for t in range(100))
+
+
+def test_guard_stays_silent_while_commands_flow_and_yields_when_they_return():
+    guard = Watchdog()
+    for i in range(100):
+        guard.command(i * 0.125, True)
+        assert not any(guard.tick(i * 0.125 + t / 100) for t in range(12))
+    assert guard.tick(99 * 0.125 + 0.2)
+    guard.command(99 * 0.125 + 0.21, True)
+    assert not guard.tick(99 * 0.125 + 0.26)
