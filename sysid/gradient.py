@@ -79,7 +79,7 @@ def profile_delays(
     """Cost over a grid of each delay-type parameter, the others held at u (P,).
 
     Returns:
-        Per delay its name, the grid (G,) in unit coordinates and the costs (G,).
+        Per delay its name, the grid (G,) of its values [s] and the costs (G,).
     """
     profiles = []
     for index, name in enumerate(space.names):
@@ -87,7 +87,7 @@ def profile_delays(
             grid = np.linspace(0.0, 1.0, points)
             at = np.tile(u, (len(grid), 1))
             at[:, index] = grid
-            profiles.append((name, grid, objective.weighted_cost(at)))
+            profiles.append((name, space.to_values(at)[:, index], objective.weighted_cost(at)))
     return profiles
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.log import Command, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,8 @@ def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
     """Trials that are true replicates: of one manoeuvre with equal commands, two at least."""
     groups: dict[tuple[str, bytes, bytes], list[Trial]] = {}
     for trial in trials:
+        if trial.name == trial.manoeuvre or manoeuvre_of(trial.name) != trial.manoeuvre:
+            continue  # not a numbered repetition
         key = (trial.manoeuvre, trial.command.v.tobytes(), trial.command.omega.tobytes())
         groups.setdefault(key, []).append(trial)
     return [group for group in groups.values() if len(group) > 1]

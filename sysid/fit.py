@@ -1,0 +1,343 @@
+"""Fit a vehicle to a driving log: `python -m sysid.fit DATASET --out RUN`.
+
+Only training trials are fitted; held-out ones are predicted once, at the end, by the initial and the fitted vehicle.
+Writes RUN/report.json (`sysid.report`), RUN/*.png and RUN/vehicle.toml.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from sysid import gradient, tpe, uncertainty
+from sysid.log import Log, Trial
+from sysid.measured import load_any
+from sysid.metrics import Prediction
+from sysid.objective import Noise, Objective, estimate_noise
+from sysid.report import KIND, SCHEMA, error_rows, parameter_table, summaries, table, write_report
+from sysid.result import FitResult, Progress
+from sysid.rollout import Plant, Replay, make_batch, predictions, vehicle_plant
+from sysid.space import Space, make_space
+from whill_mjx.config import VehicleConfig
+from whill_mjx.parameters import describe, get_values, set_values
+from whill_mjx.presets import preset_params
+
+QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
+QUICK_EVALUATIONS = 64
+QUICK_ITERATIONS = 14
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a log is fitted."""
+
+    preset: Literal["paper", "physical"] = "physical"
+    """Base model whose parameters are fitted."""
+    method: Literal["tpe", "lm", "both"] = "both"
+    """Global search, gradient search, or a short global search that gives the gradient search its starts."""
+    trials: int = 192
+    """Parameter sets that the global search tries."""
+    starts: int = 4
+    """Starts of the gradient search: the initial values and the best of the global search."""
+    iterations: int = 40
+    """Iterations of the gradient search."""
+    seed: int = 0
+    """Seed of both searches."""
+    quick: bool = False
+    """Fewer trials, candidates and iterations: minutes on two cores."""
+    channels: Literal["both", "ground_truth", "odometry"] = "both"
+    """Which measurements are fitted; all are scored."""
+    robust: bool = False
+    """Count large residuals linearly (Huber)."""
+    parameters: tuple[str, ...] = ()
+    """Names to fit; by default all that a driving log can tell."""
+    physics_dt: float = 0.005
+    """Physics step [s]."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted vehicle and what is known of it."""
+
+    params: Any
+    """`VehicleParams` at the fitted values."""
+    initial_params: Any
+    space: Space
+    uncertainty: uncertainty.Uncertainty
+    noise: Noise
+    scan: FitResult | None
+    """Result of the global search."""
+    search: FitResult | None
+    """Result of the gradient search."""
+    u: np.ndarray  # (P,) fitted unit coordinates
+    initial_cost: float
+    cost: float
+    """Mean squared residual in noise scales; J in metres where method is "tpe"."""
+    profiles: list[tuple[str, np.ndarray, np.ndarray]]
+    seconds: float
+    plant: Plant
+
+
+def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None) -> Fit:
+    """Fit the training trials of a log.
+
+    Args:
+        log: its held-out trials are not looked at.
+        params: where the search starts; by default the preset's values for the log's vehicle.
+    """
+    config = config or FitConfig()
+    began = time.perf_counter()
+    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
+    if not trials:
+        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    if config.quick and len(trials) > QUICK_TRIALS:
+        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
+    plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
+    params = preset_params(log.spec, config.preset) if params is None else params
+    space = make_space(params, config.parameters or None)
+    objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
+
+    scan = search = None
+    starts = space.to_unit(space.initial)[None]
+    start_count = min(config.starts, 2) if config.quick else config.starts
+    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
+    profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
+    if config.method in ("tpe", "both"):
+        evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
+        cost = "paper" if config.method == "tpe" else "weighted"
+        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost,
+                       best=max(start_count - 1, 1), progress=progress)
+        starts = np.concatenate([starts, scan.starts])[:max(start_count, 2)]
+    elif start_count > 1:
+        starts = gradient.random_starts(space, start_count, config.seed)
+    if config.method == "tpe":
+        assert scan is not None
+        u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
+    else:
+        search, objective, profiles = _gradient_search(objective, space, starts, iterations, config, progress)
+        u, final_cost = search.u, search.cost
+        initial_cost = float(objective.weighted_cost(space.to_unit(space.initial)[None])[0])
+    known = uncertainty.estimate(objective, u)
+    fitted = set_values(params, space.names, jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float)))
+    return Fit(fitted, params, space, known, objective.noise, scan, search, u, initial_cost, final_cost, profiles,
+               time.perf_counter() - began, plant)
+
+
+def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:
+    """Objective over the space's parameters; the others keep their values in `params`."""
+    batch, measured = make_batch(trials, plant.dt)
+    replay = Replay(plant, batch, lambda values: set_values(params, space.names, values))
+    return Objective(replay, space, trials, measured, noise)
+
+
+def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list[Prediction]]:
+    """Replays of trials with the initial and with the fitted vehicle."""
+    if not trials:
+        return [], []
+    batch, _ = make_batch(trials, fit.plant.dt)
+    names = fit.space.names
+    replay = Replay(fit.plant, batch, lambda values: set_values(fit.params, names, values))
+    values = np.stack([np.asarray(get_values(one, names)) for one in (fit.initial_params, fit.params)])
+    simulated = replay.simulate(values)
+    initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
+    return initial, fitted
+
+
+def fit_dataset(
+    path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
+    progress: Progress | None = None, source: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Fit a dataset and write report.json, plots and vehicle.toml into the folder `out`.
+
+    Args:
+        path: dataset folder; only named in the report when `log` is given.
+        quick: overrides `config.quick` where true.
+        log: an already loaded log.
+        source: more to note in the report's `dataset`.
+
+    Returns:
+        The report.
+    """
+    from sysid.plots import write_plots
+    from whill_mjx.vehicle_file import save_vehicle
+
+    config = config or FitConfig()
+    config = replace(config, quick=quick or config.quick)
+    log = load_any(path) if log is None else log
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    fit = fit_log(log, config, progress)
+    pairs = [predict(fit, part) for part in (log.training, log.held_out)]
+    trials = (*log.training, *log.held_out)
+    initial, fitted = ([*pairs[0][k], *pairs[1][k]] for k in (0, 1))
+    rows = error_rows(trials, initial, fitted)
+    report = make_report(log, config, fit, rows, str(path), source)
+    write_report(out / "report.json", report)
+    write_plots(out, trials, initial, fitted, rows)
+    intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
+    save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+    return report
+
+
+def make_report(
+    log: Log, config: FitConfig, fit: Fit, rows: list[dict[str, Any]], path: str, source: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """The report of a fit (keys in `sysid.report`)."""
+    about = describe(fit.params)
+    parameters = [
+        {"name": one.name, "unit": about[one.name].unit, "initial": one.initial, "value": one.value,
+         "interval": [one.low, one.high], "confidence": uncertainty.CONFIDENCE,
+         "bounds": [float(fit.space.low[i]), float(fit.space.high[i])], "identifiable": one.identifiable,
+         "remark": one.remark}
+        for i, one in enumerate(fit.uncertainty.estimates)]
+    fixed = [{"name": name, "value": float(get_values(fit.params, [name])[0]), "reason": reason}
+             for name, reason in fit.space.fixed]
+    searches = [result for result in (fit.scan, fit.search) if result is not None]
+    return {
+        "schema": SCHEMA, "kind": KIND,
+        "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
+                    "notes": list(log.notes), "training": [trial.name for trial in log.training],
+                    "held_out": [trial.name for trial in log.held_out], **(source or {})},
+        "settings": asdict(config),
+        "model": {"preset": config.preset, "effects": [effect.name for effect in fit.params.effects]},
+        "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},
+        "parameters": parameters, "fixed": fixed,
+        "weak_combinations": fit.uncertainty.weak_combinations(),
+        "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
+                   "cost_initial": fit.initial_cost, "cost": fit.cost,
+                   "start_costs": fit.search.start_costs if fit.search is not None else [],
+                   "delay_profiles": [{"name": name, "values": grid, "cost": costs}
+                                      for name, grid, costs in fit.profiles]},
+        **summaries(rows, log.trials), "errors": rows,
+    }
+
+
+def provenance(report: dict[str, Any]) -> dict[str, Any]:
+    """What the vehicle file says of its origin."""
+    summary = report["summary"]["held_out"] or report["summary"]["training"]
+    errors = {f"{channel}_{metric}": one["fitted"] for channel, metrics in summary.items()
+              for metric, one in metrics.items() if isinstance(one, dict)}
+    return {"made_by": "sysid.fit", "dataset": report["dataset"]["name"], "dataset_sha256": report["dataset"]["sha256"],
+            "preset": report["model"]["preset"], "method": report["settings"]["method"],
+            "seed": report["settings"]["seed"], "cost": report["search"]["cost"],
+            "scored_on": "held_out" if report["summary"]["held_out"] else "training", "rmse": errors,
+            "not_identifiable": [one["name"] for one in report["parameters"] if not one["identifiable"]]}
+
+
+def _gradient_search(
+    objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
+    progress: Progress | None,
+) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
+    """LM from all starts; delays are then profiled on a grid, and where that is better LM continues from there. Noise
+    scales that are mere defaults are replaced by the size of the residual and LM continues."""
+
+    def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
+        return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
+                            progress=progress)
+
+    result = search(objective, starts, iterations)
+    if objective.noise.source == "defaults":
+        objective = objective.with_noise(objective.residual_noise(result.u))
+        result = search(objective, result.starts, iterations)
+    profiles = gradient.profile_delays(objective, space, result.u)
+    better = []
+    for name, grid, costs in profiles:
+        if costs.min() < float(objective.weighted_cost(result.u[None])[0]):
+            point = result.u.copy()
+            index = space.names.index(name)
+            point[index] = space.subset([name]).to_unit(grid[[costs.argmin()]])[0]
+            better.append(point)
+    if better:
+        again = np.array([result.u, *better, *result.starts])[: len(starts)]
+        if len(again) == len(starts):  # the same shapes, so nothing is compiled again
+            new = search(objective, again, iterations)
+            result = new if new.cost < result.cost else result
+    return result, objective, profiles
+
+
+def _keep_channels(trial: Trial, channels: str) -> Trial:
+    if channels == "ground_truth" and trial.ground_truth is not None:
+        return replace(trial, odometry=None)
+    if channels == "odometry" and trial.odometry is not None:
+        return replace(trial, ground_truth=None)
+    return trial
+
+
+def progress_bar(total: int) -> tuple[Progress, Callable[[], None]]:
+    """A bar with rate and remaining time, and the function that closes it."""
+    from tqdm import tqdm
+
+    bar: Any = tqdm(total=total, desc="fit", unit="eval")
+
+    def advance(count: int, remark: str) -> None:
+        bar.set_postfix_str(remark, refresh=False)
+        bar.update(min(count, max(bar.total - bar.n, 0)))
+
+    return advance, bar.close
+
+
+def expected_steps(config: FitConfig) -> int:
+    """How far the progress bar goes at most."""
+    scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
+    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
+    return (scan if config.method != "lm" else 0) + (iterations if config.method != "tpe" else 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(FitConfig):
+    """Command line of `python -m sysid.fit`."""
+
+    dataset: Path
+    """Folder with the driving log."""
+
+    out: Path = Path("runs/fit")
+    """Folder for report.json, plots and vehicle.toml."""
+    format: Literal["auto", "dataset", "drive_norlab", "mrclam"] = "auto"
+    """Form of the data; found out by default."""
+    train: tuple[str, ...] = ()
+    """Trials to fit in a measured set: RUN, GROUP or RUN:FROM-TO, e.g. warthog_asphalt_a:0-0.667 or robot1."""
+    held_out: tuple[str, ...] = ()
+    """Trials to predict in a measured set, in the same form."""
+    chained: bool = False
+    """DRIVE: 6 s steps, chained from 2 s windows, instead of the windows."""
+
+
+def main(arguments: Arguments) -> None:
+    """Load, fit, write and print the summary."""
+    dataset = arguments.dataset
+    settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
+    log = load_any(dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
+    for note in log.notes:
+        print(note)
+    progress, close = progress_bar(expected_steps(settings))
+    try:
+        report = fit_dataset(dataset, arguments.out, config=settings, log=log, progress=progress,
+                             source={"train": arguments.train, "held_out_selection": arguments.held_out})
+    finally:
+        close()
+    print(parameter_table(report))
+    print(table(report))
+    print(f"wrote {arguments.out / 'report.json'}, {arguments.out / 'vehicle.toml'} and the plots")
+
+
+def cli() -> None:
+    """Command line: errors in the input end with one line, not a traceback."""
+    import sys
+
+    import tyro
+
+    arguments = tyro.cli(Arguments, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
+    try:
+        main(arguments)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,103 @@
+"""Plots of a fit: trajectories and yaw, measured against simulated, and errors per trial."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.log import OdometryStream, PoseStream, Trial
+from sysid.metrics import Prediction, ideal_replay
+
+MAX_PANELS = 12
+COLOURS = {"measured": "black", "ideal": "tab:gray", "initial": "tab:orange", "fitted": "tab:blue"}
+STYLES = {"measured": "-", "ideal": ":", "initial": "--", "fitted": "-"}
+
+
+def write_plots(
+    folder: Path, trials: tuple[Trial, ...], initial: list[Prediction], fitted: list[Prediction],
+    rows: list[dict[str, Any]],
+) -> list[Path]:
+    """Write trajectories.png, yaw.png and errors.png; returns their paths. Held-out trials come first."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    chosen = choose(trials)
+    columns = min(4, len(chosen))
+    lines = -(-len(chosen) // columns)
+    paths = []
+    for name in ("trajectories", "yaw"):
+        figure, axes = pyplot.subplots(lines, columns, figsize=(3.6 * columns, 3.2 * lines), squeeze=False,
+                                       layout="constrained")
+        for axis in axes.flat[len(chosen) :]:
+            axis.set_visible(False)
+        for axis, index in zip(axes.flat, chosen, strict=False):
+            trial = trials[index]
+            streams = {"measured": _stream(trial), "ideal": _stream(ideal_replay(trial)),
+                       "initial": _stream(initial[index]), "fitted": _stream(fitted[index])}
+            sparse = len(streams["measured"].t) < 60
+            for label, stream in streams.items():
+                across, up = (stream.x, stream.y) if name == "trajectories" else (stream.t, stream.yaw)
+                if across is None or up is None:
+                    continue
+                axis.plot(across, up, STYLES[label], color=COLOURS[label], label=label,
+                          linewidth=2.2 if label == "measured" else 1.3,
+                          marker="." if sparse else None, markersize=3)
+            axis.set_title(trial.name + (" (held out)" if trial.held_out else ""), fontsize=9)
+            axis.set_xlabel("x [m]" if name == "trajectories" else "t [s]", fontsize=8)
+            axis.set_ylabel("y [m]" if name == "trajectories" else "yaw [rad]", fontsize=8)
+            axis.tick_params(labelsize=7)
+            axis.grid(alpha=0.3)
+            if name == "trajectories":
+                axis.axis("equal")
+        axes.flat[0].legend(fontsize=7)
+        paths.append(folder / f"{name}.png")
+        figure.savefig(paths[-1], dpi=110)
+        pyplot.close(figure)
+    paths.append(folder / "errors.png")
+    _error_bars(pyplot, paths[-1], rows, {trials[index].name for index in chosen})
+    return paths
+
+
+def choose(trials: tuple[Trial, ...]) -> list[int]:
+    """At most MAX_PANELS trials: held-out ones first, spread evenly, at least a third of the panels for training."""
+    held_out = [i for i, trial in enumerate(trials) if trial.held_out]
+    training = [i for i, trial in enumerate(trials) if not trial.held_out]
+    room = max(MAX_PANELS - len(training), 2 * MAX_PANELS // 3)
+    first = _spread(held_out, room)
+    return first + _spread(training, MAX_PANELS - len(first))
+
+
+def _spread(items: list[int], count: int) -> list[int]:
+    if len(items) <= count:
+        return items
+    return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
+
+
+def _stream(source: Trial | Prediction) -> PoseStream | OdometryStream:
+    stream = source.ground_truth if source.ground_truth is not None else source.odometry
+    assert stream is not None
+    return stream
+
+
+def _error_bars(pyplot: Any, path: Path, rows: list[dict[str, Any]], names: set[str]) -> None:
+    """Trajectory and yaw error of the chosen trials for each replay."""
+    mine = [row for row in rows if row["trial"] in names and "trajectory" in row["metrics"]]
+    channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in mine) else "odometry"
+    mine = [row for row in mine if row["channel"] == channel]
+    figure, axes = pyplot.subplots(2, 1, figsize=(max(6.0, 0.8 * len(mine)), 6.5), sharex=True, layout="constrained")
+    for axis, metric, unit in zip(axes, ("trajectory", "yaw"), ("m", "rad"), strict=True):
+        for k, replay in enumerate(("ideal", "initial", "fitted")):
+            axis.bar(np.arange(len(mine)) + 0.27 * (k - 1), [row["metrics"][metric][replay] for row in mine], 0.27,
+                     color=COLOURS[replay], label=replay)
+        axis.set_ylabel(f"{metric} RMSE [{unit}]")
+        axis.grid(axis="y", alpha=0.3)
+    axes[0].legend()
+    axes[0].set_title(f"Error per trial, {channel.replace('_', ' ')} (* held out)")
+    axes[1].set_xticks(range(len(mine)), [row["trial"] + ("*" if row["held_out"] else "") for row in mine],
+                       rotation=60, ha="right", fontsize=8)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

@@ -1,0 +1,124 @@
+"""The report of a fit: `report.json` (versioned, below), and the table and plots that people read.
+
+    schema, kind          1, "sysid-report"
+    dataset               name, path, format, sha256, notes, training and held_out trial names
+    settings              how the fit was called
+    model                 preset, effects
+    noise                 source ("replicates", "defaults", "residuals") and the scale per channel
+    noise_floor           training, held_out: channel -> metric -> error that a perfect model would still have, or null
+    parameters            name, unit, initial, value, interval, confidence, bounds, identifiable, remark
+    fixed                 name, value, reason
+    weak_combinations     combinations of parameters that the log does not tell
+    search                method, evaluations, seconds, cost before and after, cost of each start, delay profiles
+    errors                per trial and channel: metric -> ideal, initial, fitted
+    summary               training, held_out -> channel -> metric -> mean of ideal, initial, fitted, and noise_floor
+    groups                the same per group (terrain, robot), where there are several
+
+"ideal" is a vehicle that follows its commands at once without slip, "initial" the model before the fit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.metrics import METRICS, UNITS, Prediction, ideal_replay, noise_floor, score
+
+SCHEMA = 1
+KIND = "sysid-report"
+REPLAYS = ("ideal", "initial", "fitted")
+
+
+def error_rows(trials: tuple[Trial, ...], initial: list[Prediction], fitted: list[Prediction]) -> list[dict[str, Any]]:
+    """Errors of each trial and channel for the three replays."""
+    rows = []
+    for trial, before, after in zip(trials, initial, fitted, strict=True):
+        scores = [score(trial, prediction) for prediction in (ideal_replay(trial), before, after)]
+        for channel in scores[0]:
+            tables = [one[channel].as_dict() for one in scores]
+            metrics = {metric: dict(zip(REPLAYS, (table[metric] for table in tables), strict=True))
+                       for metric in METRICS if tables[0][metric] is not None}
+            rows.append({"trial": trial.name, "manoeuvre": trial.manoeuvre, "group": trial.group,
+                         "held_out": trial.held_out, "channel": channel, "metrics": metrics})
+    return rows
+
+
+def summarise(rows: Iterable[dict[str, Any]], floor: dict[str, dict[str, float | None]] | None) -> dict[str, Any]:
+    """Mean over trials per channel and metric of the three replays, beside the noise floor."""
+    rows = list(rows)
+    summary: dict[str, Any] = {}
+    for channel in dict.fromkeys(row["channel"] for row in rows):
+        mine = [row for row in rows if row["channel"] == channel]
+        summary[channel] = {"trials": len(mine)}
+        for metric in METRICS:
+            found = [row["metrics"][metric] for row in mine if metric in row["metrics"]]
+            if found:
+                summary[channel][metric] = {
+                    **{replay: float(np.mean([one[replay] for one in found])) for replay in REPLAYS},
+                    "unit": UNITS[metric], "noise_floor": floor[channel][metric] if floor else None}
+    return summary
+
+
+def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str, Any]:
+    """`noise_floor`, `summary` and `groups` of the report."""
+    parts = {"training": False, "held_out": True}
+    floors = {part: noise_floor(tuple(t for t in trials if t.held_out is held)) for part, held in parts.items()}
+    groups = sorted({row["group"] for row in rows})
+    return {
+        "noise_floor": floors,
+        "summary": {part: summarise((row for row in rows if row["held_out"] is held), floors[part])
+                    for part, held in parts.items()},
+        "groups": {} if len(groups) < 2 else {
+            group: {part: summarise((row for row in rows if row["held_out"] is held and row["group"] == group), None)
+                    for part, held in parts.items()} for group in groups},
+    }
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(_plain(report), indent=1) + "\n")
+    os.replace(temporary, path)
+
+
+def table(report: dict[str, Any]) -> str:
+    """The summary as text."""
+    lines = [f"{'':10} {'channel':13} {'metric':17} {'ideal':>9} {'initial':>9} {'fitted':>9} {'floor':>9}"]
+    for part, channels in report["summary"].items():
+        for channel, metrics in channels.items():
+            for metric in (name for name in METRICS if name in metrics):
+                one = metrics[metric]
+                floor = "-" if one["noise_floor"] is None else f"{one['noise_floor']:.4f}"
+                lines.append(f"{part:10} {channel:13} {metric + ' ' + one['unit']:22} " + " ".join(
+                    f"{one[replay]:9.4f}" for replay in REPLAYS).replace("     ", "", 1) + f" {floor:>9}")
+    return "\n".join(lines)
+
+
+def parameter_table(report: dict[str, Any]) -> str:
+    """Fitted parameters with their intervals as text."""
+    lines = []
+    for one in report["parameters"]:
+        low, high = one["interval"]
+        lines.append(f"{one['name']:32} {one['initial']:10.4g} -> {one['value']:10.4g}  [{low:.4g}, {high:.4g}] "
+                     f"{one['unit']} {one['remark']}".rstrip())
+    return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
