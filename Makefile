@@ -5,7 +5,7 @@ RUN ?= runs/train
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test lint clean
+.PHONY: train test test-quick lint clean
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -29,6 +29,9 @@ train: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q
+
+test-quick: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -q -m quick
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .

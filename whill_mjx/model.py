@@ -12,6 +12,7 @@ import numpy as np
 
 from whill_mjx.config import VehicleConfig
 from whill_mjx.specs import VehicleSpec
+from whill_mjx.types import Body
 
 ASSET = Path(__file__).parent / "assets" / "whill_cr.xml"
 CHASSIS = 1  # body ids, in the order of the asset
@@ -31,16 +32,27 @@ class VehicleModel:
     """An mjx.Data of the right shapes; only qpos, qvel and qfrc_applied of it are ever set."""
 
 
-def mujoco_model(spec: VehicleSpec, config: VehicleConfig | None = None) -> mujoco.MjModel:
-    """C MuJoCo model of `spec`: the asset with the spec's geometry and mass put in."""
+def mujoco_model(
+    spec: VehicleSpec, config: VehicleConfig | None = None, body: Body | None = None
+) -> mujoco.MjModel:
+    """C MuJoCo model of `spec`: the asset with the spec's geometry put in, and the mass distribution of `body`.
+
+    Without `body`: nominal mass, centre of mass at the origin, inertia of a box.
+    """
     config = config or VehicleConfig()
     editable = mujoco.MjSpec.from_file(str(ASSET))
     editable.modelname = spec.name
     editable.option.timestep = config.physics_dt
     chassis = editable.body("chassis")
     chassis.pos = [0.0, 0.0, spec.wheel_radius]
-    chassis.mass = spec.mass
-    chassis.inertia = list(box_inertia(spec))
+    roll, pitch, yaw = box_inertia(spec)
+    if body is None:
+        chassis.mass, chassis.inertia = spec.mass, [roll, pitch, yaw]
+    else:
+        chassis.mass = float(body.mass)
+        scale = chassis.mass / spec.mass
+        chassis.inertia = [roll * scale, pitch * scale, float(body.yaw_inertia)]
+        chassis.ipos = [float(body.com_x), float(body.com_y), float(body.com_z)]
     for name, side in (("left_wheel", 1.0), ("right_wheel", -1.0)):
         editable.body(name).pos = [spec.reference_x, side * spec.track / 2, 0.0]
         editable.joint(name).armature = spec.wheel_inertia

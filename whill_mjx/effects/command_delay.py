@@ -42,5 +42,6 @@ class CommandDelay(Effect):
         arrived = jnp.clip((age - self.delay) / motion.dt + 1.0, 0.0, 1.0)
         delayed = value[-1]
         for slot in range(SLOTS - 2, -1, -1):  # from the oldest change to the newest
-            delayed = delayed + arrived[slot] * (value[slot] - delayed)
+            blend = delayed + arrived[slot] * (value[slot] - delayed)
+            delayed = jnp.where(arrived[slot] >= 1.0, value[slot], blend)  # exact, not only to rounding
         return CommandMemory(value, age + motion.dt), delayed

@@ -1,0 +1,47 @@
+"""Imports point one way: sysid -> whill_mjx; dreamer and bridge stand alone; three doors may look upwards."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
+ALLOWED = {"whill_mjx": set(), "sysid": {"whill_mjx"}, "dreamer": set(), "bridge": set()}
+DOORS = {
+    "whill_mjx/train.py": {"dreamer", "sysid"},  # the training command
+    "whill_mjx/training.py": {"dreamer"},  # its parts
+    "bridge/simulate.py": {"whill_mjx"},  # the simulator behind the topics
+}
+
+pytestmark = pytest.mark.quick
+
+
+def modules():
+    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def imported(path):
+    """Dotted names that a module imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_one_way(path):
+    relative = path.relative_to(ROOT)
+    own = relative.parts[0]
+    allowed = {own} | ALLOWED[own] | DOORS.get(relative.as_posix(), set())
+    outside = {name.split(".")[0] for name in imported(path)} & {*PACKAGES, "benchmarks", "tests"}
+    assert outside <= allowed
+
+
+def test_nothing_imports_the_doors():
+    doors = {door.removesuffix(".py").replace("/", ".") for door in DOORS if door != "whill_mjx/training.py"}
+    importers = {path.name for path in modules() if doors & set(imported(path))}
+    assert not importers

@@ -1,0 +1,179 @@
+"""Each effect alone: what it does, and that it vanishes at its neutral value."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.effects import (
+    EFFECTS,
+    AccelerationLimit,
+    AirDrag,
+    CommandDelay,
+    LateralDamping,
+    OdometryLag,
+    RollingResistance,
+    SlipTraction,
+    YawScrub,
+)
+from whill_mjx.effects.base import PLACES, place_of
+from whill_mjx.model import build_model
+from whill_mjx.presets import preset
+from whill_mjx.types import Drive, Odometry, parameters_of
+from whill_mjx.vehicle import measure, nominal_world, place
+
+pytestmark = pytest.mark.quick
+
+
+def motion_at(v=0.0, omega=0.0, sideways=0.0):
+    """Motion of the chair rolling at v [m/s], omega [rad/s] with a sideways speed added."""
+    spec, params = preset("whill_cr")
+    model = build_model(spec)
+    state = place(model, params, 0.0, 0.0, 0.0, v, omega)
+    state = state.replace(qvel=state.qvel.at[1].add(sideways))
+    return measure(model, params, nominal_world(model), state)
+
+
+def neutral(kind):
+    values = {name: about.neutral for name, about in parameters_of(kind).items()}
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), kind(**values))
+
+
+@pytest.mark.parametrize("speed", [-1.0, -0.1, 0.1, 1.0])
+@pytest.mark.parametrize("effect", [RollingResistance(mu_r=jnp.array(0.01)), AirDrag(jnp.array(1.0), jnp.array(1.0))])
+def test_resistance_opposes_motion(effect, speed):
+    _, wrench = effect.force((), motion_at(speed))
+    assert wrench.fx * speed < 0
+
+
+def test_rolling_resistance_is_the_coefficient_times_the_weight():
+    _, wrench = RollingResistance(mu_r=jnp.array(0.01)).force((), motion_at(1.0))
+    np.testing.assert_allclose(wrench.fx, -0.01 * 52 * 9.81, rtol=0.02)
+
+
+def test_air_drag_grows_with_the_square_of_speed():
+    drag = AirDrag(c_d=jnp.array(1.0), area=jnp.array(0.5))
+    slow, fast = (drag.force((), motion_at(v))[1].fx for v in (0.5, 1.0))
+    np.testing.assert_allclose(fast / slow, 4.0, rtol=1e-4)
+    np.testing.assert_allclose(fast, -0.5 * 1.2 * 0.5, rtol=1e-4)
+
+
+def test_lateral_damping_pushes_against_sideways_motion():
+    _, wrench = LateralDamping(c_rear=jnp.array(2.0), c_front=jnp.array(2.0)).force((), motion_at(sideways=0.3))
+    np.testing.assert_allclose(wrench.fy, -2.0 * 52 * 0.3, rtol=0.02)
+
+
+@pytest.mark.parametrize("omega", [-1.0, 1.0])
+def test_yaw_scrub_opposes_turning(omega):
+    _, wrench = YawScrub(torque=jnp.array(4.0)).force((), motion_at(omega=omega))
+    np.testing.assert_allclose(wrench.tz, -4.0 * np.sign(omega), rtol=1e-3)
+
+
+def test_slip_force_never_exceeds_the_friction_circle():
+    motion = motion_at(v=0.5, omega=0.5, sideways=0.8)
+    motion = motion.replace(spin=motion.spin * 4, drive_torque=jnp.array([500.0, -500.0]))
+    _, wrench = SlipTraction(mu=jnp.array(0.6), slip_speed=jnp.array(0.05), mu_free=jnp.array(0.0)).force((), motion)
+    driven_load = float(motion.normal_force[:2].sum())
+    assert np.hypot(float(wrench.fx), float(wrench.fy)) <= 0.6 * driven_load * 1.001
+
+
+def test_acceleration_limit_ramps_the_command():
+    limit = AccelerationLimit(linear=jnp.array(1.7), angular=jnp.array(3.0))
+    memory = limit.init()
+    for _ in range(20):  # 0.1 s
+        memory, command = limit.command(memory, jnp.array([1.0, -1.0]), motion_at())
+    np.testing.assert_allclose(command, [0.17, -0.3], rtol=1e-4)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.1, 0.22])
+def test_a_delayed_command_arrives_after_its_delay(delay):
+    effect = CommandDelay(delay=jnp.array(delay))
+    memory = effect.init()
+    motion = motion_at()
+    heard = []
+    for step in range(80):
+        sent = jnp.array([1.0, 0.5]) if step >= 10 else jnp.zeros(2)
+        memory, command = effect.command(memory, sent, motion)
+        heard.append(float(command[0]))
+    arrival = next(step for step, value in enumerate(heard) if value > 0.5)
+    assert arrival == 10 + round(delay / motion.dt)
+    assert heard[-1] == 1.0
+
+
+def test_a_delay_keeps_the_order_of_commands_that_are_under_way():
+    effect = CommandDelay(delay=jnp.array(0.3))
+    memory, motion = effect.init(), motion_at()
+    sent = np.repeat([0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.4], 20)
+    heard = []
+    for value in sent:
+        memory, command = effect.command(memory, jnp.array([value, 0.0]), motion)
+        heard.append(float(command[0]))
+    np.testing.assert_allclose(heard[61:], sent[1:-60], atol=1e-5)
+
+
+def test_odometry_lag_filters_speeds_and_leaves_the_pose():
+    lag = OdometryLag(time_constant=jnp.array(0.05))
+    reading = Odometry(*(jnp.array(value) for value in (1.0, 2.0, 3.0, 0.5, 0.4)))
+    memory = lag.init()
+    for _ in range(10):
+        memory, filtered = lag.sensing(memory, reading, motion_at())
+    expected = 0.5 * (1 - (0.05 / 0.055) ** 10)
+    np.testing.assert_allclose(filtered.v, expected, rtol=1e-4)
+    assert (filtered.x, filtered.y, filtered.yaw) == (1.0, 2.0, 3.0)
+
+
+def test_every_effect_acts_at_exactly_one_place():
+    assert {place_of(neutral(kind)) for kind in EFFECTS.values()} <= set(PLACES)
+
+
+def test_an_effect_without_a_place_is_refused():
+    class Nothing:
+        pass
+
+    with pytest.raises(TypeError, match="exactly one of"):
+        place_of(Nothing())
+
+
+@pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"pid_drive", "torque_drive"}))
+def test_every_effect_vanishes_exactly_at_its_neutral_value(name):
+    """To the last bit. The two drives are no disturbances: at zero gain they give no force, tested apart."""
+    effect = neutral(EFFECTS[name])
+    motion = motion_at(0.7, 0.4, 0.1)
+    memory = effect.init()
+    match place_of(effect):
+        case "force":
+            _, wrench = effect.force(memory, motion)
+            assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(wrench))
+        case "command":
+            for value in ([0.3, 0.2], [0.3, 0.2], [-0.1, 0.7]):
+                memory, command = effect.command(memory, jnp.array(value), motion)
+                np.testing.assert_array_equal(command, np.float32(value))
+        case "actuation":
+            drive = Drive(jnp.array([0.1, 0.2]), jnp.array([3.0, 4.0]), jnp.array([5.0, 6.0]))
+            _, after = effect.actuation(memory, drive, motion)
+            assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), drive, after))
+        case "sensing":
+            reading = Odometry(*(jnp.array(value) for value in (1.0, 2.0, 3.0, 0.5, 0.4)))
+            _, after = effect.sensing(memory, reading, motion)
+            assert jax.tree.all(jax.tree.map(lambda a, b: a == b, reading, after))
+
+
+@pytest.mark.parametrize("name", ["pid_drive", "torque_drive"])
+def test_a_drive_with_zero_gains_gives_no_force(name):
+    effect = neutral(EFFECTS[name])
+    drive = Drive(jnp.array([0.5, 0.2]), jnp.zeros(2), jnp.zeros(2))
+    _, after = effect.actuation(effect.init(), drive, motion_at(0.3))
+    np.testing.assert_array_equal(after.force, 0.0)
+    np.testing.assert_array_equal(after.torque, 0.0)
+
+
+@pytest.mark.parametrize("kind", EFFECTS.values())
+def test_every_parameter_has_a_unit_a_range_and_a_description(kind):
+    assert parameters_of(kind)
+    assert {field.name for field in dataclasses.fields(kind)} == set(parameters_of(kind))
+    for about in parameters_of(kind).values():
+        assert about.unit and about.description and about.low < about.high

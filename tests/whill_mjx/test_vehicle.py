@@ -1,0 +1,231 @@
+"""Motion of one vehicle: known answers, invariants, and C MuJoCo as an independent reference."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from whill_mjx.kinematics import body_twist, reference_pose
+from whill_mjx.model import build_model, mujoco_model
+from whill_mjx.parameters import describe, get_values, set_values
+from whill_mjx.presets import preset, preset_params
+from whill_mjx.specs import SPECS, WARTHOG, WHILL_CR, VehicleSpec, find_spec
+from whill_mjx.vehicle import drive, forces, measure, nominal_world, place, substep
+
+VEHICLES = ["whill_cr_ramp", "whill_cr_physical"]
+
+
+@lru_cache
+def compiled_period(name):
+    """Static model, parameters and one compiled control period of a preset; compiled once for all tests."""
+    spec, params = preset_params_of(name)
+    model = build_model(spec)
+    return model, params, jax.jit(lambda params, state, command: drive(model, params, state, command))
+
+
+def preset_params_of(name):
+    if name == "warthog_physical":
+        return WARTHOG, preset_params(WARTHOG, "physical")
+    return preset(name)
+
+
+def drive_periods(name, command, periods=20, start=(0.0, 0.0, 0.0)):
+    """State after `periods` control periods of one command (v, omega)."""
+    model, params, period = compiled_period(name)
+    state = place(model, params, *start)
+    for _ in range(periods):
+        state = period(params, state, jnp.asarray(command))
+    return model, state
+
+
+@pytest.mark.quick
+def test_a_vehicle_at_rest_stays_where_it_is_placed():
+    model, state = drive_periods("whill_cr_physical", (0.0, 0.0), start=(1.0, -2.0, 0.7))
+    np.testing.assert_allclose(reference_pose(model, state.qpos), (1.0, -2.0, 0.7), atol=1e-3)
+    np.testing.assert_allclose(state.qvel, 0.0, atol=1e-3)
+    assert not state.diverged
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_straight_command_drives_straight_and_odometry_agrees(name):
+    model, state = drive_periods(name, (0.5, 0.0), 40)
+    x, y, yaw = reference_pose(model, state.qpos)
+    v, omega = body_twist(model, state.qpos, state.qvel)
+    assert abs(v - 0.5) < 0.02 and abs(omega) < 0.02
+    assert 1.7 < x < 2.0 and abs(y) < 0.05
+    np.testing.assert_allclose(state.odometry.x, x, atol=0.03)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_turn_on_the_spot_keeps_the_driven_axle_in_place(name):
+    model, state = drive_periods(name, (0.0, 0.8))
+    x, y, yaw = reference_pose(model, state.qpos)
+    assert np.hypot(x, y) < 0.05
+    assert 0.9 < yaw < 1.7
+
+
+@pytest.mark.parametrize("name", ["whill_cr_physical", "warthog_physical"])
+def test_left_and_right_turns_are_mirror_images(name):
+    model, left = drive_periods(name, (0.4, 0.6))
+    _, right = drive_periods(name, (0.4, -0.6))
+    np.testing.assert_allclose(
+        np.array(reference_pose(model, left.qpos)) * [1, -1, -1], reference_pose(model, right.qpos), atol=2e-4
+    )
+
+
+def test_motion_does_not_depend_on_the_place_and_heading_in_the_world():
+    model, here = drive_periods("whill_cr_physical", (0.5, 0.4))
+    _, there = drive_periods("whill_cr_physical", (0.5, 0.4), start=(3.0, 1.0, 1.0))
+    x, y, yaw = (float(value) for value in reference_pose(model, here.qpos))
+    expected = (3 + x * np.cos(1) - y * np.sin(1), 1 + x * np.sin(1) + y * np.cos(1), 1 + yaw)
+    np.testing.assert_allclose(reference_pose(model, there.qpos), expected, atol=1e-3)
+
+
+def test_slip_separates_odometry_from_the_body():
+    """A skid-steered vehicle turns less than its wheels say."""
+    model, state = drive_periods("warthog_physical", (0.5, 1.0))
+    _, _, yaw = reference_pose(model, state.qpos)
+    assert 0 < yaw < 0.8 * state.odometry.yaw
+
+
+@pytest.mark.parametrize("name", [*SPECS, "whill_cr_paper", "whill_cr_ramp", "whill_cr_physical"])
+def test_static_axle_loads_stay_positive_up_to_the_documented_acceleration(name):
+    """Quasi-static load transfer at 1.7 m/s^2 leaves load on both axles, for every preset."""
+    spec, params = preset(name)
+    height = spec.wheel_radius + float(params.body.com_z)
+    rear_arm = float(params.body.com_x) - spec.rear_x
+    front_arm = spec.front_x - float(params.body.com_x)
+    transfer = 1.7 * height / 9.81  # shift of the load's point of action [m]
+    assert rear_arm - transfer > 0 and front_arm - transfer > 0
+
+
+def test_suspension_carries_the_weight_and_shifts_it_towards_the_centre_of_mass():
+    spec, params = preset("whill_cr_paper")
+    model = build_model(spec)
+    state = jax.jit(lambda: place(model, params, 0.0, 0.0, 0.0))()
+    motion = measure(model, params, nominal_world(model), state)
+    load = np.asarray(motion.normal_force)
+    np.testing.assert_allclose(load.sum(), float(params.body.mass) * 9.81, rtol=0.02)
+    share_rear = (spec.front_x - float(params.body.com_x)) / spec.wheelbase
+    np.testing.assert_allclose(load[:2].sum() / load.sum(), share_rear, atol=0.02)
+    assert load[0] > load[1]  # centre of mass to the left
+
+
+def test_vmapped_instances_equal_a_loop_with_different_parameters():
+    model, params, alone = compiled_period("whill_cr_physical")
+    scales = jnp.array([0.8, 1.0, 1.2])
+    batch = jax.tree.map(lambda leaf: leaf * scales, params)
+    command = jnp.array([0.6, -0.5])
+    placed = jax.vmap(lambda params: place(model, params, 0.0, 0.0, 0.0))(batch)
+    together = jax.jit(jax.vmap(lambda params, state: drive(model, params, state, command)))(batch, placed)
+    for index, scale in enumerate(scales):
+        one = jax.tree.map(lambda leaf, scale=scale: leaf * scale, params)
+        expected = alone(one, place(model, one, 0.0, 0.0, 0.0), command)
+        np.testing.assert_allclose(together.qpos[index], expected.qpos, atol=1e-5)
+
+
+def test_mjx_follows_c_mujoco_under_the_same_forces_for_ten_seconds():
+    """The same force law, fed from C MuJoCo's own state and stepped by mj_step: positions agree within 1e-4 m.
+
+    Recorded forces cannot be replayed blindly: without the suspension's feedback a tilted chassis falls over.
+    """
+    spec, params = preset("whill_cr_physical")
+    params = params.replace(body=params.body.replace(com_x=jnp.array(-0.1), com_z=jnp.array(0.1)))
+    model = build_model(spec)
+    times = np.arange(2000) * model.config.physics_dt
+    commands = np.stack([0.6 * np.sin(0.7 * times) + 0.3, 0.8 * np.sin(1.1 * times)], axis=1).astype(np.float32)
+
+    @jax.jit
+    def roll(commands):
+        def one(state, command):
+            state = substep(model, params, state, command)
+            return state, state.qpos
+
+        return jax.lax.scan(one, place(model, params, 0.0, 0.0, 0.0), commands)[1]
+
+    @jax.jit
+    def force_at(state, qpos, qvel, command):
+        state = state.replace(qpos=qpos, qvel=qvel)
+        memory, force, _ = forces(model, params, state, command)
+        return state.replace(memory=memory), force
+
+    expected = np.asarray(roll(jnp.asarray(commands)))
+    reference = mujoco_model(spec, body=params.body)
+    data = mujoco.MjData(reference)
+    state = place(model, params, 0.0, 0.0, 0.0)
+    data.qpos[:] = np.asarray(state.qpos)
+    distance = []
+    for command, qpos in zip(commands, expected, strict=True):
+        state, force = force_at(state, data.qpos.astype(np.float32), data.qvel.astype(np.float32), command)
+        data.qfrc_applied[:] = np.asarray(force)
+        mujoco.mj_step(reference, data)
+        distance.append(np.abs(data.qpos[:3] - qpos[:3]).max())
+    assert np.abs(expected[-1, :2]).max() > 1.0  # it went somewhere
+    assert max(distance) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["whill_cr_ramp", "whill_cr_physical"])
+def test_forward_mode_derivatives_agree_with_central_differences(name):
+    """d(pose after 2 s)/d(parameter) within 1 % for each parameter, in float64."""
+    with jax.enable_x64(True):
+        spec, params = preset(name)
+        build_model.cache_clear()
+        model = build_model(spec)
+        names = list(describe(params))
+        values = np.array(get_values(params, names), dtype=np.float64)
+        if "command_delay.delay" in names:  # a delay of whole steps is a kink: differentiate beside it
+            values[names.index("command_delay.delay")] += 0.4 * model.config.physics_dt
+        commands = jnp.asarray(np.repeat([[0.8, 0.5], [0.5, -0.7], [-0.3, 0.2]], 7, axis=0), jnp.float64)
+
+        def outcome(values):
+            changed = set_values(params, names, values)
+            state = place(model, changed, 0.0, 0.0, 0.0)
+            state = jax.lax.scan(lambda s, c: (drive(model, changed, s, c), None), state, commands)[0]
+            odometry = state.odometry
+            pose = reference_pose(model, state.qpos)
+            return jnp.stack([*pose, odometry.x, odometry.y, odometry.yaw, odometry.v, odometry.omega])
+
+        forward = np.asarray(jax.jit(jax.jacfwd(outcome))(jnp.asarray(values)))
+        steps = 1e-6 * np.maximum(np.abs(values), 1e-2)
+        points = np.concatenate([values + np.diag(steps), values - np.diag(steps)])
+        results = np.asarray(jax.jit(jax.vmap(outcome))(jnp.asarray(points)))
+        central = (results[: len(values)] - results[len(values) :]) / (2 * steps[:, None])
+        build_model.cache_clear()
+    for index, parameter in enumerate(names):
+        scale = np.abs(central[index]).max()
+        error = np.abs(forward[:, index] - central[index]).max()
+        assert error <= 0.01 * scale + 1e-7, f"{parameter}: {forward[:, index]} against {central[index]}"
+
+
+def test_a_state_that_is_not_finite_is_flagged_and_contained():
+    model, params, period = compiled_period("whill_cr_physical")
+    state = place(model, params, 0.0, 0.0, 0.0)
+    broken = period(params, state, jnp.array([jnp.nan, 0.0]))
+    assert broken.diverged
+    assert np.isfinite(np.asarray(broken.qpos)).all()
+    assert not period(params, state, jnp.array([0.1, 0.0])).diverged
+
+
+@pytest.mark.quick
+def test_unknown_vehicle_names_the_known_ones():
+    with pytest.raises(ValueError, match="unknown vehicle 'tricycle'.*whill_cr"):
+        find_spec("tricycle")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("field", "value"), [("mass", -1.0), ("track", 0.0), ("wheel_radius", float("nan"))])
+def test_a_spec_refuses_what_is_not_physical(field, value):
+    with pytest.raises(ValueError, match=f"{field} is .*must be positive"):
+        dataclasses.replace(WHILL_CR, **{field: value})
+
+
+@pytest.mark.quick
+def test_a_spec_refuses_an_unknown_drive():
+    with pytest.raises(ValueError, match="use 'differential' or 'skid'"):
+        VehicleSpec(name="x", wheel_radius=0.1, track=0.5, wheelbase=0.5, mass=10.0, drive="omni")

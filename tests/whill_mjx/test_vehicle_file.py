@@ -1,0 +1,68 @@
+"""The vehicle file: what is saved is loaded, and what is wrong is named."""
+
+from __future__ import annotations
+
+import jax
+import pytest
+
+from whill_mjx.presets import preset
+from whill_mjx.vehicle_file import load_intervals, load_vehicle, save_vehicle
+
+pytestmark = pytest.mark.quick
+
+
+@pytest.fixture
+def saved(tmp_path):
+    spec, params = preset("whill_cr_ramp")
+    return save_vehicle(tmp_path / "vehicle.toml", spec, params, {"body.mass": (50.0, 55.0)}, {"fit": "none"})
+
+
+@pytest.mark.parametrize("name", ["whill_cr", "whill_cr_physical", "warthog"])
+def test_a_saved_vehicle_loads_to_the_last_bit(tmp_path, name):
+    spec, params = preset(name)
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, params)
+    loaded_spec, loaded, _ = load_vehicle(path)
+    assert loaded_spec == spec
+    assert [effect.name for effect in loaded.effects] == [effect.name for effect in params.effects]
+    assert jax.tree.all(jax.tree.map(lambda a, b: a == b, params, loaded))
+
+
+def test_intervals_and_provenance_are_kept(saved):
+    assert load_intervals(saved) == {"body.mass": (50.0, 55.0)}
+    assert load_vehicle(saved)[2] == {"fit": "none"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 7", "schema is 7; this version reads schema 1"),
+        ('kind = "micromobility-vehicle"', 'kind = "car"', "kind is 'car'.*Give a vehicle file"),
+        ('name = "pid_drive"', 'name = "warp_drive"', "unknown effect 'warp_drive' .*known: .*pid_drive"),
+        ('unit = "kg"', 'unit = "lb"', "body.mass is in 'lb'; it must be in 'kg'"),
+        ("value = 52.0", "value = nan", "body.mass is nan; it must be a number"),
+        ("value = 52.0", "value = -52.0", "must be positive"),
+        ("wheel_radius = 0.1325", "wheel_radius = -1.0", "wheel_radius is -1.0; it must be positive"),
+        ("wheel_radius = 0.1325", "wheel_size = 0.1325", "Remove the entry"),
+        ("schema = 1", "schema 1", "not a TOML file"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_name_and_the_rule(saved, old, new, message):
+    text = saved.read_text()
+    assert old in text
+    saved.write_text(text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        load_vehicle(saved)
+
+
+def test_a_missing_file_tells_how_to_make_one(tmp_path):
+    with pytest.raises(FileNotFoundError, match="sysid.fit"):
+        load_vehicle(tmp_path / "none.toml")
+
+
+def test_an_unfinished_write_leaves_the_old_file(saved, monkeypatch):
+    before = saved.read_text()
+    spec, params = preset("whill_cr")
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        save_vehicle(saved, spec, params)
+    assert saved.read_text() == before
