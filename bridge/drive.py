@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from bridge import ros
@@ -39,6 +40,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node publishes commands on the same topic")
+    parser.add_argument("--results", type=Path, help="JSON file for the counts of the drive, written at its end")
     return parser.parse_args(arguments)
 
 
@@ -99,6 +101,7 @@ class DriveNode:
         self._started = time.monotonic()
         self._clock_offset = time.time() - self._started
         self._told: str | None = None
+        self._others: list[str] = []
         node.create_timer(WATCH_PERIOD, self._on_watch)
         node.create_timer(STATUS_PERIOD, self._on_status)
 
@@ -131,7 +134,8 @@ class DriveNode:
         self._incompatible = True
 
     def _on_status(self) -> None:
-        others = other_commanders(self.node, self.options.command_topic)
+        before, self._others = self._others, other_commanders(self.node, self.options.command_topic)
+        others = self._others if before else []  # seen twice: at first a node's name, the guard's too, is not known yet
         forbidden = bool(others) and not self.options.allow_other_commanders
         self.supervisor.block("another node publishes commands", forbidden)
         reason = self.supervisor.reason
@@ -169,6 +173,9 @@ def main(arguments: list[str] | None = None) -> int:
             ros.spin(node)
         finally:
             ros.publish_stops(drive.publisher)
+        if options.results:
+            supervisor = drive.supervisor
+            ros.write_json(options.results, {"counts": dict(supervisor.counts), "reason": supervisor.reason})
     return 0
 
 

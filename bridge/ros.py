@@ -3,6 +3,7 @@
 Only functions import rclpy, so the package can be imported, and its pure parts tested, where ROS 2 is not installed.
 """
 
+import json
 import os
 import signal
 import sys
@@ -127,3 +128,10 @@ def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
         return arguments, []
     at = arguments.index("--ros-args")
     return arguments[:at], arguments[at:]
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file in one piece."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(json.dumps(content) + "\n")
+    os.replace(temporary, path)

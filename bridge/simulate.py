@@ -10,11 +10,10 @@ tolerates: so it stops, forgets, and no frame of an episode can reach the next o
 import argparse
 import array
 import importlib
-import json
 import math
-import os
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +23,8 @@ import numpy as np
 from bridge import ros
 
 RESET_SILENCE = 0.5
+LOG_LENGTH = 100_000
+"""Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
 
@@ -64,6 +65,50 @@ class SimulatedVehicle(Protocol):
         """Advance one control period with the command v [m/s], omega [rad/s]."""
 
 
+class ChairSimulator:
+    """The batch simulator's environment, driven one instance at a time.
+
+    Commands outside the task's range are limited to it. An action repeat is the policy's affair, so here every step is
+    one control period.
+    """
+
+    def __init__(self, task: str = "corridor", vehicle: str | None = None) -> None:
+        """Compile the environment of a task, with a vehicle file, a preset or (None) the built-in chair."""
+        import jax
+
+        from whill_mjx import env as environment
+        from whill_mjx.task import make_task
+
+        env, params = environment.make_env(make_task(task, action_repeat=1), vehicle)
+        self.period = float(env.model.config.control_dt)
+        self._low = np.array([env.task.v_min, -env.task.omega_max])
+        self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
+        self._key = jax.random.key
+        self._reset = jax.jit(lambda key: environment.reset(env, params, key))
+        self._step = jax.jit(lambda state, action: environment.step(env, params, state, action))
+        self._state: Any = None
+
+    def reset(self, seed: int) -> Frame:
+        """Begin the episode of a seed."""
+        self._state, time_step = self._reset(self._key(seed))
+        return self._frame(time_step)
+
+    def step(self, v: float, omega: float) -> Frame:
+        """Advance one control period."""
+        action = (np.array([v, omega]) - self._low) / self._span * 2 - 1
+        self._state, time_step = self._step(self._state, action.astype(np.float32))
+        return self._frame(time_step)
+
+    def _frame(self, time_step: Any) -> Frame:
+        metrics, odometry = time_step.metrics, self._state.vehicle.odometry
+        names = ("x", "y", "yaw", "v", "omega")
+        x, y, yaw, v, omega = (float(metrics[name]) for name in names)
+        reported = [float(getattr(odometry, name)) for name in names]
+        return Frame(np.asarray(time_step.obs), x, y, yaw, v, omega, collided=bool(metrics["collision"]),
+                     reached_goal=bool(metrics["success"]), done=bool(time_step.terminated | time_step.truncated),
+                     odometry=(reported[0], reported[1], reported[2], reported[3], reported[4]))
+
+
 @dataclass
 class Episode:
     """Outcome of one episode, for the results file."""
@@ -73,8 +118,13 @@ class Episode:
     collided: bool = False
     reached_goal: bool = False
     x: float = 0.0
+    """Last place of the drive-axle centre [m]."""
     y: float = 0.0
     commands: int = 0
+    began: float = 0.0
+    """Steady time of the first image [s]."""
+    ended: float = 0.0
+    """Steady time of the last image [s]."""
 
 
 class SimulateNode:
@@ -94,9 +144,11 @@ class SimulateNode:
         self._collision = node.create_publisher(Bool, ros.COLLISION_TOPIC, ros.reliable(10))
         node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
         self.episodes: list[Episode] = []
-        self.command_log: list[tuple[float, float, float]] = []
-        self.delays: list[float] = []
-        """Seconds from publishing an image to receiving the first command after it."""
+        self.command_log: deque[tuple[float, float, float]] = deque(maxlen=LOG_LENGTH)
+        """Steady time of receipt [s], v, omega."""
+        self.delays: deque[tuple[float, float]] = deque(maxlen=LOG_LENGTH)
+        """Steady time of an image [s], and seconds until the first command after it came."""
+        self.image_times: deque[float] = deque(maxlen=LOG_LENGTH)
         self._asked: float | None = None
         vehicle.reset(options.seed)
         vehicle.step(0.0, 0.0)  # compiles, where the simulator does
@@ -113,21 +165,20 @@ class SimulateNode:
 
     def results(self) -> dict[str, Any]:
         """Return the episodes, and what came on the command topic."""
-        times = [t for t, _, _ in self.command_log]
         moving = [i for i, (_, v, omega) in enumerate(self.command_log) if v or omega]
         return {
             "episodes": [vars(episode) for episode in self.episodes],
-            "commands": len(times),
-            "command_times": times,
-            "stops_at_end": len(times) - 1 - moving[-1] if moving else len(times),
-            "frame_to_command_s": self.delays,
+            "image_times": list(self.image_times),
+            "commands": list(self.command_log),
+            "stops_at_end": len(self.command_log) - (moving[-1] + 1 if moving else 0),
+            "frame_to_command": list(self.delays),
         }
 
     def _on_command(self, message: Any) -> None:
         now = time.monotonic()
         self.command_log.append((now, message.linear.x, message.angular.z))
         if self._asked is not None:
-            self.delays.append(now - self._asked)
+            self.delays.append((self._asked, now - self._asked))
             self._asked = None
         if self._frame is not None:
             self.episodes[-1].commands += 1
@@ -157,7 +208,7 @@ class SimulateNode:
         self._next = None
         self._collision.publish(self._types[2](data=False))
         self._show(self.vehicle.reset(seed))
-        self.episodes[-1].steps = 0
+        self.episodes[-1].began, self.episodes[-1].steps = time.monotonic(), 0
 
     def _show(self, frame: Frame) -> None:
         """Publish the end of a period, and end the episode where it is over."""
@@ -169,7 +220,7 @@ class SimulateNode:
         if not frame.done:
             return
         episode.collided, episode.reached_goal = bool(frame.collided), bool(frame.reached_goal)
-        episode.x, episode.y = float(frame.x), float(frame.y)
+        episode.x, episode.y, episode.ended = float(frame.x), float(frame.y), time.monotonic()
         if frame.collided:
             self._collision.publish(self._types[2](data=True))
         self._frame = None
@@ -178,7 +229,7 @@ class SimulateNode:
         if len(self.episodes) == self.options.episodes:
             self.finished_at = time.monotonic()
         if self.options.results:
-            write_json(Path(self.options.results), self.results())
+            ros.write_json(self.options.results, self.results())
 
     def _command(self) -> tuple[float, float]:
         """Return the command in force: the last one, zero where it has expired or is not finite."""
@@ -199,6 +250,7 @@ class SimulateNode:
         message.data = array.array("B", image.tobytes())  # an ndarray would be copied byte by byte
         message.header.stamp = self.node.get_clock().now().to_msg()
         self._asked = time.monotonic()
+        self.image_times.append(self._asked)
         self._image.publish(message)
 
     def _publish_pose(self, frame: Frame) -> None:
@@ -235,13 +287,6 @@ def enlarge(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return image[rows[:, None], columns]
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file in one piece."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(content) + "\n")
-    os.replace(temporary, path)
-
-
 def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     """Return the simulator that `--simulator MODULE:FACTORY` names."""
     module, _, name = options.simulator.partition(":")
@@ -262,7 +307,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=float, default=10.0, help="wait so long for a driver before the first one [s]")
     parser.add_argument("--linger", type=float, default=1.0, help="listen for so long after the last episode [s]")
-    parser.add_argument("--results", help="JSON file for the outcome of the episodes")
+    parser.add_argument("--results", type=Path, help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)
@@ -277,7 +322,7 @@ def main(arguments: list[str] | None = None) -> int:
         simulate = SimulateNode(node, vehicle, options)
         ros.spin(node, simulate.finished)
         if options.results:
-            write_json(Path(options.results), simulate.results())
+            ros.write_json(options.results, simulate.results())
     return 0
 
 
