@@ -1,4 +1,4 @@
-"""Random photometric changes of the camera image: the paper's augmentation, drawn once per episode, noise in each frame."""
+"""The paper's photometric randomisation of camera images: drawn once per episode, the noise anew in each frame."""
 
 from __future__ import annotations
 
@@ -76,4 +76,4 @@ def colour_matrix(change: Photometry) -> jax.Array:
     c, s = change.saturation * jnp.cos(angle), change.saturation * jnp.sin(angle)
     zero, one = jnp.zeros(()), jnp.ones(())
     turn = jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])])
-    return np.linalg.inv(TO_YIQ) @ turn @ TO_YIQ
+    return jnp.asarray(np.linalg.inv(TO_YIQ)) @ turn @ TO_YIQ

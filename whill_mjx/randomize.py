@@ -23,7 +23,8 @@ def randomize_params(key: jax.Array, params: VehicleParams, spread: float) -> Ve
     """
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))
-    return jax.tree.unflatten(tree, [_scale(k, jnp.asarray(leaf), spread) for k, leaf in zip(keys, leaves, strict=True)])
+    drawn = [_scale(k, jnp.asarray(leaf), spread) for k, leaf in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(tree, drawn)
 
 
 def _scale(key: jax.Array, leaf: jax.Array, spread: float) -> jax.Array:
@@ -35,7 +36,7 @@ def _scale(key: jax.Array, leaf: jax.Array, spread: float) -> jax.Array:
 
 def randomize_looks(key: jax.Array, scene: Scene) -> Scene:
     """The scene with other colours, tiles, sun and sky. Shapes and places stay; the goal marker stays blue."""
-    keys = iter(jax.random.split(key, 16))
+    keys = iter(jax.random.split(key, 20))
     boxes, marker, looks = scene.boxes, scene.marker, scene.looks
     paint = jax.random.uniform(next(keys), boxes.colour.shape, minval=0.08, maxval=0.92)
     # No other thing may be taken for the marker: a box's blue never exceeds its red and green.

@@ -2,9 +2,11 @@
 
 Camera axes: x right, y down, z forward. Depth is measured along the optical axis, not along the ray.
 
-Written for one fused kernel. A box turned only about the vertical shows at most one of its two faces per axis, and a face
-has one colour under a distant sun. So each box is reduced to a few numbers beforehand, and a pixel keeps two registers
-through the unrolled loop over boxes: the nearest depth and one word with label and colour. No [P, H, W] array, no gather.
+Written so that XLA fuses the loop over boxes into one kernel on CPUs and GPUs. A box turned only about the vertical
+shows at most one of its two faces per axis, so label and face fit into ten bits. A pixel carries one integer through
+the loop: the bits of the nearest depth with label and face in the low bits, so that an integer minimum does the depth
+test. A face has one colour under a distant sun; it is looked up after the loop. There is no [P, H, W] array and no
+division.
 """
 
 from __future__ import annotations
@@ -111,7 +113,7 @@ def _cast(position, rotation, intrinsics, scene: Scene, height: int, width: int)
 
 
 def _nearest_box(u, v, inverse_z, table) -> jax.Array:
-    """Key (H, W) int32 of the nearest box face, FAR where there is none: a minimum over the boxes in a few loop rounds."""
+    """Key (H, W) int32 of the nearest box face, FAR where there is none: a minimum over boxes in a few rounds."""
     rounds = max(2, -(-table.shape[0] // UNROLL))  # at least 2: a loop of one round is inlined, and no longer a kernel
     size = -(-table.shape[0] // rounds)
     padding = jnp.zeros((rounds * size - table.shape[0], table.shape[1])).at[:, 9:].set(-1.0)
@@ -190,8 +192,10 @@ def _face_words(position: jax.Array, boxes: Boxes, looks: Looks) -> jax.Array:
         jnp.where(offset[:, 2] > 0, looks.sun[2], -looks.sun[2]),
     ], 1)  # (P, 3)
     light = looks.ambient + looks.diffuse * jnp.maximum(cosine, 0.0)
-    words = _pack(light[..., None] * boxes.colour[:, None, :], jnp.arange(boxes.yaw.shape[0], dtype=jnp.uint32)[:, None] + MARKER)
-    return jnp.zeros((boxes.yaw.shape[0] + MARKER, 4), jnp.uint32).at[MARKER:, :3].set(words)
+    count = boxes.yaw.shape[0]
+    label = jnp.arange(count, dtype=jnp.uint32)[:, None] + MARKER
+    words = _pack(light[..., None] * boxes.colour[:, None, :], label)
+    return jnp.zeros((count + MARKER, 4), jnp.uint32).at[MARKER:, :3].set(words)
 
 
 def _shade(word, depth, dx, dy, dz, origin, looks: Looks):
@@ -253,7 +257,7 @@ def _with_marker(scene: Scene) -> Boxes:
     """Marker first, then the solid boxes, so that labels follow the order."""
     boxes, marker = scene.boxes, scene.marker
     if boxes.yaw.shape[0] > MAX_BOXES:
-        raise ValueError(f"scene has {boxes.yaw.shape[0]} boxes; labels allow {MAX_BOXES}. Leave boxes out or merge them.")
+        raise ValueError(f"scene has {boxes.yaw.shape[0]} boxes; labels allow {MAX_BOXES}. Merge or drop some.")
     return Boxes(
         jnp.concatenate([marker.position[None], boxes.centre]),
         jnp.concatenate([marker.half[None], boxes.half]),

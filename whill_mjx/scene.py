@@ -1,6 +1,6 @@
 """The world of one instance as arrays of fixed size: solid boxes, goal marker and looks; collision and clearance.
 
-World frame: x forward along the course, y left, z up, ground at z = 0. Lengths in m, angles in rad, colours linear in [0, 1].
+World frame: x forward along the course, y left, z up, ground at z = 0. Lengths in m, angles in rad, colours in [0, 1].
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def box(x, y, length, width, height, colour, yaw=0.0, mask=True) -> Boxes:
 class Footprint:
     """The vehicle as an oriented rectangle on the ground, centred at its chassis origin (midway between the axles).
 
-    The driven-axle centre, which the tasks measure from, lies `spec.reference_x` (usually negative) ahead of this centre.
+    The driven-axle centre, which the tasks measure from, lies `spec.reference_x` (usually negative) ahead of it.
     """
 
     x: jax.Array  # () centre [m]

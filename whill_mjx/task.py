@@ -1,7 +1,7 @@
 """The two tasks of the reference paper: their worlds, rewards and endings.
 
 The world frame has its origin under the driven-axle centre at the nominal start, x towards the goal. The paper gives
-neither the course's layout nor the corridor's width; both are chosen here, and stay as they are so that figures compare.
+neither the course's layout nor the corridor's width; both are chosen here and stay, so that figures compare.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ObstacleCourse(Task):
     """1 leaves out the second gate: an easier course for short trainings on a CPU."""
     goal_x: float = 5.3
     """Distance of the goal centre [m]: 4.3 m to go until arrival."""
-    gate_x: tuple[float, float] = (2.35, 3.85)
+    gate_x: tuple[float, float] = (2.30, 3.90)
     """Places of the gates [m]."""
 
 
@@ -112,7 +112,7 @@ class World:
 
 
 def scale_action(task: Task, action: jax.Array) -> jax.Array:
-    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,); values outside [-1, 1] are clipped, NaN becomes 0."""
+    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,), clipped to [-1, 1]; NaN counts as 0."""
     action = jnp.clip(jnp.nan_to_num(action, nan=0.0, posinf=1.0, neginf=-1.0), -1.0, 1.0)
     v = task.v_min + (action[0] + 1.0) / 2.0 * (task.v_max - task.v_min)
     return jnp.stack([v, action[1] * task.omega_max])
@@ -162,22 +162,22 @@ def _course(task: ObstacleCourse, key: jax.Array) -> World:
     """Gaps of the gates, their sizes, walls, goal and heading at the start; all lengths in m."""
     draw = _Draws(key if task.randomised else None)
     side = draw.sign()
-    gap_1 = side * draw(0.36, 0.60, fixed=0.45)
-    gap_2 = jnp.clip(gap_1 + draw(-0.50, 0.50, fixed=-0.40), -0.60, 0.60)
+    gap_1 = side * draw(0.42, 0.70, fixed=0.50)
+    gap_2 = jnp.clip(gap_1 + side * draw(-0.80, 0.30, fixed=-0.65), -0.66, 0.66)
     wall = draw(1.60, 1.90, fixed=1.75)
-    goal_y = jnp.clip(gap_2 + draw(-0.40, 0.40, fixed=-0.05), -0.50, 0.50)
+    goal_y = jnp.clip(gap_2 + draw(-0.50, 0.50, fixed=-0.10), -0.60, 0.60)
     boxes = [*_walls(wall, task.goal_x + 2.5)]
     for gate, gap in enumerate([gap_1, gap_2][: task.gates]):
-        x = task.gate_x[gate] + draw(-0.12, 0.12, fixed=0.0)
-        gap_width = draw(1.00, 1.15, fixed=1.08)
+        x = task.gate_x[gate] + draw(-0.10, 0.10, fixed=0.0)
+        gap_width = draw(0.96, 1.10, fixed=1.04)
         for part, direction in enumerate((1.0, -1.0)):
-            inner = direction * gap + gap_width / 2  # distance of the near and the far end of the box from the centre line
+            inner = direction * gap + gap_width / 2  # signed distance of the box's near end from the centre line
             outer = wall - draw(0.0, 0.35, fixed=0.1)
             length, height = draw(0.25, 0.50, fixed=0.35), draw(0.35, 0.62, fixed=0.5)
             colour = jnp.array(OBSTACLES[2 * gate + part])
             boxes.append(box(x, direction * (inner + outer) / 2, length, outer - inner, height, colour))
     marker = _marker(task.goal_x, goal_y, size=0.6, height=1.05)
-    start = jnp.stack([jnp.zeros(()), jnp.zeros(()), draw(-0.17, 0.17, fixed=0.0)])
+    start = jnp.stack([jnp.zeros(()), jnp.zeros(()), draw(-0.22, 0.22, fixed=0.0)])
     return World(Scene(stack_boxes(boxes), marker, default_looks()), start)
 
 
@@ -185,7 +185,8 @@ def _corridor(task: Corridor, key: jax.Array) -> World:
     """Randomised as in the paper: start +-0.3 m and +-15 degrees, box +-1.0 m along and +-0.5 m across."""
     draw = _Draws(key if task.randomised else None)
     box_x, box_y = task.box_x + draw(-1.0, 1.0, fixed=0.0), draw(-0.5, 0.5, fixed=0.0)
-    start = jnp.stack([draw(-0.3, 0.3, fixed=0.0), draw(-0.3, 0.3, fixed=0.0), jnp.deg2rad(draw(-15.0, 15.0, fixed=0.0))])
+    x, y = draw(-0.3, 0.3, fixed=0.0), draw(-0.3, 0.3, fixed=0.0)
+    start = jnp.stack([x, y, jnp.deg2rad(draw(-15.0, 15.0, fixed=0.0))])
     cardboard = box(box_x, box_y, 0.40, 0.40, 0.45, jnp.array(CARDBOARD))
     boxes = stack_boxes([*_walls(jnp.asarray(task.width / 2), task.goal_x + 2.0), cardboard])
     return World(Scene(boxes, _marker(task.goal_x, jnp.zeros(()), size=0.5, height=0.55), default_looks()), start)

@@ -1,0 +1,90 @@
+"""The instance axis: N environments side by side, auto-reset, random vehicle parameters, sharding over devices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.env import Env, Outcome, State, first_outcome, observe, reset_state, step_state, time_step
+from whill_mjx.randomize import randomize_params
+from whill_mjx.types import TimeStep, VehicleParams
+
+
+@struct.dataclass
+class BatchState:
+    """N instances between two steps."""
+
+    env: State  # leaves (N, ...)
+    params: VehicleParams  # leaves (N, ...): each instance has its own vehicle
+
+
+@dataclass(frozen=True, eq=False)
+class BatchEnv:
+    """N instances of one environment. Static: closed over by compiled functions."""
+
+    env: Env
+    params: VehicleParams
+    """Nominal parameters of the vehicle."""
+    count: int
+    """N."""
+    spread: float = 0.0
+    """Relative spread of the vehicle parameters, drawn anew for each episode; 0 gives all the nominal ones."""
+    devices: tuple = ()
+    """Devices over which the instances are split evenly; none leaves the placement to JAX."""
+
+    def __post_init__(self) -> None:
+        if self.devices and self.count % len(self.devices):
+            raise ValueError(f"{self.count} instances do not split evenly over {len(self.devices)} devices.")
+
+    def reset(self, key: jax.Array) -> tuple[BatchState, TimeStep]:
+        """Start N episodes; leaves of the time step are (N, ...)."""
+        keys = self._split(jax.random.split(key, self.count))
+        state, outcome = jax.vmap(self._begin)(keys)
+        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)
+        return self._split((state, time_step(obs, outcome, jnp.ones(self.count, bool))))
+
+    def step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
+        """Advance N instances by one environment step.
+
+        An instance whose episode has ended ignores its action: it starts a new episode and returns that one's first
+        frame, with `first` True and reward 0. So the last frame of an episode is seen before it is replaced.
+
+        Args:
+            state: from `reset` or the previous `step`.
+            actions: (N, 2), each in [-1, 1].
+        """
+        state, outcome, first = jax.vmap(self._advance)(state, actions)
+        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)  # once, after the choice between step and reset
+        return self._split((state, time_step(obs, outcome, first)))
+
+    def _begin(self, key: jax.Array) -> tuple[BatchState, Outcome]:
+        key, params_key = jax.random.split(key)
+        params = randomize_params(params_key, self.params, self.spread) if self.spread else self.params
+        params = jax.tree.map(jnp.asarray, params)
+        state = reset_state(self.env, params, key)
+        return BatchState(state, params), first_outcome(self.env, state)
+
+    def _advance(self, state: BatchState, action: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
+        ended = state.env.done
+        after, outcome = step_state(self.env, state.params, state.env, action)
+        begun = self._begin(state.env.key)
+        chosen, outcome = jax.tree.map(
+            lambda new, old: jnp.where(ended, new, old), begun, (BatchState(after, state.params), outcome)
+        )
+        return chosen, outcome, ended
+
+    def _split(self, tree):
+        """The tree with its first axis split over the devices."""
+        if not self.devices:
+            return tree
+        mesh = jax.sharding.Mesh(self.devices, ("instance",))
+        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("instance"))
+        return jax.lax.with_sharding_constraint(tree, sharding)
+
+
+def make_batch(env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = ()) -> BatchEnv:
+    """`count` instances of `env`; see `BatchEnv` for the rest."""
+    return BatchEnv(env, params, count, spread, tuple(devices))

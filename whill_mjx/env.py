@@ -1,0 +1,257 @@
+"""The environment of one instance: `reset` and `step`, pure functions without a batch axis."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.augment import Photometry, augment, draw_photometry, neutral
+from whill_mjx.effects.acceleration_limit import AccelerationLimit
+from whill_mjx.kinematics import body_twist, camera_pose, reference_pose
+from whill_mjx.model import VehicleModel, build_model
+from whill_mjx.presets import preset
+from whill_mjx.randomize import randomize_looks
+from whill_mjx.render import pinhole, render
+from whill_mjx.scene import Scene, clearance, collides, footprint
+from whill_mjx.specs import VehicleSpec
+from whill_mjx.task import Task, goal_position, make_task, reward_terms, sample_world, scale_action
+from whill_mjx.types import TimeStep, VehicleParams, VehicleState
+from whill_mjx.vehicle import drive, place
+from whill_mjx.vehicle_file import load_vehicle as load_vehicle_file
+
+RAMP = 1.7
+"""Change of wheel speed that the maker documents for velocity commands [m/s^2]."""
+END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
+"""Metrics that are 0 except on the last frame of an episode."""
+
+
+@dataclass(frozen=True, eq=False)
+class Env:
+    """Static part of an environment; closed over by compiled functions."""
+
+    model: VehicleModel
+    task: Task
+    height: int = 64
+    """Rows of the image."""
+    width: int = 64
+    """Columns of the image."""
+    random_looks: bool = False
+    """Draw colours, light and textures anew for each episode."""
+    photometric: bool = False
+    """Apply the paper's photometric randomisation to the images."""
+
+
+@struct.dataclass
+class State:
+    """One instance between two steps."""
+
+    vehicle: VehicleState
+    scene: Scene
+    photometry: Photometry
+    command: jax.Array  # (2,) last command: v [m/s], omega [rad/s]
+    goal_distance: jax.Array  # () m
+    step_count: jax.Array  # () int32 control periods since the start
+    episode_return: jax.Array  # () sum of the rewards since the start
+    done: jax.Array  # () bool: the episode has ended; the next step of a batch starts a new one
+    key: jax.Array  # random key of the episode
+
+
+@struct.dataclass
+class Outcome:
+    """What one step gives besides the image."""
+
+    reward: jax.Array  # ()
+    terminated: jax.Array  # () bool
+    truncated: jax.Array  # () bool
+    metrics: dict[str, jax.Array]
+
+
+def make_env(
+    task: str | Task = "obstacle_course",
+    vehicle: str | Path | None = None,
+    layout: str | None = None,
+    random_looks: bool | None = None,
+    photometric: bool | None = None,
+    height: int = 64,
+    width: int = 64,
+) -> tuple[Env, VehicleParams]:
+    """Environment, and the nominal parameters of its vehicle.
+
+    Args:
+        task: name of a task, or a task with its fields set.
+        vehicle: path of a vehicle file, or the name of a preset; None takes the built-in WHILL Model CR.
+        layout: "randomised" or "fixed"; None keeps the task's own.
+        random_looks, photometric: see `Env`; None means off, except in a randomised corridor, as in the paper.
+        height, width: image size [pixels].
+
+    Raises:
+        ValueError: unknown task, layout or vehicle.
+    """
+    task = make_task(task) if isinstance(task, str) else task
+    if layout is not None:
+        task = dataclasses.replace(task, layout=layout)
+    spec, params = load_vehicle(vehicle)
+    default = task.randomised and getattr(task, "name", "") == "corridor"
+    env = Env(
+        build_model(spec),
+        task,
+        height,
+        width,
+        default if random_looks is None else random_looks,
+        default if photometric is None else photometric,
+    )
+    return env, params
+
+
+def load_vehicle(vehicle: str | Path | None) -> tuple[VehicleSpec, VehicleParams]:
+    """Spec and parameters of a vehicle file or a preset; None: the paper's identified WHILL with its ramp."""
+    if vehicle is None:
+        spec, params = preset("whill_cr_paper")
+        # The ramp acts on each wheel here, so the yaw rate may change by twice 1.7 m/s^2 over the track.
+        ramp = AccelerationLimit(linear=jnp.asarray(RAMP), angular=jnp.asarray(2 * RAMP / spec.track))
+        return spec, dataclasses.replace(params, effects=(*params.effects, ramp))
+    if Path(vehicle).suffix == ".toml":
+        spec, params, _ = load_vehicle_file(vehicle)
+        return spec, params
+    return preset(str(vehicle))
+
+
+def reset(env: Env, params: VehicleParams, key: jax.Array) -> tuple[State, TimeStep]:
+    """Start an episode.
+
+    Args:
+        env: static model and task.
+        params: physical parameters of this instance.
+        key: random key; the same key gives the same world.
+
+    Returns:
+        State, and the first time step: reward 0, `first` True.
+    """
+    state = reset_state(env, params, key)
+    return state, time_step(observe(env, state), first_outcome(env, state), first=jnp.array(True))
+
+
+def step(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, TimeStep]:
+    """Advance one instance by one environment step: `action_repeat` control periods, fewer when the episode ends.
+
+    Args:
+        env: static model and task.
+        params: physical parameters of this instance.
+        state: from `reset` or the previous `step`. After the end of an episode nothing moves any more.
+        action: (2,) normalised speed and yaw rate, each in [-1, 1].
+
+    Returns:
+        Next state, and its time step with obs (H, W, 3) uint8 and reward ().
+    """
+    state, outcome = step_state(env, params, state, action)
+    return state, time_step(observe(env, state), outcome, first=jnp.array(False))
+
+
+def time_step(obs: jax.Array, outcome: Outcome, first: jax.Array) -> TimeStep:
+    """Image and outcome as one time step."""
+    return TimeStep(obs, outcome.reward, outcome.terminated, outcome.truncated, first, outcome.metrics)
+
+
+def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
+    """State at the start of an episode, without its image."""
+    key, world_key, looks_key, photometry_key = jax.random.split(key, 4)
+    world = sample_world(env.task, world_key)
+    scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
+    photometry = draw_photometry(photometry_key) if env.photometric else neutral()
+    vehicle = place(env.model, params, world.start[0], world.start[1], world.start[2])
+    return State(
+        vehicle=vehicle,
+        scene=scene,
+        photometry=photometry,
+        command=jnp.zeros(2),
+        goal_distance=jnp.linalg.norm(goal_position(scene) - world.start[:2]),
+        step_count=jnp.zeros((), jnp.int32),
+        episode_return=jnp.zeros(()),
+        done=jnp.zeros((), bool),
+        key=key,
+    )
+
+
+def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, Outcome]:
+    """State and outcome after one environment step, without the image."""
+    command = scale_action(env.task, action)
+    if env.task.action_repeat == 1:
+        return _control_period(env, params, state, command)
+
+    def repeat(carry, _):
+        before, so_far = carry
+        after, outcome = _control_period(env, params, before, command)
+        outcome = dataclasses.replace(outcome, reward=so_far.reward + outcome.reward)
+        return jax.tree.map(lambda old, new: jnp.where(before.done, old, new), carry, (after, outcome)), None
+
+    first = _control_period(env, params, state, command)
+    return jax.lax.scan(repeat, first, None, length=env.task.action_repeat - 1)[0]
+
+
+def _control_period(env: Env, params: VehicleParams, state: State, command: jax.Array) -> tuple[State, Outcome]:
+    """One control period, its reward and whether it ended the episode."""
+    task = env.task
+    vehicle = drive(env.model, params, state.vehicle, command)
+    x, y, yaw = reference_pose(env.model, vehicle.qpos)
+    distance = jnp.linalg.norm(goal_position(state.scene) - jnp.stack([x, y]))
+    collided = collides(footprint(env.model.spec, x, y, yaw), state.scene.boxes) & ~vehicle.diverged
+    reached = (distance <= task.goal_radius) & ~collided & ~vehicle.diverged
+    progress = jnp.where(vehicle.diverged, 0.0, state.goal_distance - distance)
+    terms = reward_terms(task, progress, command[1] - state.command[1], reached, collided)
+    reward = jnp.asarray(sum(terms.values()))
+
+    terminated = reached | collided | vehicle.diverged
+    step_count = state.step_count + 1
+    truncated = (step_count >= task.max_steps) & ~terminated
+    after = dataclasses.replace(
+        state,
+        vehicle=vehicle,
+        command=command,
+        goal_distance=distance,
+        step_count=step_count,
+        episode_return=state.episode_return + reward,
+        done=terminated | truncated,
+    )
+    after = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
+    ends = {"success": reached, "collision": collided, "timeout": truncated, "diverged": vehicle.diverged}
+    metrics = _metrics(env, after, {name: flag.astype(reward.dtype) for name, flag in ends.items()})
+    return after, Outcome(jnp.where(state.done, 0.0, reward), terminated, truncated, metrics)
+
+
+def first_outcome(env: Env, state: State) -> Outcome:
+    """Outcome that goes with the first frame of an episode."""
+    false, zero = jnp.zeros((), bool), jnp.zeros(())
+    ends = {name: zero for name in ("success", "collision", "timeout", "diverged")}
+    return Outcome(zero, false, false, _metrics(env, state, ends))
+
+
+def _metrics(env: Env, state: State, ends: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
+    return {
+        **ends,
+        "time_s": jnp.where(state.done, state.step_count * env.model.config.control_dt, 0.0),
+        "episode_return": jnp.where(state.done, state.episode_return, 0.0),
+        "x": x,
+        "y": y,
+        "yaw": yaw,
+        "v": v,
+        "omega": omega,
+        "goal_distance": state.goal_distance,
+        "clearance": clearance(footprint(env.model.spec, x, y, yaw), state.scene.boxes),
+    }
+
+
+def observe(env: Env, state: State) -> jax.Array:
+    """Camera image (H, W, 3) uint8 of one instance."""
+    position, rotation = camera_pose(env.model, state.vehicle.qpos)
+    intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
+    image = render(position, rotation, intrinsics, state.scene, env.height, env.width)
+    if not env.photometric:
+        return image
+    return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))

@@ -1,0 +1,168 @@
+"""A planner that knows the true scene and pose: the ceiling that a camera policy is compared with.
+
+Cross-entropy search over speed and yaw-rate profiles of a unicycle with the vehicle's ramp, replanned in every step.
+Its own model is simpler than the vehicle, so what it reaches is a lower bound of the optimum.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.env import Env, State
+from whill_mjx.kinematics import body_twist, reference_pose
+from whill_mjx.scene import Scene, collides, footprint
+from whill_mjx.task import Task, goal_position, reward_terms
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Size and style of the search."""
+
+    horizon_s: float = 5.2
+    """How far the plan looks ahead [s]."""
+    steps: int = 40
+    """Steps of the planner's own model over the horizon."""
+    knots: int = 10
+    """Points between which speed and yaw rate are interpolated."""
+    samples: int = 64
+    """Profiles tried per round."""
+    elites: int = 12
+    """Best profiles that the next round is drawn around."""
+    first_rounds: int = 12
+    """Rounds at the start of an episode."""
+    rounds: int = 2
+    """Rounds in each later step."""
+    spread_v: float = 0.0
+    """Spread of the speed in the first round, in units of the action; 0 keeps close to full speed."""
+    spread_omega: float = 0.4
+    """The same of the yaw rate."""
+    margin: float = 0.06
+    """Distance from boxes below which a plan is penalised [m]."""
+    margin_cost: float = 8.0
+    """Penalty per control period spent closer than that."""
+    acceleration: float = 1.7
+    """Assumed ramp of the speed [m/s^2]; the yaw rate follows in proportion to the track."""
+
+
+def for_task(task: Task) -> PlannerConfig:
+    """Settings that suit a task's speed: slow tasks look further ahead with longer steps."""
+    if task.v_max >= 0.8:
+        return PlannerConfig()
+    return PlannerConfig(horizon_s=18.0, steps=60, knots=10, acceleration=1.7)
+
+
+def first_plan(config: PlannerConfig, env: Env, state: State, key: jax.Array) -> jax.Array:
+    """Plan (knots, 2) of actions for an episode that begins: a search from full speed straight on."""
+    straight = jnp.tile(jnp.array([1.0, 0.0]), (config.knots, 1))
+    return _search(config, env, state, straight, key, config.first_rounds, 1.0)
+
+
+def plan_action(
+    config: PlannerConfig, env: Env, state: State, plan: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Next action (2,) of one instance, and the plan to hand in at the next step.
+
+    Args:
+        config: size of the search.
+        env: static model and task.
+        state: true state of the instance.
+        plan: (knots, 2) actions, the first one now; from the previous step or `first_plan`.
+        key: random key.
+    """
+    plan = _search(config, env, state, plan, key, config.rounds, 0.4)
+    return plan[0], _later(config, plan, env.model.config.control_dt * env.task.action_repeat)
+
+
+def _search(config: PlannerConfig, env: Env, state: State, plan: jax.Array, key: jax.Array, rounds: int, width: float):
+    """Best plan (knots, 2) of the last of some rounds that begin around `plan`."""
+    start, before = _start(env, state), state.command[1]
+    score = jax.vmap(lambda actions: predicted_return(config, env, state.scene, start, before, actions))
+
+    def one_round(carry, round_key):
+        mean, deviation = carry
+        noise = jax.random.normal(round_key, (config.samples, config.knots, 2))
+        tried = jnp.clip(mean + deviation * noise.at[0].set(0.0), -1.0, 1.0)
+        elite = tried[jax.lax.top_k(score(tried), config.elites)[1]]
+        return (elite.mean(0), elite.std(0) + 0.01), elite[0]
+
+    deviation = jnp.broadcast_to(width * jnp.array([config.spread_v, config.spread_omega]), plan.shape)
+    _, best = jax.lax.scan(one_round, (plan, deviation), jax.random.split(key, rounds))
+    return best[-1]
+
+
+def predicted_return(
+    config: PlannerConfig, env: Env, scene: Scene, start: jax.Array, omega_before: jax.Array, actions: jax.Array
+) -> jax.Array:
+    """() return of a profile (knots, 2) in the planner's own model, less the cost of passing too close.
+
+    `start` (5,) is x, y, yaw, v, omega; `omega_before` the yaw rate commanded last.
+    """
+    task, dt = env.task, config.horizon_s / config.steps
+    ramp = jnp.array([config.acceleration, 2.0 * config.acceleration / env.model.spec.track]) * dt
+    goal = goal_position(scene)
+    periods = dt / env.model.config.control_dt  # control periods per step of this model
+    profile = _resample(config, actions)  # (steps, 2)
+    low, high = jnp.array([task.v_min, -task.omega_max]), jnp.array([task.v_max, task.omega_max])
+    commands = low + (profile + 1.0) / 2.0 * (high - low)
+    changes = jnp.diff(commands[:, 1], prepend=omega_before)
+
+    def one_step(pose, command):
+        x, y, yaw, v, omega = pose
+        v_next, omega_next = jnp.stack([v, omega]) + jnp.clip(command - jnp.stack([v, omega]), -ramp, ramp)
+        middle, travelled = yaw + omega_next * dt / 2, (v + v_next) / 2 * dt
+        x, y = x + travelled * jnp.cos(middle), y + travelled * jnp.sin(middle)
+        pose = jnp.stack([x, y, yaw + omega_next * dt, v_next, omega_next])
+        return pose, pose
+
+    _, poses = jax.lax.scan(one_step, start, commands)
+    distance = jnp.linalg.norm(goal - poses[:, :2], axis=1)
+    before = jnp.concatenate([jnp.linalg.norm(goal - start[:2])[None], distance[:-1]])
+    collided = _touches(config, env, scene, poses, margin=0.0)
+    near = _touches(config, env, scene, poses, config.margin)
+    reached = distance <= task.goal_radius
+    terms = reward_terms(task, before - distance, changes, reached, collided)
+    terms["time"] = terms["time"] * periods
+    rewards = sum(terms.values()) - config.margin_cost * periods * near
+    ended = jnp.cumsum(collided | reached) - (collided | reached) > 0  # after the end
+    return jnp.sum(jnp.where(ended, 0.0, rewards))
+
+
+def _touches(config: PlannerConfig, env: Env, scene: Scene, poses: jax.Array, margin: float) -> jax.Array:
+    """(steps,) bool: does the vehicle, grown by `margin` on each side, touch a box at these poses (steps, 5)?"""
+
+    def at(pose):
+        vehicle = footprint(env.model.spec, pose[0], pose[1], pose[2])
+        grown = dataclasses.replace(
+            vehicle, half_length=vehicle.half_length + margin, half_width=vehicle.half_width + margin
+        )
+        return collides(grown, scene.boxes)
+
+    return jax.vmap(at)(poses)
+
+
+def _start(env: Env, state: State) -> jax.Array:
+    """(5,) true x, y, yaw, v, omega."""
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
+    return jnp.stack([x, y, yaw, v, omega])
+
+
+def _resample(config: PlannerConfig, actions: jax.Array) -> jax.Array:
+    """(steps, 2) profile between the knots."""
+    at = jnp.linspace(0.0, config.knots - 1.0, config.steps)
+    return _interpolate(actions, at)
+
+
+def _later(config: PlannerConfig, actions: jax.Array, seconds: float) -> jax.Array:
+    """The same profile seen `seconds` later, its last value held."""
+    knot_s = config.horizon_s / (config.knots - 1)
+    return _interpolate(actions, jnp.minimum(jnp.arange(config.knots) + seconds / knot_s, config.knots - 1.0))
+
+
+def _interpolate(actions: jax.Array, at: jax.Array) -> jax.Array:
+    grid = jnp.arange(actions.shape[0], dtype=jnp.float32)
+    return jnp.stack([jnp.interp(at, grid, actions[:, 0]), jnp.interp(at, grid, actions[:, 1])], 1)
