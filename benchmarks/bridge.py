@@ -3,7 +3,8 @@
     python -m benchmarks.bridge --seconds 60
 
 The policy is a stand-in of 10 million random parameters with the shape of a trained one (recurrent, 64x64 RGB), unless
---policy names another. A trained policy cannot be made to fail on purpose, so `stop_action_ms` always uses the stand-in.
+--policy names another. A trained policy cannot be made to fail on purpose, so `stop_action_ms` always uses the
+stand-in.
 All times are of the system's one steady clock.
 """
 

@@ -208,3 +208,30 @@ def test_vehicle_file_must_be_the_one_of_the_contract(tmp_path):
 def test_contract_without_meaning_is_refused(change):
     with pytest.raises(ValueError, match="PolicyContract"):
         dataclasses.replace(CONTRACT, **change)
+
+
+@pytest.mark.parametrize("encoder", ["conv", "patch"])
+def test_policy_of_the_learner_runs_on_the_vehicle_as_it_does_in_jax(tmp_path, encoder):
+    from bridge.policy import Policy
+    from dreamer import agent
+    from dreamer.config import DreamerConfig
+
+    config = DreamerConfig(encoder=encoder, deter=32, hidden=16, units=16, stoch=4, classes=4, blocks=4, depth=4,
+                           mults=(1, 2), patch_units=4, policy_outscale=1.0, learning_starts=0)
+    params = agent.init_params(config, (16, 16, 3), 2, jax.random.key(1))
+
+    def step(carry, image):
+        return agent.policy_step(config, params, carry, image)
+
+    carry = agent.policy_carry(config, 2)
+    path = export_policy(tmp_path / "p", step, carry, params, CONTRACT, check_steps=30)
+    policy, jitted = Policy.load(path), jax.jit(step)
+    rng = np.random.default_rng(3)
+    commands = []
+    for _ in range(20):
+        image = rng.integers(0, 256, (16, 16, 3), np.uint8)
+        carry, action = jitted(carry, image)
+        commands.append(policy.step(image))
+        low, high = np.array(CONTRACT.action_low), np.array(CONTRACT.action_high)
+        np.testing.assert_allclose(commands[-1], low + (high - low) * (np.asarray(action) + 1) / 2, atol=1e-5)
+    assert np.ptp(commands, axis=0).min() > 1e-3  # the actions do depend on what is seen

@@ -1,0 +1,43 @@
+"""The real simulator behind the bridge's protocol."""
+
+import numpy as np
+import pytest
+
+from bridge.simulate import ChairSimulator, _halfway
+
+
+@pytest.fixture(scope="module")
+def chair():
+    return ChairSimulator("corridor")
+
+
+def test_chair_drives_forward_as_commanded_and_reports_its_odometry(chair):
+    start = chair.reset(3)
+    assert start.image.shape == (64, 64, 3) and start.image.dtype == np.uint8 and start.image.std() > 5
+    for _ in range(20):
+        frame = chair.step(0.3, 0.0)
+    assert frame.v == pytest.approx(0.3, abs=0.02)
+    assert 0.4 < np.hypot(frame.x - start.x, frame.y - start.y) < 0.62
+    assert frame.odometry[0] == pytest.approx(np.hypot(frame.x - start.x, frame.y - start.y), abs=0.05)
+    assert not np.array_equal(frame.image, start.image) and not frame.done
+
+
+def test_same_seed_gives_the_same_first_image_and_another_seed_another(chair):
+    first, again, other = (chair.reset(seed).image for seed in (5, 5, 6))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_left_turn_turns_left_and_commands_beyond_the_task_are_limited(chair):
+    start = chair.reset(3)
+    for _ in range(10):
+        frame = chair.step(9.0, 9.0)
+    assert 0.2 < frame.yaw - start.yaw < 0.65 and frame.v < 0.35
+
+
+def test_pose_between_two_frames_takes_the_short_way_round(chair):
+    a = chair.reset(0)
+    b = chair.step(0.0, 0.0)
+    a, b = (type(f)(f.image, x, 0.0, yaw, 0.0, 0.0, odometry=(0.0, 0.0, 0.0, v, 0.0))
+            for f, x, yaw, v in ((a, 1.0, 3.1, 0.1), (b, 2.0, -3.1, 0.3)))
+    middle = _halfway(a, b)
+    assert middle.x == 1.5 and abs(abs(middle.yaw) - np.pi) < 1e-6 and middle.odometry[3] == pytest.approx(0.2)
