@@ -40,6 +40,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node publishes commands on the same topic")
+    parser.add_argument("--require-arm", action="store_true", help="stand until a first message on /bridge/rearm")
     parser.add_argument("--results", type=Path, help="JSON file for the counts of the drive, written at its end")
     return parser.parse_args(arguments)
 
@@ -98,12 +99,14 @@ class DriveNode:
                              on_clock_change=True)
         self._jump = node.get_clock().create_jump_callback(
             jump, post_callback=lambda _: self.supervisor.clock_jump())
+        if options.require_arm:
+            self.supervisor.latch("not armed")
         self._started = time.monotonic()
         self._clock_offset = time.time() - self._started
-        self._told: str | None = None
+        self._told: tuple[str, str] | None = None
         self._others: list[str] = []
-        node.create_timer(WATCH_PERIOD, self._on_watch)
-        node.create_timer(STATUS_PERIOD, self._on_status)
+        ros.steady_timer(node, WATCH_PERIOD, self._on_watch)
+        ros.steady_timer(node, STATUS_PERIOD, self._on_status)
 
     def _on_image(self, message: Any) -> None:
         now = time.monotonic()
@@ -147,10 +150,10 @@ class DriveNode:
             detail = f"{self.options.command_topic} has other publishers: {others}; stop them"
         status = {"driving": not reason, "reason": reason, "detail": detail, "counts": dict(self.supervisor.counts)}
         self._status.publish(self._status_type(data=json.dumps(status)))
-        if reason != self._told or (reason and detail):
+        if (reason, detail) != self._told:
             log = self.node.get_logger()
             log.warning(f"standing: {reason}. {detail}") if reason else log.info("driving")
-        self._told = reason
+        self._told = (reason, detail)
 
     def _publish(self, command: Command | None) -> None:
         if command is not None:

@@ -74,9 +74,9 @@ def main(arguments: list[str] | None = None) -> int:
                 node.get_logger().info(f"guarding {ros.COMMAND_TOPIC}")
                 telling.cancel()
 
-        telling = node.create_timer(0.2, tell)
+        telling = ros.steady_timer(node, 0.2, tell)
         node.create_subscription(Twist, ros.COMMAND_TOPIC, on_command, ros.reliable())
-        node.create_timer(WATCH_PERIOD, on_watch)
+        ros.steady_timer(node, WATCH_PERIOD, on_watch)
         ros.spin(node)
     return 0
 

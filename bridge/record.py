@@ -2,8 +2,8 @@
 
     python -m bridge.record logs/monday figure_eight_1
 
-Rows are written as they come into a hidden folder beside the trial, which gets the trial's name when the recording
-ends; a killed recorder leaves the hidden folder with all rows but the last second's.
+Rows are written as they come into a hidden folder of the dataset, which moves to its place when the recording ends; a
+killed recorder leaves the hidden folder with all rows but the last second's.
 """
 
 import argparse
@@ -25,7 +25,7 @@ COLUMNS = {
 
 
 class TrialWriter:
-    """Writes the streams of one trial; times count from the first row of any stream."""
+    """Writes the streams of one trial. Times count from the first pose; the command then in force becomes row one."""
 
     def __init__(self, dataset: str | Path, trial: str) -> None:
         """Open the trial for writing.
@@ -39,17 +39,23 @@ class TrialWriter:
         self.folder = Path(dataset) / "trials" / trial
         if self.folder.exists():
             raise ValueError(f"{self.folder}: exists already; a recording never replaces another. Choose another name.")
-        self._partial = self.folder.with_name(f".{trial}.partial-{os.getpid()}")
-        self._partial.mkdir(parents=True)
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
+        self._partial.mkdir()
         self._files: dict[str, IO[str]] = {}
         self._origin: float | None = None
+        self._waiting: tuple[float, float] | None = None
+        self._last: dict[str, float] = {}
         self._first_pose: tuple[float, float, float] | None = None
         self._yaw: float | None = None
         self.rows = dict.fromkeys(COLUMNS, 0)
 
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
-        self._add("command", t, v, omega)
+        if self._origin is None:
+            self._waiting = (v, omega)
+        else:
+            self._add("command", t, v, omega)
 
     def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float) -> None:
         """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped."""
@@ -88,7 +94,13 @@ class TrialWriter:
             self._files[stream].write(",".join(COLUMNS[stream]) + "\n")
         if self._origin is None:
             self._origin = t
-        self._files[stream].write(f"{t - self._origin:.4f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
+            if self._waiting is not None:
+                self._add("command", t, *self._waiting)
+        t = round(t - self._origin, 6)
+        if t <= self._last.get(stream, -math.inf):
+            return  # two messages within a microsecond
+        self._last[stream] = t
+        self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1
 
 
@@ -134,7 +146,7 @@ class RecordNode:
         node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable(10))
         node.create_subscription(Odometry, options.odometry_topic, self._on_odometry, ros.best_effort())
         node.create_subscription(Odometry, options.ground_truth_topic, self._on_ground_truth, ros.best_effort())
-        node.create_timer(1.0, writer.flush)
+        ros.steady_timer(node, 1.0, writer.flush)
 
     def finished(self) -> bool:
         """Return whether the recording time is over."""

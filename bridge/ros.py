@@ -98,6 +98,13 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
+def steady_timer(node: Any, period: float, callback: Callable[[], None]) -> Any:
+    """A timer on the steady clock: a node timer would stop with /clock where the simulation's time is used."""
+    from rclpy.clock import Clock, ClockType
+
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
 def stamp_seconds(stamp: Any) -> float:
     """Seconds of a builtin_interfaces/Time."""
     return stamp.sec + stamp.nanosec * 1e-9

@@ -136,6 +136,8 @@ class SimulateNode:
         from sensor_msgs.msg import Image
         from std_msgs.msg import Bool
 
+        vehicle.reset(options.seed)
+        vehicle.step(0.0, 0.0)  # compiles, where the simulator does; before anybody waits for frames
         self.node, self.vehicle, self.options = node, vehicle, options
         self._types = (Image, Odometry, Bool)
         self._image = node.create_publisher(Image, ros.IMAGE_TOPIC, ros.best_effort())
@@ -150,14 +152,12 @@ class SimulateNode:
         """Steady time of an image [s], and seconds until the first command after it came."""
         self.image_times: deque[float] = deque(maxlen=LOG_LENGTH)
         self._asked: float | None = None
-        vehicle.reset(options.seed)
-        vehicle.step(0.0, 0.0)  # compiles, where the simulator does
         self._half = 0
         self._ready_at = self._begin_at = time.monotonic()
         self._frame: Frame | None = None
         self._next: Frame | None = None
         self.finished_at: float | None = None
-        node.create_timer(vehicle.period / 2, self._on_half_period)
+        ros.steady_timer(node, vehicle.period / 2, self._on_half_period)
 
     def finished(self) -> bool:
         """Return whether all episodes are over, and the time to linger has passed."""

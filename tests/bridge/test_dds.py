@@ -102,7 +102,9 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
     assert max(distance) == pytest.approx(max(column(trial / "ground_truth.csv", "x")), abs=0.05)
     rows_per_command = len(distance) / sum(v > 0 for v in speeds)
     assert rows_per_command > 1.2  # 20 Hz against 10 Hz
-    assert (tmp_path / "logs" / "dataset.toml").is_file()
+    sysid_log = pytest.importorskip("sysid.log")
+    (loaded,) = sysid_log.load_log(tmp_path / "logs").trials
+    assert loaded.name == "straight_1" and loaded.odometry is not None and loaded.ground_truth is not None
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
@@ -157,3 +159,13 @@ def test_refused_policy_ends_the_node_with_an_error_before_it_joins_the_graph(gr
     graph.start("drive", policy if damage == "hash" else policy.with_name("nowhere"))
     assert graph.wait("drive") == 2
     assert ("SHA-256" if damage == "hash" else "does not exist") in graph.log("drive")
+
+
+def test_unarmed_bridge_stands_before_a_good_camera_until_it_is_armed(graph, policy, tmp_path):
+    graph.start("simulate", "--simulator", "point_robot:EndlessRobot", "--results", tmp_path / "results.json")
+    graph.start("drive", policy, "--require-arm", "--ros-args", "-p", "use_sim_time:=true")  # and nobody sends /clock
+    graph.wait_for("drive", "standing: not armed")
+    time.sleep(1.0)
+    assert graph.end("drive") == 0 and graph.end("simulate") == 0
+    commands = json.loads((tmp_path / "results.json").read_text())["commands"]
+    assert len(commands) >= 5 and all(v == 0 and omega == 0 for _, v, omega in commands)

@@ -21,13 +21,16 @@ def read(path):
 
 def test_trial_has_the_columns_of_the_format_and_one_time_origin(tmp_path):
     writer = TrialWriter(tmp_path, "circle_1")
-    writer.command(1000.0, 0.5, -0.2)
-    writer.odometry(1000.05, 0.0, 0.0, 0.0, 0.1, 0.0)
+    for t in (900.0, 999.0):  # before the first pose only the command in force matters
+        writer.command(t, t / 1000, 0.0)
+    writer.odometry(1000.0, 0.0, 0.0, 0.0, 0.1, 0.0)
+    writer.command(1000.05, 0.5, -0.2)
+    writer.command(1000.05, 0.5, -0.2)
     writer.ground_truth(1000.1, 3.0, 4.0, 1.5)
-    assert not (tmp_path / "trials" / "circle_1").exists()  # not before it is whole
+    assert not list((tmp_path / "trials").iterdir())  # not before it is whole
     folder = writer.close()
-    assert read(folder / "command.csv") == [{"t": 0.0, "v": 0.5, "omega": -0.2}]
-    assert read(folder / "odometry.csv") == [{"t": 0.05, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0}]
+    assert read(folder / "command.csv") == [{"t": 0.0, "v": 0.999, "omega": 0.0}, {"t": 0.05, "v": 0.5, "omega": -0.2}]
+    assert read(folder / "odometry.csv") == [{"t": 0, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0}]
     assert read(folder / "ground_truth.csv") == [{"t": 0.1, "x": 3.0, "y": 4.0, "yaw": 1.5}]
 
 
@@ -47,6 +50,7 @@ def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     writer = TrialWriter(tmp_path, "a")
+    writer.ground_truth(0.0, 0.0, 0.0, 0.0)
     writer.command(0.0, math.nan, 0.0)
     writer.command(0.1, 0.2, 0.0)
     assert len(read(writer.close() / "command.csv")) == 1
