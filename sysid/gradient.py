@@ -15,6 +15,7 @@ from sysid.space import Space, is_delay
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
+MAX_DAMPING = 1e4
 MAX_STEP = 0.3  # of the range, in one iteration
 HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
 
@@ -58,10 +59,11 @@ def fit(
             if new < cost[n]:
                 calm[n] = calm[n] + 1 if cost[n] - new < tolerance * cost[n] else 0
                 u[n], cost[n] = candidates[n, best[n]], new
-                damping[n] = np.clip(damping[n] * DAMPINGS[best[n]], 1e-7, 1e4)
+                damping[n] = np.clip(damping[n] * DAMPINGS[best[n]], 1e-7, MAX_DAMPING)
             else:
-                calm[n] += 1
-                damping[n] = min(damping[n] * 100.0, 1e4)
+                # Only when even a short step down the gradient does not help is the start at its minimum.
+                calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
+                damping[n] = min(damping[n] * 100.0, MAX_DAMPING)
         history.append(float(cost.min()))
         if progress is not None:
             progress(1, f"cost {cost.min():.4g}")

@@ -157,15 +157,19 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
     odometry = ground_truth = None
     if (folder / "odometry.csv").exists():
         columns = read_csv(folder / "odometry.csv", ODOMETRY_COLUMNS)
-        odometry = OdometryStream(**{**columns, "yaw": np.unwrap(columns["yaw"])})
+        odometry = OdometryStream(**{name: columns[name] for name in ODOMETRY_COLUMNS})
     if (folder / "ground_truth.csv").exists():
         columns = read_csv(folder / "ground_truth.csv", POSE_COLUMNS)
-        ground_truth = PoseStream(**{**columns, "yaw": np.unwrap(columns["yaw"])})
+        ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
     if odometry is None and ground_truth is None:
         raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them.")
     for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
         if stream is not None:
-            _check_reach(folder / name, stream, command)
+            _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
+    if odometry is not None and odometry.yaw is not None:
+        odometry = replace(odometry, yaw=np.unwrap(odometry.yaw))
+    if ground_truth is not None:
+        ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
     return make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
 
 

@@ -1,0 +1,155 @@
+"""Loading a dataset: what is read, and one error per kind of bad input, naming file, value, rule and remedy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid.log import load_log, manoeuvre_of
+from sysid.synthetic import write_csv, write_text
+
+pytestmark = pytest.mark.quick
+TOML = 'schema = 1\nvehicle = "a chair"\nwheel_radius = 0.13\ntrack = 0.5\nwheelbase = 0.5\nmass = 60.0\n'
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Two trials: one second of standstill in the corner of a room, then straight ahead along its y axis."""
+    t = np.arange(0.0, 3.0, 0.1)
+    v = np.where(t > 0.95, 0.5, 0.0)
+    distance = np.maximum(t - 1.0, 0.0) * 0.5
+    zero = np.zeros_like(t)
+    for name in ("straight_1", "straight_2"):
+        folder = tmp_path / "trials" / name
+        write_csv(folder / "command.csv", "t,v,omega", np.column_stack([t, v, zero]))
+        write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", np.column_stack([t, distance, zero, zero, v, zero]))
+        yaw = np.full_like(t, np.pi / 2)
+        write_csv(folder / "ground_truth.csv", "t,x,y,yaw", np.column_stack([t, zero + 2.0, distance - 1.0, yaw]))
+    write_text(tmp_path / "dataset.toml", TOML + 'held_out = ["straight_2"]\n')
+    return tmp_path
+
+
+def replace_in(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_a_dataset_is_read_with_spec_start_pose_and_held_out_trials(dataset):
+    log = load_log(dataset)
+    assert (log.spec.track, log.spec.mass, log.spec.drive) == (0.5, 60.0, "differential")
+    assert [trial.name for trial in log.training] == ["straight_1"]
+    assert [trial.name for trial in log.held_out] == ["straight_2"]
+    start = log.trials[0].start
+    np.testing.assert_allclose([start.x, start.y, start.yaw], [2.0, -1.0, np.pi / 2], atol=1e-5)
+
+
+def test_odometry_is_counted_from_the_start_of_the_drive(dataset):
+    folder = dataset / "trials" / "straight_1"
+    t = np.arange(0.0, 3.0, 0.1)
+    distance = np.maximum(t - 1.0, 0.0) * 0.5
+    table = np.column_stack([t, 0 * t + 7.0, distance - 3.0, 0 * t + np.pi / 2, 0 * t, 0 * t])
+    write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", table)
+    odometry = load_log(dataset).trials[0].odometry
+    np.testing.assert_allclose(odometry.x, distance, atol=1e-5)
+    np.testing.assert_allclose(odometry.y, 0.0, atol=1e-5)
+
+
+def test_the_start_pose_does_not_look_beyond_the_standstill(dataset):
+    before = load_log(dataset).trials[0].start
+    path = dataset / "trials" / "straight_1" / "ground_truth.csv"
+    lines = path.read_text().splitlines()
+    lines[20:] = [",".join([line.split(",")[0], "2.5", *line.split(",")[2:]]) for line in lines[20:]]
+    path.write_text("\n".join(lines) + "\n")
+    assert load_log(dataset).trials[0].start == before
+
+
+def test_replicates_share_the_name_before_the_number():
+    assert manoeuvre_of("figure_eight_12") == "figure_eight"
+    assert manoeuvre_of("circle") == "circle"
+
+
+def test_a_missing_mass_is_assumed_and_noted(dataset):
+    replace_in(dataset / "dataset.toml", "mass = 60.0\n", "")
+    assert any("mass" in note for note in load_log(dataset).notes)
+
+
+BAD_TOML = {
+    "no schema": ("schema = 1", "", "schema is None"),
+    "newer schema": ("schema = 1", "schema = 2", "schema is 2"),
+    "unknown field": ("mass = 60.0", "weight = 60.0", "unknown field 'weight'"),
+    "unknown drive": ("mass = 60.0", 'drive = "ackermann"', "'ackermann'"),
+    "unknown axle": ("mass = 60.0", 'driven_axle = "middle"', "'middle'"),
+    "vehicle no text": ('vehicle = "a chair"', "vehicle = 3", "vehicle is 3"),
+    "no track": ("track = 0.5", "", "no track"),
+    "track in mm": ("track = 0.5", "track = 500.0", "track is 500"),
+    "negative mass": ("mass = 60.0", "mass = -60.0", "mass is -60"),
+    "unknown reference": ("mass = 60.0", 'reference_point = "camera"', "'camera'"),
+    "bad limits": ("mass = 60.0", "command_limits = [1.0]", "command_limits"),
+    "held out of nothing": ('"straight_2"', '"straight_9"', "straight_9"),
+    "not toml": ("schema = 1", "schema: 1", "not valid TOML"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TOML)
+def test_a_bad_description_is_named_with_file_and_value(dataset, case):
+    old, new, message = BAD_TOML[case]
+    replace_in(dataset / "dataset.toml", old, new)
+    with pytest.raises(ValueError, match="dataset.toml") as caught:
+        load_log(dataset)
+    assert message in str(caught.value)
+
+
+BAD_CSV = {
+    "missing column": ("ground_truth.csv", "t,x,y,yaw", "t,x,y,heading", "no column 'yaw'"),
+    "nan": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,nan,0,0,0,0", "line 3: x is nan"),
+    "text": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,left,0,0,0,0", "x is 'left'"),
+    "short row": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,0", "y is ''"),
+    "time backwards": ("command.csv", "0.2,0,0", "0.05,0,0", "it must increase"),
+    "unix time": ("command.csv", "2.9,0.5,0", "1700000000,0.5,0", "seconds from the trial's start"),
+    "speed in mm/s": ("command.csv", "2.9,0.5,0", "2.9,500,0", "v is 500"),
+    "yaw rate in deg/s": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,0,0,0,0,45", "omega is 45"),
+    "yaw in degrees": ("ground_truth.csv", "2,-1,1.570796", "2,-1,91.3", "yaw spans"),
+    "position in mm": ("ground_truth.csv", "2,-1,1.570796", "2000,-1,1.570796", "x spans"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CSV)
+def test_a_bad_table_is_named_with_file_and_value(dataset, case):
+    name, old, new, message = BAD_CSV[case]
+    replace_in(dataset / "trials" / "straight_1" / name, old, new)
+    with pytest.raises(ValueError, match=name) as caught:
+        load_log(dataset)
+    assert message in str(caught.value)
+
+
+def test_missing_parts_of_a_dataset_are_named(dataset):
+    trial = dataset / "trials" / "straight_1"
+    (trial / "odometry.csv").unlink()
+    assert load_log(dataset).trials[0].odometry is None
+    (trial / "ground_truth.csv").unlink()
+    with pytest.raises(ValueError, match="neither odometry.csv nor ground_truth.csv"):
+        load_log(dataset)
+    (trial / "command.csv").write_text("t,v,omega\n")
+    with pytest.raises(ValueError, match="0 rows of data"):
+        load_log(dataset)
+    (trial / "command.csv").unlink()
+    with pytest.raises(FileNotFoundError, match="command.csv"):
+        load_log(dataset)
+    (dataset / "dataset.toml").unlink()
+    with pytest.raises(FileNotFoundError, match="dataset.toml"):
+        load_log(dataset)
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        load_log(dataset / "nowhere")
+
+
+def test_a_dataset_without_trials_is_an_error(tmp_path):
+    write_text(tmp_path / "dataset.toml", TOML)
+    with pytest.raises(ValueError, match="no trial in it"):
+        load_log(tmp_path)
+
+
+def test_the_hash_tells_changed_data(dataset):
+    before = load_log(dataset).sha256
+    replace_in(dataset / "trials" / "straight_1" / "command.csv", "2.9,0.5,0", "2.9,0.4,0")
+    assert load_log(dataset).sha256 != before

@@ -1,0 +1,139 @@
+"""Loaders of the measured sets: on small fabricated files, and on the real ones where they are at hand."""
+
+from __future__ import annotations
+
+import gzip
+
+import numpy as np
+import pytest
+from conftest import shared_folder
+
+from sysid.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
+from whill_mjx.specs import CREATE, WARTHOG
+
+pytestmark = pytest.mark.quick
+BLOCKS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
+
+
+def write_drive(path, rows=3, update=5):
+    """Windows of straight driving at 1 rad/s of both wheels (0.3 m/s), with the ICP held for `update` samples."""
+    columns = [f"{name}_{i}" for name in BLOCKS for i in range(40)]
+    data = np.zeros((rows, len(columns)))
+    index = {name: i for i, name in enumerate(columns)}
+    for i in range(40):
+        for name in BLOCKS[:4]:
+            data[:, index[f"{name}_{i}"]] = 1.0
+        data[:, index[f"icp_x_{i}"]] = 0.3 * 0.05 * (i // update * update)
+        data[:, index[f"imu_yaw_{i}"]] = 0.1
+    np.savez(path, data=data, columns=np.array(columns))
+
+
+def test_a_drive_window_starts_at_the_measured_wheel_speed_and_scores_only_new_poses(tmp_path):
+    write_drive(tmp_path / "warthog_sand_1.npz")
+    log = load_drive(tmp_path, ("warthog_sand_1",))
+    assert log.spec == WARTHOG and len(log.trials) == 3
+    trial = log.trials[0]
+    assert (trial.start.v, trial.start.omega) == (pytest.approx(0.3), 0.0)
+    np.testing.assert_allclose(trial.ground_truth.t, np.arange(5, 40, 5) * 0.05)
+    np.testing.assert_allclose(trial.command.v, 0.3)
+    assert trial.odometry.x is None and trial.group == "sand"
+
+
+def test_the_gyro_of_the_gravel_run_is_turned_round(tmp_path):
+    for run in ("warthog_gravel", "warthog_sand_1"):
+        write_drive(tmp_path / f"{run}.npz")
+    gyro = load_drive(tmp_path, ("warthog_gravel", "warthog_sand_1")).fields["gyro"]
+    assert gyro["warthog_gravel/000.0"] == pytest.approx(-0.1)
+    assert gyro["warthog_sand_1/000.0"] == pytest.approx(0.1)
+
+
+def test_chained_windows_continue_each_other_and_state_the_error_of_the_joints(tmp_path):
+    write_drive(tmp_path / "warthog_sand_1.npz")
+    log = load_drive(tmp_path, ("warthog_sand_1",), chained=True)
+    truth = log.trials[0].ground_truth
+    assert len(log.trials) == 1 and truth.t[-1] == pytest.approx(4 + 35 * 0.05)
+    assert (np.diff(truth.x) > 0).all()
+    # Each window loses the update between its last change (sample 35) and the next window's first sample.
+    assert "100% of the joints miss an ICP update" in log.notes[0]
+    assert truth.x[-1] == pytest.approx(0.3 * 0.05 * 35 * 3)
+
+
+def test_a_staircase_is_reduced_to_its_steps_and_yaw_is_unwrapped():
+    yaw = np.array([3.1, 3.1, -3.1, -3.1])
+    pose = only_changes(np.arange(4.0), np.zeros(4), np.zeros(4), yaw)
+    np.testing.assert_allclose(pose.t, [2.0])
+    np.testing.assert_allclose(pose.yaw, [2 * np.pi - 3.1])
+
+
+def write_mrclam(folder, robot=1):
+    time = 1248444175.0 + np.arange(0.0, 40.0, 0.05)
+    command = np.column_stack([time, np.full_like(time, 0.08), np.zeros_like(time)])
+    truth = np.column_stack([time + 3.0, 0.08 * (time - time[0]), np.zeros_like(time), np.zeros_like(time)])
+    for kind, table in (("Odometry", command), ("Groundtruth", truth)):
+        with gzip.open(folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz", "wt") as file:
+            np.savetxt(file, table, header="as published")
+
+
+def test_mrclam_windows_intersect_commands_and_truth_and_start_at_the_command_in_force(tmp_path):
+    write_mrclam(tmp_path)
+    log = load_mrclam(tmp_path, (1,))
+    assert log.spec == CREATE and len(log.trials) == 2
+    trial = log.trials[1]
+    assert trial.start.v == pytest.approx(0.08) and trial.start.x == pytest.approx(0.08 * 15, abs=0.01)
+    assert trial.command.t[0] == 0.0 and np.diff(trial.ground_truth.t).min() > 0.09
+
+
+def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
+    with pytest.raises(ValueError, match="no dataset.toml"):
+        detect_format(tmp_path)
+    write_drive(tmp_path / "warthog_sand_1.npz")
+    assert detect_format(tmp_path) == "drive_norlab"
+    with pytest.raises(ValueError, match="--train"):
+        load_any(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no run 'warthog_moon'"):
+        load_drive(tmp_path, ("warthog_moon",))
+    with pytest.raises(ValueError, match="different robots"):
+        load_drive(tmp_path, ("warthog_sand_1", "husky_steps_000_133"))
+    np.savez(tmp_path / "warthog_sand_2.npz", data=np.zeros((3, 2)), columns=np.array(["a", "b"]))
+    with pytest.raises(ValueError, match="cmd_left"):
+        load_drive(tmp_path, ("warthog_sand_2",))
+    write_mrclam(tmp_path)
+    assert detect_format(tmp_path) == "mrclam"
+    with pytest.raises(FileNotFoundError, match="Robot2_Odometry"):
+        load_mrclam(tmp_path, (2,))
+
+
+def test_selections_split_a_run_by_share_and_must_be_disjoint(tmp_path):
+    write_drive(tmp_path / "warthog_sand_1.npz", rows=9)
+    log = load_drive(tmp_path, ("warthog_sand_1",))
+    parts = split(log, ("warthog_sand_1:0-0.6",), ("warthog_sand_1:0.6-1",))
+    assert (len(parts.training), len(parts.held_out)) == (6, 3)
+    assert {trial.name for trial in parts.training}.isdisjoint(trial.name for trial in parts.held_out)
+    with pytest.raises(ValueError, match="disjoint"):
+        split(log, ("warthog_sand_1",), ("warthog_sand_1:0.5-1",))
+    with pytest.raises(ValueError, match="FROM-TO"):
+        split(log, ("warthog_sand_1:half",), ())
+    with pytest.raises(ValueError, match="matches no trial"):
+        split(log, ("gravel",), ())
+
+
+def test_the_published_drive_runs_load_with_the_gyro_sign_of_the_icp():
+    folder = shared_folder("drive_norlab")
+    for run in ("warthog_gravel", "warthog_asphalt_a"):
+        log = load_drive(folder, (run,))
+        assert len(log.trials) > 280
+        turned = np.array([trial.ground_truth.yaw[-1] / trial.ground_truth.t[-1] for trial in log.trials])
+        gyro = np.array([log.fields["gyro"][trial.name] for trial in log.trials])
+        assert (turned * gyro).sum() / (gyro**2).sum() == pytest.approx(0.95, abs=0.15)
+
+
+def test_the_published_continuous_run_loads():
+    run = "warthog_grass_2024_07_18_continuous"
+    log = load_drive(shared_folder("drive_norlab"), (run,))
+    assert len(log.trials) > 30 and log.trials[0].group == "grass"
+
+
+def test_the_published_mrclam_robots_load():
+    log = load_mrclam(shared_folder("mrclam"), (1, 4))
+    assert len(log.trials) > 80
+    assert all(trial.ground_truth.t[-1] <= 15.1 and len(trial.ground_truth.t) > 30 for trial in log.trials)

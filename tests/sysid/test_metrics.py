@@ -1,0 +1,106 @@
+"""The four errors, the ideal replay and the replicate noise against known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.metrics import Prediction, ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
+from sysid.scenarios import SCENARIOS, Scenario, command_sequence
+
+pytestmark = pytest.mark.quick
+
+
+def pose(t, x, y, yaw):
+    return PoseStream(t, *(np.broadcast_to(value, t.shape).astype(float) for value in (x, y, yaw)))
+
+
+def trial_of(truth, command=None, name="circle_1", start=None, odometry=None):
+    command = command or Command(np.array([0.0]), np.array([0.0]), np.array([0.0]))
+    return Trial(name, name.rsplit("_", 1)[0], command, odometry, truth, start or Start())
+
+
+def test_trajectory_error_is_the_rms_distance_and_yaw_its_own_number():
+    t = np.arange(4.0)
+    errors = score(trial_of(pose(t, 0, 0, 0)), Prediction(pose(t, 3.0, 4.0, 0.5), None))["ground_truth"]
+    assert errors.trajectory == pytest.approx(5.0) and errors.yaw == pytest.approx(0.5)
+    assert errors.velocity is None
+
+
+def test_odometry_and_outside_pose_are_scored_apart():
+    t = np.arange(4.0)
+    one = np.ones(4)
+    odometry = OdometryStream(t, one, one, one, one, one)
+    shifted = OdometryStream(t, one, one, one, one + 0.2, one - 0.3)
+    scores = score(trial_of(pose(t, 0, 0, 0), odometry=odometry), Prediction(pose(t, 1.0, 0, 0), shifted))
+    assert scores["ground_truth"].trajectory == pytest.approx(1.0)
+    assert scores["odometry"].trajectory == 0.0
+    assert scores["odometry"].velocity == pytest.approx(0.2)
+    assert scores["odometry"].angular_velocity == pytest.approx(0.3)
+
+
+def test_the_ideal_replay_drives_a_circle_back_to_its_start():
+    command = Command(np.array([0.0]), np.array([0.5]), np.array([0.5]))
+    t = np.array([0.0, np.pi, 2 * np.pi, 4 * np.pi])
+    x, y, yaw = integrate(command, Start(1.0, 2.0, 0.0), t)
+    np.testing.assert_allclose(x, [1.0, 2.0, 1.0, 1.0], atol=1e-12)  # radius 1, centre (1, 3)
+    np.testing.assert_allclose(y, [2.0, 3.0, 4.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(yaw, 0.5 * t)
+
+
+def test_the_start_speeds_hold_until_the_first_command():
+    command = Command(np.array([1.0]), np.array([0.0]), np.array([0.0]))
+    x, _, _ = integrate(command, Start(v=0.5), np.array([0.5, 1.0, 3.0]))
+    np.testing.assert_allclose(x, [0.25, 0.5, 0.5])
+
+
+def test_an_ideal_vehicle_has_no_error():
+    command = command_sequence("figure_eight", Scenario())
+    t = np.arange(0.0, 20.0, 0.05)
+    start = Start(1.0, -2.0, 0.7)
+    truth = PoseStream(t, *integrate(command, start, t))
+    trial = trial_of(truth, command, start=start)
+    assert score(trial, ideal_replay(trial))["ground_truth"].trajectory < 1e-12
+
+
+def test_replicate_noise_is_found_whatever_the_start_pose():
+    random = np.random.default_rng(0)
+    command = command_sequence("straight", Scenario())
+    t = np.arange(0.0, 10.0, 0.02)
+    trials = []
+    for i in range(1, 4):
+        start = Start(*random.normal(size=3))
+        x, y, yaw = integrate(command, start, t)
+        noise = random.normal(size=(3, len(t))) * [[0.02], [0.02], [0.01]]
+        truth = PoseStream(t, x + noise[0], y + noise[1], yaw + noise[2])
+        trials.append(trial_of(truth, command, f"straight_{i}", start))
+    floor = noise_floor(tuple(trials))
+    assert floor["ground_truth"]["trajectory"] == pytest.approx(0.02 * np.sqrt(2), rel=0.05)
+    assert floor["ground_truth"]["yaw"] == pytest.approx(0.01, rel=0.05)
+    assert noise_floor(tuple(trials[:1])) is None
+
+
+def test_only_numbered_trials_with_equal_commands_are_replicates():
+    t = np.arange(3.0)
+    other = Command(np.array([0.0]), np.array([0.1]), np.array([0.0]))
+    trials = (trial_of(pose(t, 0, 0, 0), name="a_1"), trial_of(pose(t, 0, 0, 0), name="a_2"),
+              trial_of(pose(t, 0, 0, 0), other, name="a_3"), trial_of(pose(t, 0, 0, 0), name="b_1"))
+    assert [[trial.name for trial in group] for group in replicate_groups(trials)] == [["a_1", "a_2"]]
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_manoeuvre_starts_and_ends_at_rest(name):
+    command = command_sequence(name, Scenario(v=0.4, omega=0.7, length=5.0))
+    rest = command.t < 0.95
+    assert not command.v[rest].any() and not command.omega[rest].any()
+    assert command.v[-1] == command.omega[-1] == 0.0
+    assert max(np.abs(command.v).max(), np.abs(command.omega).max()) in (0.4, 0.7)
+
+
+def test_the_figure_eight_turns_as_far_to_the_left_as_to_the_right():
+    command = command_sequence("figure_eight", Scenario(omega=0.5))
+    assert command.omega.sum() * 0.1 == pytest.approx(0.0, abs=0.11)
+    assert rmse(np.array([3.0, 4.0])) == pytest.approx(np.sqrt(12.5))
+    with pytest.raises(ValueError, match="unknown manoeuvre"):
+        command_sequence("spiral")

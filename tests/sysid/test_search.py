@@ -1,0 +1,182 @@
+"""Replay, residual, both searches and the intervals, on a small kinematic vehicle with planted parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
+
+from sysid import gradient, tpe, uncertainty
+from sysid.log import Command, PoseStream, Start, Trial
+from sysid.objective import Noise
+from sysid.rollout import Replay, make_batch, predictions
+from sysid.space import Space
+
+U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
+
+
+def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
+    t = np.array([0.03, 0.55, 1.013, 2.5])
+    command = Command(np.array([0.5]), np.array([0.4]), np.array([0.0]))
+    trial = Trial("a_1", "a", command, None, PoseStream(t, 0 * t, 0 * t, 0 * t), Start(1.0, 2.0, np.pi / 2))
+    plant = unicycle_plant(dt=0.01)
+    batch, _ = make_batch((trial,), plant.dt)
+    simulated = Replay(plant, batch, lambda values: values).simulate(np.array([[0.01, 0.01, 1.0]]))  # lag of one step
+    truth = predictions((trial,), dataclasses.replace(simulated, pose=simulated.pose[0]))[0].ground_truth
+    np.testing.assert_allclose(truth.y, 2.0 + 0.4 * np.maximum(t - 0.5, 0.0), atol=0.005)
+    np.testing.assert_allclose(truth.x, 1.0, atol=1e-5)
+
+
+def test_yaw_is_unwrapped_over_several_turns_from_any_start():
+    t = np.arange(0.0, 12.0, 0.1)
+    command = Command(np.array([0.0]), np.array([0.0]), np.array([2.0]))
+    yaw = 9.0 + 2.0 * t  # the measurement counts its turns from elsewhere
+    trial = Trial("a_1", "a", command, None, PoseStream(t, 0 * t, 0 * t, yaw), Start(yaw=9.0, omega=2.0))
+    plant = unicycle_plant()
+    batch, _ = make_batch((trial,), plant.dt)
+    simulated = Replay(plant, batch, lambda values: values).simulate(np.array([[0.1, 0.1, 1.0]]))
+    np.testing.assert_allclose(simulated.pose[0, 0, : len(t), 2], yaw, atol=1e-3)
+
+
+def test_the_jacobian_is_that_of_the_residual(unicycle_log):
+    objective = unicycle_objective(tuple(without_start_noise(trial) for trial in unicycle_log.training[:3]))
+    u = np.array([[0.4, 0.5, 0.6]])
+    _, jacobian = objective.jacobian(u)
+    for parameter in range(3):
+        step = np.eye(3)[parameter] * 1e-2
+        slope = (objective.residuals(u + step) - objective.residuals(u - step)) / 2e-2
+        error = np.linalg.norm(slope - jacobian[..., parameter]) / np.linalg.norm(slope)
+        assert error < 0.01
+
+
+def test_a_wrong_start_pose_is_absorbed_only_as_far_as_its_noise_allows(objective):
+    """A start error of the size of its noise costs about its prior; ignoring it costs hundreds of samples."""
+    moved = []
+    for trial in objective.trials:
+        start = dataclasses.replace(trial.start, yaw=trial.start.yaw + 0.02, position_sigma=1e-9, yaw_sigma=0.02)
+        moved.append(dataclasses.replace(trial, start=start))
+    solved = unicycle_objective(tuple(moved))
+    strict = unicycle_objective(tuple(
+        dataclasses.replace(trial, start=dataclasses.replace(trial.start, yaw_sigma=1e-9)) for trial in moved))
+    base, absorbed, ignored = (one.with_noise(objective.noise).weighted_cost(U_TRUTH[None])[0]
+                               for one in (objective, solved, strict))
+    assert absorbed < base + 0.1 < ignored - 1.0
+
+
+def test_lm_reaches_the_noise_floor_from_several_starts(objective):
+    result = gradient.fit(objective, objective.space, starts=gradient.random_starts(objective.space, 4, seed=1))
+    assert np.ptp(result.start_costs) < 0.01 * result.cost
+    assert 0.8 < result.cost < 1.2  # the residual is as large as the spread between replicates
+    np.testing.assert_allclose(objective.space.to_values(result.u), TRUTH, rtol=0.05)
+
+
+def test_lm_stays_inside_the_bounds_and_finds_a_minimum_on_one(objective):
+    space = dataclasses.replace(objective.space, low=np.array([0.02, 0.02, 0.95]), initial=np.array([0.1, 0.1, 1.2]))
+    bounded = dataclasses.replace(objective, space=space)
+    result = gradient.fit(bounded, space)
+    assert ((result.u >= 0) & (result.u <= 1)).all()
+    assert space.to_values(result.u)[2] == pytest.approx(0.95)
+
+
+def test_frozen_parameters_keep_their_value(objective):
+    result = gradient.fit(objective, objective.space, frozen=("tau_v",), iterations=3)
+    assert objective.space.to_values(result.u)[0] == pytest.approx(0.1)
+    assert result.cost < result.initial_cost
+
+
+def test_a_robust_fit_is_not_drawn_by_outliers(objective):
+    pose, start = objective.measured.pose.copy(), np.array([[trial.start.yaw] for trial in objective.trials])
+    pose[:, ::7, 2] += 0.5 * (pose[:, ::7, 2] - start)  # every seventh yaw is half as far again
+    spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
+    errors = [np.abs(gradient.fit(spoiled, spoiled.space, robust=robust).u - U_TRUTH).max() for robust in (False, True)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("cost", ["paper", "weighted"])
+def test_tpe_improves_on_the_initial_values(objective, cost):
+    result = tpe.fit(objective, objective.space, evaluations=64, seed=0, cost=cost, best=3)
+    assert result.cost < 0.5 * result.initial_cost
+    assert result.starts.shape == (3, 3) and (np.diff(result.history) <= 0).all()
+
+
+def test_the_papers_cost_is_the_sum_of_the_position_rmse(objective):
+    from sysid.metrics import score
+
+    u = np.array([[0.3, 0.4, 0.5]])
+    simulated = objective.simulate(u)
+    one = type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0])
+    errors = [score(trial, prediction)["ground_truth"].trajectory
+              for trial, prediction in zip(objective.trials, predictions(objective.trials, one), strict=True)]
+    assert objective.paper_cost(u)[0] == pytest.approx(sum(errors), rel=1e-4)
+
+
+def test_intervals_hold_the_truth_and_are_not_wide(objective):
+    result = gradient.fit(objective, objective.space)
+    known = uncertainty.estimate(objective, result.u)
+    for estimate, truth in zip(known.estimates, TRUTH, strict=True):
+        assert estimate.low - 0.02 * truth < truth < estimate.high + 0.02 * truth
+        assert estimate.identifiable and estimate.high - estimate.low < 0.5 * truth
+    assert known.weak_combinations() == []
+
+
+def test_what_the_log_does_not_tell_is_named(objective):
+    """Two parameters that act only as a sum, and one that does nothing."""
+    space = Space(("a", "b", "nothing"), np.zeros(3), np.ones(3), np.full(3, 0.5), np.zeros(3, bool))
+    plant = unicycle_plant()
+    batch, measured = make_batch(objective.trials, plant.dt, record_dt=0.04)
+
+    def lags(values):
+        return values[:2].sum() * np.array([0.3, 0.2, 0.0]) + np.array([0.0, 0.0, 0.9])
+
+    blind = dataclasses.replace(objective, replay=Replay(plant, batch, lags), space=space, measured=measured)
+    result = gradient.fit(blind, space, iterations=8)
+    known = uncertainty.estimate(blind, result.u)
+    assert [estimate.identifiable for estimate in known.estimates] == [False, False, False]
+    weak = " / ".join(known.weak_combinations())
+    assert "nothing" in weak and "a" in weak and "b" in weak
+    sum_sd = np.sqrt(np.array([1, 1, 0]) @ known.covariance @ np.array([1, 1, 0]))
+    assert sum_sd < 0.1  # their sum is well known
+
+
+def test_a_delay_is_profiled_on_a_grid(objective):
+    renamed = dataclasses.replace(objective.space, names=("delay", "tau_omega", "turn"))
+    (name, grid, costs), = gradient.profile_delays(dataclasses.replace(objective, space=renamed), renamed, U_TRUTH)
+    assert name == "delay" and len(grid) == len(costs) == 16
+    assert grid[costs.argmin()] == pytest.approx(TRUTH[0], rel=0.35)
+
+
+def test_a_diverged_simulation_is_dear_and_not_a_number_nowhere(objective):
+    class Broken:
+        def simulate(self, values):
+            simulated = objective.replay.simulate(values)
+            pose = simulated.pose.copy()
+            pose[:, 0] = np.nan
+            return dataclasses.replace(simulated, pose=pose)
+
+    broken = dataclasses.replace(objective, replay=Broken())
+    assert np.isfinite(broken.weighted_cost(U_TRUTH[None])).all()
+    assert broken.weighted_cost(U_TRUTH[None])[0] > 1e3 * objective.weighted_cost(U_TRUTH[None])[0]
+    assert broken.paper_cost(U_TRUTH[None])[0] > 100
+
+
+@pytest.mark.quick
+def test_unit_coordinates_and_values_are_inverse():
+    space = Space(("a", "b"), np.array([0.1, -2.0]), np.array([10.0, 2.0]), np.array([1.0, 0.0]),
+                  np.array([True, False]))
+    u = np.array([[0.0, 0.0], [0.3, 0.7], [1.0, 1.0]])
+    np.testing.assert_allclose(space.to_unit(space.to_values(u)), u, atol=1e-12)
+    inside = u[1]
+    slope = (space.to_values(inside + 1e-6) - space.to_values(inside - 1e-6)) / 2e-6
+    np.testing.assert_allclose(space.slope(inside), slope, rtol=1e-6)
+    with pytest.raises(ValueError, match="outside"):
+        dataclasses.replace(space, initial=np.array([20.0, 0.0]))
+    with pytest.raises(ValueError, match="low must be below high"):
+        dataclasses.replace(space, low=np.array([10.0, -2.0]))
+
+
+@pytest.mark.quick
+def test_noise_scales_are_named():
+    noise = Noise(np.ones(3), np.arange(5.0), "defaults")
+    assert noise.as_dict()["odometry.omega"] == 4.0
