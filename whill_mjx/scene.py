@@ -100,9 +100,9 @@ def box(x, y, length, width, height, colour, yaw=0.0, mask=True) -> Boxes:
 
 @struct.dataclass
 class Footprint:
-    """The vehicle as an oriented rectangle on the ground, centred at its chassis origin (midway between the axles).
+    """The vehicle as an oriented rectangle on the ground, centred at its chassis origin.
 
-    The driven-axle centre, which the tasks measure from, lies `spec.reference_x` (usually negative) ahead of it.
+    The driven-axle centre, which the tasks measure from, lies `spec.reference_x` (negative: behind) along the heading.
     """
 
     x: jax.Array  # () centre [m]

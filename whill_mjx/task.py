@@ -161,9 +161,12 @@ OBSTACLES = ((0.78, 0.20, 0.16), (0.88, 0.58, 0.14), (0.26, 0.55, 0.24), (0.66, 
 def _course(task: ObstacleCourse, key: jax.Array) -> World:
     """Gaps of the gates, their sizes, walls, goal and heading at the start; all lengths in m."""
     draw = _Draws(key if task.randomised else None)
+    heading = draw(-0.20, 0.20, fixed=0.0)
+    ahead = task.gate_x[0] * jnp.tan(heading)  # where driving straight on would cross the first gate
     side = draw.sign()
-    gap_1 = side * draw(0.42, 0.70, fixed=0.50)
-    gap_2 = jnp.clip(gap_1 + side * draw(-0.80, 0.30, fixed=-0.65), -0.66, 0.66)
+    gap_1 = side * draw(0.42, 0.66, fixed=0.50)
+    gap_1 = jnp.where(jnp.abs(gap_1 - ahead) < 0.40, ahead - side * 0.40, gap_1)  # straight on must not lead through
+    gap_2 = jnp.clip(gap_1 + side * draw(-0.70, 0.30, fixed=-0.65), -0.66, 0.66)
     wall = draw(1.60, 1.90, fixed=1.75)
     goal_y = jnp.clip(gap_2 + draw(-0.50, 0.50, fixed=-0.10), -0.60, 0.60)
     boxes = [*_walls(wall, task.goal_x + 2.5)]
@@ -177,7 +180,7 @@ def _course(task: ObstacleCourse, key: jax.Array) -> World:
             colour = jnp.array(OBSTACLES[2 * gate + part])
             boxes.append(box(x, direction * (inner + outer) / 2, length, outer - inner, height, colour))
     marker = _marker(task.goal_x, goal_y, size=0.6, height=1.05)
-    start = jnp.stack([jnp.zeros(()), jnp.zeros(()), draw(-0.22, 0.22, fixed=0.0)])
+    start = jnp.stack([jnp.zeros(()), jnp.zeros(()), heading])
     return World(Scene(stack_boxes(boxes), marker, default_looks()), start)
 
 
