@@ -40,6 +40,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node publishes commands on the same topic")
+    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on /bridge/rearm")
     parser.add_argument("--results", type=Path, help="JSON file for the counts of the drive, written at its end")
     return parser.parse_args(arguments)
@@ -144,8 +145,7 @@ class DriveNode:
         reason = self.supervisor.reason
         detail = self.controller.last_error
         if not self.supervisor.counts["frames"] and time.monotonic() - self._started > SILENT_AFTER:
-            topic = self.options.image_topic
-            detail = detail or explain_silence(topic, self.node.count_publishers(topic), self._incompatible)
+            detail = detail or self._explain_silence()
         elif others:
             detail = f"{self.options.command_topic} has other publishers: {others}; stop them"
         status = {"driving": not reason, "reason": reason, "detail": detail, "counts": dict(self.supervisor.counts)}
@@ -154,6 +154,14 @@ class DriveNode:
             log = self.node.get_logger()
             log.warning(f"standing: {reason}. {detail}") if reason else log.info("driving")
         self._told = (reason, detail)
+
+    def _explain_silence(self) -> str:
+        late = self.supervisor.counts["late"]
+        if late:
+            return (f"{late} frames are stamped more than {self.options.stamp_age} s from now: "
+                    "set the camera's clock, or give --stamp-age inf")
+        topic = self.options.image_topic
+        return explain_silence(topic, self.node.count_publishers(topic), self._incompatible)
 
     def _publish(self, command: Command | None) -> None:
         if command is not None:
@@ -170,7 +178,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (PolicyFileError, ValueError) as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return 2
-    with ros.node_session("bridge_drive", ros_arguments) as node:
+    with ros.node_session("bridge_drive", ros_arguments, options.realtime) as node:
         drive = DriveNode(node, Controller(policy, safety), options)
         try:
             ros.spin(node)

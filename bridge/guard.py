@@ -6,6 +6,7 @@ The vehicle's driver has no command timeout of its own. The guard listens to the
 was a motion and none has followed for SILENCE seconds, it publishes zeros. It never publishes anything else.
 """
 
+import argparse
 import sys
 import time
 from typing import Any
@@ -50,8 +51,11 @@ class Watchdog:
 
 def main(arguments: list[str] | None = None) -> int:
     """Guard until SIGTERM or Ctrl-C."""
-    _, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
-    with ros.node_session(ros.GUARD_NAME, ros_arguments) as node:
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    parser = argparse.ArgumentParser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
+    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
+    options = parser.parse_args(own)
+    with ros.node_session(ros.GUARD_NAME, ros_arguments, options.realtime) as node:
         from geometry_msgs.msg import Twist
 
         watchdog = Watchdog()

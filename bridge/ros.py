@@ -38,6 +38,16 @@ def use_dds_profile(environment: MutableMapping[str, str] = os.environ) -> str:
     return str(PROFILE)
 
 
+def set_realtime(name: str, priority: int) -> None:
+    """Run this thread, and those it starts, before all normal processes; say so where not permitted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, ValueError) as error:
+        print(f"{name}: --realtime {priority}: {error}. It needs a priority from 1 to 99 and the right to use it. "
+              "Run `setcap cap_sys_nice=ep` on the interpreter or raise rtprio in limits.conf; going on without.",
+              file=sys.stderr)
+
+
 def best_effort() -> Any:
     """Sensor data: newest only, losses allowed."""
     from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -53,13 +63,16 @@ def reliable(depth: int = 1) -> Any:
 
 
 @contextmanager
-def node_session(name: str, arguments: list[str]) -> Iterator[Any]:
+def node_session(name: str, arguments: list[str], realtime: int = 0) -> Iterator[Any]:
     """A ROS node whose process ends in order: SIGTERM and Ctrl-C leave `spin`, then the caller says goodbye.
 
     Args:
         name: node name.
         arguments: `--ros-args ...` of the command line, or empty.
+        realtime: SCHED_FIFO priority of this process and its DDS threads; 0 leaves the normal scheduling.
     """
+    if realtime:
+        set_realtime(name, realtime)
     use_dds_profile()
     try:
         import rclpy

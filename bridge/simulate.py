@@ -309,6 +309,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--linger", type=float, default=1.0, help="listen for so long after the last episode [s]")
     parser.add_argument("--results", type=Path, help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
+    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)
 
@@ -318,7 +319,7 @@ def main(arguments: list[str] | None = None) -> int:
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
     vehicle = make_vehicle(options)
-    with ros.node_session("bridge_simulate", ros_arguments) as node:
+    with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
         ros.spin(node, simulate.finished)
         if options.results:
