@@ -1,0 +1,219 @@
+"""How well vehicles are identified: planted truth, the shared plant logs, and two published measured sets.
+
+    python -m benchmarks.fit --shared ../shared --parts planted plant drive mrclam
+
+Writes benchmarks/results/fit.json (planted, plant, speed) and measured.json (drive, mrclam). A "gain" is the share of
+the held-out mean position RMSE (or yaw RMSE) of the ideal kinematic replay that the fitted vehicle removes; every
+window restarts from the measured pose and wheel speeds and counts only where the measurement changed.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from sysid.fit import Fit, FitConfig, fit_log, make_objective, predict
+from sysid.log import Log, Trial, load_log
+from sysid.measured import load_drive, load_mrclam, split
+from sysid.report import error_rows, summaries
+
+DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
+DRIVE_HELD_OUT = {"asphalt": ("warthog_asphalt_a:0.667-1",), "sand": ("warthog_sand_2",)}
+DRIVE_RUNS = ("warthog_asphalt_a", "warthog_sand_1", "warthog_sand_2")
+PRESETS: tuple[Literal["paper", "physical"], ...] = ("paper", "physical")
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What to measure."""
+
+    shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
+    """Folder that holds data/plant and data/measured."""
+    parts: tuple[Literal["planted", "plant", "drive", "mrclam", "speed"], ...] = ("planted", "plant", "drive", "mrclam")
+    windows: int = 100
+    """Training windows of a measured set that are fitted, spread evenly; all held-out windows are scored."""
+    evaluations: int = 96
+    """Parameter sets of the global search."""
+    iterations: int = 20
+    """Iterations of the gradient search."""
+    starts: int = 3
+    """Starts of the gradient search."""
+
+
+def thin(log: Log, count: int) -> Log:
+    """The log with at most `count` training trials, spread evenly over each group; held-out ones are kept."""
+    groups: dict[str, list[Trial]] = {}
+    for trial in log.training:
+        groups.setdefault(trial.group, []).append(trial)
+    each = max(count // len(groups), 1)
+    kept = {group[i].name for group in groups.values()
+            for i in np.linspace(0, len(group) - 1, min(each, len(group))).round().astype(int)}
+    return log.select(lambda trial: trial.held_out or trial.name in kept)
+
+
+def evaluate(fit: Fit, trials: tuple[Trial, ...]) -> dict[str, Any]:
+    """Held-out summary of `sysid.report` for some trials."""
+    held_out = tuple(replace(trial, held_out=True) for trial in trials)
+    rows = error_rows(held_out, *predict(fit, held_out))
+    return summaries(rows, held_out)
+
+
+def gains(summary: dict[str, Any], prefix: str) -> dict[str, dict[str, Any]]:
+    """Figures of one held-out summary: errors of the outside pose before and after, and the share removed."""
+    figures = {}
+    for metric in ("trajectory", "yaw"):
+        one = summary["ground_truth"][metric]
+        name = prefix if metric == "trajectory" else f"{prefix}_yaw"
+        figures[f"gain_{name}"] = figure([1 - one["fitted"] / one["ideal"]], "share")
+        for which in ("ideal", "initial", "fitted"):
+            figures[f"rmse_{name}_{which}"] = figure([one[which]], one["unit"])
+    return figures
+
+
+def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -> FitConfig:
+    # The paper's drive has no wheel-spin state: its odometry is its body's motion, so it can only fit the pose.
+    return FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations, starts=settings.starts,
+                     robust=True, channels="both" if preset == "physical" else "ground_truth")
+
+
+def drive(settings: Benchmark) -> None:
+    """DRIVE: one fit per terrain and one pooled, native 2 s windows; the same vehicles on chained 6 s steps."""
+    folder = settings.shared / "data" / "measured" / "drive_norlab"
+    native, chained = (load_drive(folder, DRIVE_RUNS, chained=chained) for chained in (False, True))
+    everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))
+    choices = {name: (DRIVE_TRAIN[name], DRIVE_HELD_OUT[name]) for name in DRIVE_TRAIN} | {"pooled": everything}
+    for preset in PRESETS:
+        for name, (train, held_out) in choices.items():
+            log = split(native, train, held_out)
+            fit = fit_log(thin(log, settings.windows), measured_config(settings, preset))
+            result = evaluate(fit, log.held_out)
+            stem = f"drive_{name}_{preset}"
+            figures = gains(result["summary"]["held_out"], stem)
+            steps = evaluate(fit, split(chained, train, held_out).held_out)
+            figures |= gains(steps["summary"]["held_out"], f"{stem}_chained_6s")
+            for group, parts in (result["groups"] if name == "pooled" else {}).items():
+                figures |= gains(parts["held_out"], f"{stem}_on_{group}")
+            figures[f"seconds_{stem}"] = figure([fit.seconds], "s")
+            if preset == "physical" and name != "pooled":
+                figures[f"drive_gain_over_ideal_{name}"] = figures[f"gain_{stem}"]
+            record("measured", "A fitted vehicle predicts real robots better than an ideal one", figures)
+            show(figures)
+            show_parameters(fit)
+    for note in chained.notes:
+        print(note)
+
+
+def mrclam(settings: Benchmark) -> None:
+    """MRCLAM: robots 1 to 3 fitted, 4 and 5 held out."""
+    log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
+    log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
+    for preset in PRESETS:
+        # 15 s windows are long: a third of the windows is the same driving time.
+        fit = fit_log(thin(log, settings.windows // 3), measured_config(settings, preset))
+        figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")
+        figures[f"seconds_mrclam_{preset}"] = figure([fit.seconds], "s")
+        record("measured", "A fitted vehicle predicts real robots better than an ideal one", figures)
+        show(figures)
+        show_parameters(fit)
+
+
+def plant(settings: Benchmark) -> None:
+    """The plant's plain chair: held-out position error against the spread between replicates."""
+    log = load_log(settings.shared / "data" / "plant" / "plain")
+    for preset in PRESETS:
+        config = FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations,
+                           starts=settings.starts)
+        fit = fit_log(log, config)
+        result = evaluate(fit, log.held_out)
+        one = result["summary"]["held_out"]["ground_truth"]["trajectory"]
+        # The held-out set has replicates of one manoeuvre only; the training set's floor is over all manoeuvres.
+        floor = evaluate(fit, log.trials)["noise_floor"]["held_out"]["ground_truth"]["trajectory"]
+        figures = gains(result["summary"]["held_out"], f"plant_{preset}")
+        figures[f"plant_replicate_ratio_{preset}"] = figure([one["fitted"] / floor], "-")
+        figures[f"seconds_plant_{preset}"] = figure([fit.seconds], "s")
+        if preset == "physical":
+            figures["plant_replicate_ratio"] = figures[f"plant_replicate_ratio_{preset}"]
+        record("fit", "The fit reaches the noise floor of its data", figures)
+        show(figures)
+        show_parameters(fit)
+
+
+def planted(settings: Benchmark) -> None:
+    """Planted truth of the same model: held-out error against the sensor noise, and starts that agree."""
+    from sysid.space import make_space
+    from sysid.synthetic import write_dataset
+    from whill_mjx.parameters import get_values
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    truth = preset_params(WHILL_CR, "paper_optimised")
+    with tempfile.TemporaryDirectory() as folder:
+        log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, replicates=2))
+    config = FitConfig(preset="paper", trials=settings.evaluations, iterations=settings.iterations,
+                       starts=settings.starts)
+    fit = fit_log(log, config)
+    one = evaluate(fit, log.held_out)["summary"]["held_out"]["ground_truth"]["trajectory"]
+    space = make_space(truth)
+    inside = [estimate.low <= value <= estimate.high for estimate, value in zip(
+        fit.uncertainty.estimates, np.asarray(get_values(truth, space.names)), strict=True) if estimate.identifiable]
+    figures = {"noise_floor_ratio": figure([one["fitted"] / one["noise_floor"]], "-"),
+               "planted_identifiable": figure([float(len(inside))], "count"),
+               "planted_inside_interval": figure([float(np.mean(inside))], "share")}
+    record("fit", "The fit reaches the noise floor of its data", figures)
+    show(figures)
+    show_parameters(fit)
+
+
+def speed(settings: Benchmark) -> None:
+    """Seconds of one gradient start and of 500 evaluations of TPE on the plant's plain chair, compilation included."""
+    from sysid import gradient, tpe
+    from sysid.objective import estimate_noise
+
+    log = load_log(settings.shared / "data" / "plant" / "plain")
+    fit = fit_log(log, FitConfig(method="lm", starts=1, iterations=1))
+    figures = {}
+    for name in ("cpu_seconds", "tpe500_cpu_seconds"):
+        objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, estimate_noise(log.training))
+        began = time.perf_counter()
+        if name == "cpu_seconds":
+            gradient.fit(objective, fit.space, iterations=settings.iterations)
+        else:
+            tpe.fit(objective, fit.space, evaluations=500)
+        figures[name] = figure([time.perf_counter() - began], "s")
+    record("fit", "The fit reaches the noise floor of its data", figures)
+    show(figures)
+
+
+def show(figures: dict[str, dict[str, Any]]) -> None:
+    for name, one in figures.items():
+        print(f"{name:52} {one['value']:9.4f} {one['unit']}", flush=True)
+
+
+def show_parameters(fit: Fit) -> None:
+    for one in fit.uncertainty.estimates:
+        print(f"  {one.name:32} {one.value:10.4g}  [{one.low:.4g}, {one.high:.4g}] {one.remark}", flush=True)
+
+
+def main(settings: Benchmark) -> None:
+    """Measure the parts whose data is at hand."""
+    parts = {"planted": planted, "plant": plant, "drive": drive, "mrclam": mrclam, "speed": speed}
+    for name in settings.parts:
+        needs = {"plant": "plant", "speed": "plant", "drive": "measured/drive_norlab", "mrclam": "measured/mrclam"}
+        folder = settings.shared / "data" / needs.get(name, "")
+        if name in needs and not folder.is_dir():
+            print(f"{name}: {folder} is not there, left out")
+            continue
+        parts[name](settings)
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Benchmark, description=__doc__))
