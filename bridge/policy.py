@@ -83,7 +83,7 @@ class Policy:
         path = Path(path)
         members = _read_members(path)
         contract, hashes = parse_contract(f"{path}/policy.json", members.pop("policy.json", None))
-        _check_hashes(path, members, hashes)
+        _check_hashes(path, members, hashes, contract)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # one thread has the lower tail latency on a vehicle's shared cores
         options.inter_op_num_threads = 1
@@ -262,7 +262,8 @@ def _is_hashes(value: Any) -> bool:
                     for name, digest in value.items()))
 
 
-def _check_hashes(path: Path, members: dict[str, bytes], hashes: dict[str, str]) -> None:
+def _check_hashes(path: Path, members: dict[str, bytes], hashes: dict[str, str], contract: Contract) -> None:
+    """Raise where a file is missing, is not the one that was exported, or is not what its name says."""
     for name, want in hashes.items():
         if name not in members:
             raise PolicyFileError(f"{path}/{name}: is missing, but policy.json lists it with SHA-256 {want}. All "
@@ -271,6 +272,10 @@ def _check_hashes(path: Path, members: dict[str, bytes], hashes: dict[str, str])
         if got != want:
             raise PolicyFileError(f"{path}/{name}: SHA-256 {got}, but policy.json says {want}. The file was damaged or "
                                   "changed after the export. Copy the policy file again.")
+    vehicle = hashes.get("vehicle.toml", contract.vehicle_sha256)
+    if vehicle != contract.vehicle_sha256:
+        raise PolicyFileError(f"{path}/vehicle.toml: SHA-256 {vehicle}, but the policy was trained with the vehicle of "
+                              f"vehicle_sha256 {contract.vehicle_sha256!r}. Both must agree. {EXPORT_AGAIN}.")
     if "weights.npz" in hashes:
         try:
             with np.load(io.BytesIO(members["weights.npz"]), allow_pickle=False) as weights:

@@ -139,6 +139,16 @@ def test_network_with_a_matching_hash_that_is_no_onnx_is_refused(folder):
 
 
 @pytest.mark.quick
+def test_vehicle_file_of_another_training_is_refused(folder):
+    (folder / "vehicle.toml").write_bytes(b"schema = 1\n")
+    digest = hashlib.sha256(b"schema = 1\n").hexdigest()
+    edit(folder, lambda table: table["files"].update({"vehicle.toml": digest}))
+    assert "vehicle_sha256" in refusal(folder)
+    edit(folder, lambda table: table.update(vehicle_sha256=digest))
+    assert Policy.load(folder).contract.vehicle_sha256 == digest
+
+
+@pytest.mark.quick
 def test_pickled_weights_are_refused(folder):
     (folder / "weights.npz").write_bytes(b"\x80\x04N.")
     edit(folder, lambda table: table["files"].update({"weights.npz": hashlib.sha256(b"\x80\x04N.").hexdigest()}))
