@@ -113,7 +113,7 @@ def load_vehicle(vehicle: str | Path | None) -> tuple[VehicleSpec, VehicleParams
     if vehicle is None:
         spec, params = preset("whill_cr_paper")
         # The ramp acts on each wheel here, so the yaw rate may change by twice 1.7 m/s^2 over the track.
-        ramp = AccelerationLimit(linear=jnp.asarray(RAMP), angular=jnp.asarray(2 * RAMP / spec.track))
+        ramp = AccelerationLimit(linear=jnp.array(RAMP, float), angular=jnp.array(2 * RAMP / spec.track, float))
         return spec, dataclasses.replace(params, effects=(*params.effects, ramp))
     if Path(vehicle).suffix == ".toml":
         spec, params, _ = load_vehicle_file(vehicle)
@@ -189,8 +189,8 @@ def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array)
         outcome = dataclasses.replace(outcome, reward=so_far.reward + outcome.reward)
         return jax.tree.map(lambda old, new: jnp.where(before.done, old, new), carry, (after, outcome)), None
 
-    first = _control_period(env, params, state, command)
-    return jax.lax.scan(repeat, first, None, length=env.task.action_repeat - 1)[0]
+    carry = (state, first_outcome(env, state))
+    return jax.lax.scan(repeat, carry, None, length=env.task.action_repeat)[0]
 
 
 def _control_period(env: Env, params: VehicleParams, state: State, command: jax.Array) -> tuple[State, Outcome]:
@@ -217,26 +217,25 @@ def _control_period(env: Env, params: VehicleParams, state: State, command: jax.
         episode_return=state.episode_return + reward,
         done=terminated | truncated,
     )
-    after = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
     ends = {"success": reached, "collision": collided, "timeout": truncated, "diverged": vehicle.diverged}
-    metrics = _metrics(env, after, {name: flag.astype(reward.dtype) for name, flag in ends.items()})
-    return after, Outcome(jnp.where(state.done, 0.0, reward), terminated, truncated, metrics)
+    ends = {name: flag.astype(reward.dtype) for name, flag in ends.items()}
+    ends["time_s"] = jnp.where(after.done, step_count * jnp.array(env.model.config.control_dt, float), 0.0)
+    ends["episode_return"] = jnp.where(after.done, after.episode_return, 0.0)
+    outcome = Outcome(reward, terminated, truncated, ends | _pose_metrics(env, after))
+    still = (state, first_outcome(env, state))  # after the end nothing moves, and the end is not told twice
+    return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 
 def first_outcome(env: Env, state: State) -> Outcome:
     """Outcome that goes with the first frame of an episode."""
     false, zero = jnp.zeros((), bool), jnp.zeros(())
-    ends = {name: zero for name in ("success", "collision", "timeout", "diverged")}
-    return Outcome(zero, false, false, _metrics(env, state, ends))
+    return Outcome(zero, false, false, dict.fromkeys(END_METRICS, zero) | _pose_metrics(env, state))
 
 
-def _metrics(env: Env, state: State, ends: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
     return {
-        **ends,
-        "time_s": jnp.where(state.done, state.step_count * env.model.config.control_dt, 0.0),
-        "episode_return": jnp.where(state.done, state.episode_return, 0.0),
         "x": x,
         "y": y,
         "yaw": yaw,

@@ -82,7 +82,14 @@ def plan_action(
 
 
 def _search(
-    config: PlannerConfig, env: Env, state: State, plan: jax.Array, key: jax.Array, rounds: int, samples: int, width: float
+    config: PlannerConfig,
+    env: Env,
+    state: State,
+    plan: jax.Array,
+    key: jax.Array,
+    rounds: int,
+    samples: int,
+    width: float,
 ) -> jax.Array:
     """Best plan (knots, 2) of the last of some rounds that begin around `plan`, `width` times the usual spread."""
     start, before = _start(env, state), state.command[1]

@@ -61,15 +61,15 @@ def default_looks() -> Looks:
     """Indoor daylight: grey tiled floor, pale walls and sky."""
     return Looks(
         sun=jnp.array([-0.48, 0.36, 0.80]),
-        ambient=jnp.array(0.55),
-        diffuse=jnp.array(0.55),
+        ambient=jnp.array(0.55, float),
+        diffuse=jnp.array(0.55, float),
         sky_horizon=jnp.array([0.80, 0.86, 0.92]),
         sky_zenith=jnp.array([0.45, 0.62, 0.85]),
         ground=jnp.array([[0.50, 0.50, 0.48], [0.42, 0.42, 0.41]]),
-        tile=jnp.array(0.5),
+        tile=jnp.array(0.5, float),
         tile_offset=jnp.zeros(2),
-        noise=jnp.array(0.06),
-        grain=jnp.array(0.04),
+        noise=jnp.array(0.06, float),
+        grain=jnp.array(0.04, float),
         seed=jnp.array(0, jnp.uint32),
     )
 

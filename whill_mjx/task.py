@@ -210,7 +210,7 @@ def _walls(half_width: jax.Array, end_x: float) -> tuple[Boxes, Boxes, Boxes]:
 
 def _marker(x: float, y: jax.Array, size: float, height: float) -> Marker:
     """Blue square of edge `size`, its centre `height` above the ground."""
-    position = jnp.stack([jnp.asarray(x), y, jnp.asarray(height)])
+    position = jnp.stack([jnp.asarray(value, float) for value in (x, y, height)])
     return Marker(position, jnp.array([0.02, size / 2, size / 2]), jnp.zeros(()), jnp.array(BLUE))
 
 
@@ -222,7 +222,7 @@ class _Draws:
 
     def __call__(self, low: float, high: float, fixed: float) -> jax.Array:
         if self.key is None:
-            return jnp.asarray(fixed)
+            return jnp.asarray(fixed, float)
         self.count += 1
         return jax.random.uniform(jax.random.fold_in(self.key, self.count), minval=low, maxval=high)
 

@@ -1,0 +1,148 @@
+"""The camera image against known answers and an independent ray caster."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.render import FIRST_BOX, GROUND, MARKER, SKY, _reciprocal, pinhole, render, render_frame
+from whill_mjx.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
+
+EYE = jnp.array([0.0, 0.0, 1.0])
+LEVEL = jnp.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along +x
+LENS = pinhole(1.2)
+RED = jnp.array([1.0, 0.0, 0.0])
+frame = jax.jit(render_frame, static_argnums=(4, 5))
+
+
+def scene_of(*boxes, marker_x=-50.0):
+    """Scene with these boxes; the marker is behind the camera unless placed."""
+    half, blue = jnp.array([0.02, 0.3, 0.3]), jnp.array([0.0, 0.1, 0.9])
+    marker = Marker(jnp.array([marker_x, 0.0, 1.0]), half, jnp.zeros(()), blue)
+    return Scene(stack_boxes(list(boxes)) if boxes else no_boxes(1), marker, default_looks())
+
+
+def random_scene(key, count=12):
+    keys = jax.random.split(key, 4)
+    place = jax.random.uniform(keys[0], (count, 2), minval=-2.5, maxval=2.5) + jnp.array([4.5, 0.0])
+    half = jax.random.uniform(keys[1], (count, 3), minval=0.1, maxval=0.5)
+    centre = jnp.concatenate([place, half[:, 2:]], 1)
+    yaw = jax.random.uniform(keys[2], (count,), maxval=6.0)
+    boxes = Boxes(centre, half, yaw, jax.random.uniform(keys[3], (count, 3)), jnp.ones(count, bool))
+    return dataclasses.replace(scene_of(marker_x=6.0), boxes=boxes)
+
+
+@pytest.mark.quick
+def test_a_red_box_ahead_fills_the_centre_of_the_image():
+    image = frame(EYE, LEVEL, LENS, scene_of(box(3.0, 0.0, 1.0, 1.0, 2.0, RED)))
+    centre = np.asarray(image.rgb[28:36, 28:36]).astype(int)
+    assert (centre[..., 0] > 100).all() and (centre[..., 1:] < 20).all()
+    assert (np.asarray(image.label[28:36, 28:36]) == FIRST_BOX).all()
+    assert (np.asarray(image.rgb[2, :, 2]) > 150).all()  # sky above
+
+
+@pytest.mark.quick
+def test_depth_of_a_wall_three_metres_ahead_is_right_within_a_centimetre():
+    image = frame(EYE, LEVEL, LENS, scene_of(box(3.1, 0.0, 0.2, 20.0, 10.0, RED)))
+    wall = np.asarray(image.label) == FIRST_BOX
+    assert wall.sum() > 2000
+    np.testing.assert_allclose(np.asarray(image.depth)[wall], 3.0, atol=0.01)
+
+
+@pytest.mark.quick
+def test_horizon_of_a_level_camera_lies_between_the_middle_rows():
+    image = frame(EYE, LEVEL, LENS, scene_of())
+    assert (np.asarray(image.label[:32]) == SKY).all() and np.isinf(image.depth[:32]).all()
+    assert (np.asarray(image.label[32:]) == GROUND).all()
+    np.testing.assert_allclose(image.depth[63], 1.0 / (31.5 / float(LENS.fy)), rtol=1e-4)
+
+
+def test_nearer_things_hide_farther_ones_and_the_marker_is_labelled():
+    near, far = box(3.0, 0.0, 0.5, 0.6, 1.2, RED), box(5.0, 0.0, 0.5, 4.0, 2.0, jnp.ones(3))
+    for boxes, (near_label, far_label) in (((near, far), (0, 1)), ((far, near), (1, 0))):
+        label = np.asarray(frame(EYE, LEVEL, LENS, scene_of(*boxes)).label)
+        assert label[33, 32] == FIRST_BOX + near_label and label[33, 20] == FIRST_BOX + far_label
+    assert np.asarray(frame(EYE, LEVEL, LENS, scene_of(far, marker_x=2.0)).label)[32, 32] == MARKER
+
+
+def test_labels_and_depth_agree_with_a_double_precision_ray_caster():
+    scene = random_scene(jax.random.key(1))
+    image = frame(EYE, LEVEL, LENS, scene)
+    u = (np.arange(64) + 0.5 - 32) / float(LENS.fx)
+    columns, rows = np.meshgrid(u, u)
+    rays = np.stack([np.ones_like(columns), -columns, -rows], -1)
+    best = np.where(rays[..., 2] < 0, -1.0 / rays[..., 2], np.inf)
+    label = np.where(rays[..., 2] < 0, GROUND, SKY)
+    marker = scene.marker
+    parts = [(marker.position, marker.half, marker.yaw)]
+    parts += list(zip(scene.boxes.centre, scene.boxes.half, scene.boxes.yaw, strict=True))
+    for index, (centre, half, yaw) in enumerate(parts):
+        c, s = np.cos(float(yaw)), np.sin(float(yaw))
+        into = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        origin, direction = into @ (np.array([0.0, 0.0, 1.0]) - np.asarray(centre, float)), rays @ into.T
+        sides = np.stack([(sign * np.asarray(half, float) - origin) / direction for sign in (-1, 1)])
+        enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
+        hit = (enter < leave) & (enter > 0) & (enter < best)
+        best, label = np.where(hit, enter, best), np.where(hit, MARKER + index, label)
+    same = np.asarray(image.label) == label
+    assert same.mean() > 0.998  # rays that graze an edge may fall to either side
+    assert len(np.unique(label)) > 8
+    np.testing.assert_allclose(np.asarray(image.depth)[same], best[same], rtol=3e-4)
+
+
+def test_a_mirrored_scene_gives_the_mirrored_image():
+    scene = random_scene(jax.random.key(2))
+    boxes = scene.boxes
+    mirrored = dataclasses.replace(boxes, centre=boxes.centre * jnp.array([1.0, -1.0, 1.0]), yaw=-boxes.yaw)
+    one = frame(EYE, LEVEL, LENS, scene)
+    other = frame(EYE, LEVEL, LENS, dataclasses.replace(scene, boxes=mirrored))
+    assert (np.asarray(one.label) == np.asarray(other.label)[:, ::-1]).mean() > 0.999
+    seen = np.isfinite(one.depth) & np.isfinite(other.depth[:, ::-1])
+    difference = np.abs(np.asarray(one.depth)[seen] - np.asarray(other.depth)[:, ::-1][seen])
+    assert seen.sum() > 2000 and np.quantile(difference, 0.99) < 1e-2
+
+
+def test_a_batch_of_images_equals_images_one_by_one():
+    scenes = jax.vmap(random_scene)(jax.random.split(jax.random.key(3), 3))
+    batch = jax.jit(jax.vmap(render, in_axes=(None, None, None, 0)))(EYE, LEVEL, LENS, scenes)
+    single = jax.jit(render)
+    for index in range(3):
+        image = single(EYE, LEVEL, LENS, jax.tree.map(lambda leaf, i=index: leaf[i], scenes))
+        assert (np.abs(np.asarray(batch[index]).astype(int) - np.asarray(image)) <= 1).mean() > 0.999
+
+
+def test_unused_boxes_leave_no_trace():
+    solid = box(3.0, 0.0, 1.0, 1.0, 2.0, RED)
+    hidden = dataclasses.replace(solid, mask=jnp.zeros(1, bool))
+    with_hidden, without = (frame(EYE, LEVEL, LENS, scene) for scene in (scene_of(hidden), scene_of()))
+    np.testing.assert_array_equal(with_hidden.rgb, without.rgb)
+
+
+def test_a_camera_inside_a_box_sees_only_that_box():
+    image = frame(EYE, LEVEL, LENS, scene_of(box(0.0, 0.0, 1.0, 1.0, 2.0, RED)))
+    assert (np.asarray(image.label) == FIRST_BOX).all() and (np.asarray(image.depth) < 1e-6).all()
+
+
+def test_a_pose_that_is_not_finite_gives_a_black_image():
+    image = frame(EYE.at[0].set(jnp.nan), LEVEL, LENS, scene_of(box(3.0, 0.0, 1.0, 1.0, 2.0, RED)))
+    assert not np.asarray(image.rgb).any() and np.isinf(image.depth).all() and (np.asarray(image.label) == SKY).all()
+
+
+def test_images_of_other_sizes_keep_the_view():
+    wide = frame(EYE, LEVEL, pinhole(1.2, 32, 48), scene_of(box(3.0, 0.0, 1.0, 1.0, 2.0, RED)), 32, 48).rgb
+    assert wide.shape == (32, 48, 3) and wide[16, 24, 0] > 100 and wide[16, 24, 1] < 20
+
+
+def test_more_boxes_than_labels_are_refused():
+    with pytest.raises(ValueError, match="300 boxes"):
+        render(EYE, LEVEL, LENS, dataclasses.replace(scene_of(), boxes=no_boxes(300)))
+
+
+@pytest.mark.quick
+def test_reciprocal_without_division_is_right_to_single_precision():
+    x = jnp.concatenate([jnp.logspace(-14, 6, 2000), -jnp.logspace(-14, 6, 2000)])
+    np.testing.assert_allclose(_reciprocal(x) * x, 1.0, rtol=5e-7)
