@@ -191,7 +191,7 @@ def measure(seconds: float, resets: int, kills: int, policy_path: Path | None) -
             results, drive = run.finish()
             figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
             end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
-            shown = sum(t <= end for t in results["image_times"])
+            shown = sum(t < end - 0.01 for t in results["image_times"])
             figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
         figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
 

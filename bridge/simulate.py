@@ -23,6 +23,8 @@ import numpy as np
 from bridge import ros
 
 RESET_SILENCE = 0.5
+MATCHING = 0.3
+"""Seconds between finding a reader and its having found us; a frame sent earlier is lost."""
 LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
@@ -153,7 +155,7 @@ class SimulateNode:
         self.image_times: deque[float] = deque(maxlen=LOG_LENGTH)
         self._asked: float | None = None
         self._half = 0
-        self._ready_at = self._begin_at = time.monotonic()
+        self._ready_at = self._begin_at = self._alone_at = time.monotonic()
         self._frame: Frame | None = None
         self._next: Frame | None = None
         self.finished_at: float | None = None
@@ -198,9 +200,12 @@ class SimulateNode:
 
     def _has_driver(self) -> bool:
         """Return whether somebody looks and steers, or the time to wait for that is over. Discovery takes up to 2 s."""
-        if time.monotonic() - self._ready_at > self.options.wait or self.episodes:
+        now = time.monotonic()
+        if now - self._ready_at > self.options.wait or self.episodes:
             return True
-        return self._image.get_subscription_count() > 0 and self.node.count_publishers(ros.COMMAND_TOPIC) > 0
+        if not self._image.get_subscription_count() or not self.node.count_publishers(ros.COMMAND_TOPIC):
+            self._alone_at = now
+        return now - self._alone_at > MATCHING
 
     def _begin(self) -> None:
         seed = self.options.seed + len(self.episodes)
