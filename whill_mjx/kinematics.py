@@ -77,5 +77,6 @@ def camera_pose(model: VehicleModel, qpos: jax.Array) -> tuple[jax.Array, jax.Ar
     cos, sin = jnp.cos(mount.pitch), jnp.sin(mount.pitch)
     # Columns: the camera's right, down and forward axes in the chassis frame, tilted down by `pitch`.
     mounted = jnp.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]).T
-    tilted = jnp.stack([mounted[:, 0], cos * mounted[:, 1] - sin * mounted[:, 2], cos * mounted[:, 2] + sin * mounted[:, 1]])
+    right, down, forward = mounted.T
+    tilted = jnp.stack([right, cos * down - sin * forward, cos * forward + sin * down])
     return position, rotation @ tilted.T

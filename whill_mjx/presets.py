@@ -29,9 +29,9 @@ from whill_mjx.types import Body, VehicleParams
 def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     """Spec and parameters of a built-in vehicle.
 
-    "whill_cr" has the paper's initial values, "whill_cr_paper" its optimised ones, "whill_cr_ramp" these with the ramp on
-    commands that the maker documents, "whill_cr_physical" the physical base model; "husky", "warthog" and "create" are the
-    paper's model on another spec.
+    "whill_cr" has the paper's initial values, "whill_cr_paper" its optimised ones, "whill_cr_ramp" these with the ramp
+    on commands that the maker documents, "whill_cr_physical" the physical base model; "husky", "warthog" and "create"
+    are the paper's model on another spec.
     """
     whill = {"whill_cr_paper": paper_optimised, "whill_cr_ramp": paper_ramp, "whill_cr_physical": physical}
     if name in whill:
@@ -94,8 +94,8 @@ def paper_ramp(spec: VehicleSpec) -> VehicleParams:
 def physical(spec: VehicleSpec) -> VehicleParams:
     """The physical base model: torque control of wheel spin, friction-limited slip, scrub, delay, odometry low-pass.
 
-    Gains scale with the vehicle: kp gives a speed loop of 10 1/s on the whole mass, ki a tenth of it per second, the torque
-    limit an acceleration of 3 m/s^2.
+    Gains scale with the vehicle: kp and ki give a speed loop of 10 1/s and 10 1/s^2 on the whole mass, the torque limit
+    an acceleration of 3 m/s^2.
     """
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # inertia that one side's motor sees [kg m^2]
     skid = spec.drive == "skid"

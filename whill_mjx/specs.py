@@ -1,8 +1,8 @@
 """Measured constants of the vehicles, each with its source.
 
-Lengths in m, masses in kg, speeds in m/s and rad/s. The chassis frame (the paper's model origin) lies at the middle of the
-overall length, at wheel-centre height: x forward, y left, z up. It is not the rear axle: the paper's centre of mass at
-x = -0.265 m would lie behind that axle and tip the chair.
+Lengths in m, masses in kg, speeds in m/s and rad/s. The chassis frame (the paper's model origin) lies at the middle of
+the overall length, at wheel-centre height: x forward, y left, z up. It is not the rear axle: the paper's centre of mass
+at x = -0.265 m would lie behind that axle and tip the chair.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class VehicleSpec:
 
     @property
     def reference_x(self) -> float:
-        """Position of the reference point (driven-axle centre; vehicle centre for skid drive) in the chassis frame [m]."""
+        """Position of the reference point (driven-axle centre; middle of a skid drive) in the chassis frame [m]."""
         if self.drive == "skid":
             return (self.rear_x + self.front_x) / 2
         return self.rear_x if self.driven_axle == "rear" else self.front_x
@@ -90,17 +90,20 @@ WHILL_CR = VehicleSpec(
     name="whill_cr", wheel_radius=0.1325, track=0.496, wheelbase=0.60, mass=52.0, rear_axle_x=-0.36,
     body_length=0.985, body_width=0.554, body_height=0.9,
 )
-# Clearpath Husky A200: radius and track from its run configuration (0.165, 0.55); 50 kg and 0.99 x 0.67 m from the data sheet.
+# Clearpath Husky A200: radius and track from its run configuration (0.165, 0.55); 50 kg and 0.99 x 0.67 m from the
+# data sheet.
 HUSKY = VehicleSpec(
     name="husky", wheel_radius=0.165, track=0.55, wheelbase=0.512, mass=50.0, drive="skid", wheel_inertia=0.1,
     body_length=0.99, body_width=0.67, body_height=0.39, v_min=-1.0, v_max=1.0, omega_max=2.0,
 )
-# Clearpath Warthog on wheels: radius and track from its run configuration (0.30, 1.08); 280 kg and size from the data sheet.
+# Clearpath Warthog on wheels: radius and track from its run configuration (0.30, 1.08); 280 kg and size from the
+# data sheet.
 WARTHOG = VehicleSpec(
     name="warthog", wheel_radius=0.30, track=1.08, wheelbase=0.914, mass=280.0, drive="skid", wheel_inertia=1.5,
     body_length=1.52, body_width=1.38, body_height=0.83, v_min=-5.0, v_max=5.0, omega_max=4.0,
 )
-# iRobot Create: wheel separation 0.258 m and radius 0.033 m from the Open Interface manual; about 3.6 kg with its battery.
+# iRobot Create: wheel separation 0.258 m and radius 0.033 m from the Open Interface manual; about 3.6 kg with its
+# battery.
 CREATE = VehicleSpec(
     name="create", wheel_radius=0.033, track=0.258, wheelbase=0.26, mass=3.6, wheel_inertia=2e-4,
     body_length=0.34, body_width=0.34, body_height=0.10, v_min=-0.5, v_max=0.5, omega_max=4.0,
@@ -111,5 +114,6 @@ SPECS = {spec.name: spec for spec in (WHILL_CR, HUSKY, WARTHOG, CREATE)}
 def find_spec(name: str) -> VehicleSpec:
     """Spec of a built-in vehicle; ValueError names the known ones."""
     if name not in SPECS:
-        raise ValueError(f"unknown vehicle {name!r} (known: {', '.join(sorted(SPECS))}). Use one of them or a vehicle file.")
+        known = ", ".join(sorted(SPECS))
+        raise ValueError(f"unknown vehicle {name!r} (known: {known}). Use one of them or a vehicle file.")
     return SPECS[name]

@@ -12,7 +12,7 @@ from flax import struct
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is known of a parameter before any data: its unit, the range a fit may search, and where it has no effect."""
+    """What is known of a parameter before any data: unit, the range a fit may search, and where it has no effect."""
 
     unit: str
     low: float
@@ -22,7 +22,7 @@ class Parameter:
 
 
 def parameter(unit: str, low: float, high: float, neutral: float, description: str = "") -> Any:
-    """Field of a pytree of parameters: a scalar leaf with its `Parameter` beside it; the default is the neutral value."""
+    """Field of a pytree of parameters: a scalar leaf, neutral by default, with its `Parameter` beside it."""
     return struct.field(default=neutral, metadata={"parameter": Parameter(unit, low, high, neutral, description)})
 
 
@@ -33,7 +33,7 @@ def parameters_of(holder: Any) -> dict[str, Parameter]:
 
 @struct.dataclass
 class Geometry:
-    """True geometry of one instance, in the chassis frame [m]. Nominal values, used by its controller, are in the spec."""
+    """True geometry of one instance in the chassis frame [m]. Its controller uses the spec's nominal one."""
 
     contact_x: jax.Array  # (4,) rear left, rear right, front left, front right
     contact_y: jax.Array  # (4,)

@@ -95,7 +95,8 @@ def load_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
         body = _read_parameters(path, "body", Body, content["body"])
         effects = tuple(_read_effect(path, table) for table in content["effects"])
     except KeyError as error:
-        raise ValueError(f"{path}: no entry {error.args[0]!r}. Every vehicle file has spec, body and effects.") from error
+        rule = "Every vehicle file has spec, body and effects."
+        raise ValueError(f"{path}: no entry {error.args[0]!r}. {rule}") from error
     except TypeError as error:
         raise ValueError(f"{path}: {error}. Remove the entry or use a newer version of this program.") from error
     if not body.mass > 0 or not body.yaw_inertia > 0:

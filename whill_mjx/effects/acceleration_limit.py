@@ -14,8 +14,8 @@ from whill_mjx.types import Motion, parameter
 class AccelerationLimit(Effect):
     """The command followed at a limited rate: |dv/dt| <= linear, |domega/dt| <= angular.
 
-    Source: the maker's protocol specification, 3.2.8: velocity commands are ramped with about 1.7 m/s^2. Whether the ramp
-    acts on (v, omega) or on each wheel is not documented; here it acts on (v, omega).
+    Source: the maker's protocol specification, 3.2.8: velocity commands are ramped with about 1.7 m/s^2. Whether the
+    ramp acts on (v, omega) or on each wheel is not documented; here it acts on (v, omega).
     """
 
     name = "acceleration_limit"

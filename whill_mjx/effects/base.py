@@ -1,6 +1,6 @@
 """What an effect is, and how a tuple of effects acts together.
 
-An effect is a frozen pytree whose leaves are its own parameters. It acts at one place, and has one method named after it:
+An effect is a frozen pytree whose leaves are its own parameters. It acts at one place, by one method named after it:
 
     command(memory, command (2,), motion)   -> memory, command     delay, dead zone, limiter
     actuation(memory, Drive, motion)        -> memory, Drive       controller, lag, saturation

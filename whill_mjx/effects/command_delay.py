@@ -24,8 +24,8 @@ class CommandMemory:
 class CommandDelay(Effect):
     """A command acts `delay` after it is sent: u(t) = u_sent(t - delay).
 
-    Changes are kept with their age, so any delay is possible and the derivative with respect to it is defined: within one
-    physics step before its time a change is blended in linearly.
+    Changes are kept with their age, so any delay is possible and the derivative with respect to it is defined: within
+    one physics step before its time a change is blended in linearly.
     """
 
     name = "command_delay"

@@ -12,7 +12,7 @@ from whill_mjx.types import Drive, Motion, Wrench, parameter
 
 @struct.dataclass
 class PidDrive(Effect):
-    """F = m/2 PID(v_target - v_wheel) on each side, the mass being shared equally. Source: reference paper, Table II."""
+    """F = m/2 PID(v_target - v_wheel) on each side, the mass shared equally. Source: reference paper, Table II."""
 
     name = "pid_drive"
     kp: jax.Array = parameter("1/s", 0.5, 60.0, 0.0, "proportional gain")
