@@ -27,7 +27,6 @@ from sysid.report import error_rows, summaries
 DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
 DRIVE_HELD_OUT = {"asphalt": ("warthog_asphalt_a:0.667-1",), "sand": ("warthog_sand_2",)}
 DRIVE_RUNS = ("warthog_asphalt_a", "warthog_sand_1", "warthog_sand_2")
-PRESETS: tuple[Literal["paper", "physical"], ...] = ("paper", "physical")
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,8 @@ class Benchmark:
     """Iterations of the gradient search."""
     starts: int = 3
     """Starts of the gradient search."""
+    presets: tuple[Literal["paper", "physical"], ...] = ("physical", "paper")
+    """Base models."""
 
 
 def thin(log: Log, count: int) -> Log:
@@ -89,7 +90,7 @@ def drive(settings: Benchmark) -> None:
     native, chained = (load_drive(folder, DRIVE_RUNS, chained=chained) for chained in (False, True))
     everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))
     choices = {name: (DRIVE_TRAIN[name], DRIVE_HELD_OUT[name]) for name in DRIVE_TRAIN} | {"pooled": everything}
-    for preset in PRESETS:
+    for preset in settings.presets:
         for name, (train, held_out) in choices.items():
             log = split(native, train, held_out)
             fit = fit_log(thin(log, settings.windows), measured_config(settings, preset))
@@ -114,7 +115,7 @@ def mrclam(settings: Benchmark) -> None:
     """MRCLAM: robots 1 to 3 fitted, 4 and 5 held out."""
     log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
     log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
-    for preset in PRESETS:
+    for preset in settings.presets:
         # 15 s windows are long: a third of the windows is the same driving time.
         fit = fit_log(thin(log, settings.windows // 3), measured_config(settings, preset))
         figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")
@@ -127,7 +128,7 @@ def mrclam(settings: Benchmark) -> None:
 def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
     log = load_log(settings.shared / "data" / "plant" / "plain")
-    for preset in PRESETS:
+    for preset in settings.presets:
         config = FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations,
                            starts=settings.starts)
         fit = fit_log(log, config)

@@ -2,7 +2,10 @@
 
 Commands are resampled to the physics grid (each holds until the next), trials are padded to one length with masks, the
 motion is recorded every few physics steps and interpolated at the measurements' own times. The vehicle comes in as
-three functions of one instance (`Plant`), so that a test can put a small model in its place.
+a few functions of one instance (`Plant`), so that a test can put a small model in its place.
+
+A trial that starts in motion is settled first: the vehicle drives a while at the start's wheel speeds and is then
+moved to the start pose. Its controller, delays and slip are those of a vehicle under way, not of one that just began.
 """
 
 from __future__ import annotations
@@ -22,8 +25,11 @@ from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
 from whill_mjx.specs import VehicleSpec
 
+WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
+WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
 RECORD_DT = 0.025  # s between recorded states; linear interpolation at 1 m/s^2 is then off by 0.1 mm at most
 POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
+SPEEDS = slice(6, 8)
 YAW_COLUMNS = (2, 5)
 
 
@@ -39,11 +45,13 @@ class Plant:
     """state -> (9,): x, y, yaw of the reference point; x, y, yaw, v, omega of the odometry; 1 if it diverged."""
     dt: float
     """Physics step [s]."""
+    move: Callable[[Any, jax.Array], Any] = lambda state, start: state
+    """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
     """The simulator's vehicle as a `Plant`; its parameters are `VehicleParams`."""
-    from whill_mjx.kinematics import reference_pose
+    from whill_mjx.kinematics import quaternion_from_angles, reference_pose
     from whill_mjx.model import build_model
     from whill_mjx.vehicle import place, substep
 
@@ -55,8 +63,35 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
         return jnp.stack([*reference_pose(model, state.qpos), odometry.x, odometry.y, odometry.yaw, odometry.v,
                           odometry.omega, state.diverged.astype(state.qpos.dtype)])
 
+    def move(state: Any, start: jax.Array) -> Any:
+        x, y, yaw = reference_pose(model, state.qpos)
+        turn = start[2] - yaw
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+
+        def rotate(a: jax.Array, b: jax.Array) -> jax.Array:
+            return jnp.stack([cos * a - sin * b, sin * a + cos * b])
+
+        origin = start[:2] + rotate(state.qpos[0] - x, state.qpos[1] - y)
+        attitude = _quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
+        qpos = jnp.concatenate([origin, state.qpos[2:3], attitude, state.qpos[7:]])
+        qvel = jnp.concatenate([rotate(state.qvel[0], state.qvel[1]), state.qvel[2:]])
+        zero = jnp.zeros_like(turn)
+        encoder, odometry = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.odometry))
+        return state.replace(qpos=qpos, qvel=qvel, encoder=encoder, odometry=odometry)
+
     return Plant(lambda params, start: place(model, params, *start),
-                 lambda params, state, command: substep(model, params, state, command), observe, config.physics_dt)
+                 lambda params, state, command: substep(model, params, state, command), observe,
+                 config.physics_dt, move)
+
+
+def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Rotation b, then a (w, x, y, z)."""
+    return jnp.stack([
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ])
 
 
 @struct.dataclass
@@ -69,6 +104,8 @@ class Batch:
     pose_weight: jax.Array  # (B, M) share of the record after it
     odometry_index: jax.Array  # (B, L)
     odometry_weight: jax.Array  # (B, L)
+    warm_up: int = struct.field(pytree_node=False, default=0)
+    """Physics steps at the start's speeds before the trial; 0 where all trials start at rest."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +145,8 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     floats = [command.reshape(len(trials), records, stride, 2), start]
     command_array, start_array = (jnp.asarray(array, jnp.result_type(float)) for array in floats)
     batch = Batch(command_array, start_array, jnp.asarray(pose_index), jnp.asarray(pose_weight, jnp.result_type(float)),
-                  jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)))
+                  jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)),
+                  round(WARM_UP / dt) if start[:, 3:].any() else 0)
     return batch, Measured(pose, pose_mask, odometry, odometry_mask)
 
 
@@ -162,9 +200,6 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
 
 
 def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
-    state = plant.place(params, one.start)
-    first = plant.observe(state)
-
     def physics(state: Any, command: jax.Array) -> tuple[Any, None]:
         return plant.substep(params, state, command), None
 
@@ -172,6 +207,10 @@ def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
         state, _ = jax.lax.scan(physics, state, commands)
         return state, plant.observe(state)
 
+    state = plant.place(params, one.start)
+    if one.warm_up:
+        state = plant.move(_settle(plant, params, state, one.start[3:], one.warm_up), one.start)
+    first = plant.observe(state)
     _, later = jax.lax.scan(record, state, one.command)
     path = jnp.concatenate([first[None], later])  # (R + 1, 9)
     for column in YAW_COLUMNS:
@@ -185,6 +224,18 @@ def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
 
     return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
                      path[-1, 8])
+
+
+def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int) -> Any:
+    """State after driving so that the odometry reports `speeds` (2,): where the vehicle falls short of its command, as
+    a skid-steered one does, the command is raised until it does not."""
+
+    def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
+        state, command = carry
+        state = plant.substep(params, state, command)
+        return (state, command + WARM_UP_GAIN * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
+
+    return jax.lax.scan(body, (state, speeds), None, length=steps)[0][0]
 
 
 def _turns(angle: jax.Array) -> jax.Array:

@@ -180,3 +180,25 @@ def test_unit_coordinates_and_values_are_inverse():
 def test_noise_scales_are_named():
     noise = Noise(np.ones(3), np.arange(5.0), "defaults")
     assert noise.as_dict()["odometry.omega"] == 4.0
+
+
+def test_a_vehicle_that_starts_in_motion_is_under_way_at_the_start_pose():
+    """A vehicle with a delay and a slow integral would otherwise begin with a stumble."""
+    from sysid.rollout import vehicle_plant
+    from whill_mjx.config import VehicleConfig
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    t = np.arange(0.0, 0.8, 0.05)
+    command = Command(np.array([0.0]), np.array([0.5]), np.array([0.4]))
+    start = Start(3.0, -2.0, 2.0, v=0.5, omega=0.4)
+    trial = Trial("a_1", "a", command, None, PoseStream(t, 0 * t, 0 * t, 0 * t), start)
+    plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.01))
+    batch, _ = make_batch((trial,), plant.dt)
+    params = preset_params(WHILL_CR, "physical")
+    simulated = Replay(plant, batch, lambda values: params).simulate(np.zeros((1, 1)))
+    pose = simulated.pose[0, 0]
+    np.testing.assert_allclose(pose[0], [3.0, -2.0, 2.0], atol=1e-4)
+    speed = np.hypot(*np.diff(pose[:, :2], axis=0).T) / 0.05
+    np.testing.assert_allclose(speed, 0.5, rtol=0.05)
+    np.testing.assert_allclose(np.diff(pose[:, 2]) / 0.05, (pose[-1, 2] - pose[0, 2]) / t[-1], rtol=0.15)
