@@ -5,6 +5,7 @@ plain data, nothing in the file can execute code. The writer checks its own work
 the JAX one and records the largest difference of their actions in `policy.json`.
 """
 
+import contextlib
 import dataclasses
 import datetime
 import hashlib
@@ -13,9 +14,10 @@ import logging
 import math
 import os
 import shutil
+import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -194,8 +196,9 @@ def _to_onnx(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: Poli
     level = quiet.level
     quiet.setLevel(logging.ERROR)  # it warns about shapes it leaves out, which no runtime needs
     try:
-        model = jax2onnx.to_onnx(flat_step, [_image_shape(contract), *shapes.values()], model_name="policy",
-                                 opset=OPSET, input_names=inputs)
+        with _jax_restored():
+            model = jax2onnx.to_onnx(flat_step, [_image_shape(contract), *shapes.values()], model_name="policy",
+                                     opset=OPSET, input_names=inputs)
     finally:
         quiet.setLevel(level)
     model = onnx.inliner.inline_local_functions(model)
@@ -208,6 +211,24 @@ def _to_onnx(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: Poli
                          "cannot run them. Rewrite those operations in the policy step.")
     onnx.checker.check_model(model, full_check=False)
     return model.SerializeToString()
+
+
+@contextlib.contextmanager
+def _jax_restored() -> Iterator[None]:
+    """Put back every attribute of JAX's modules that is exchanged inside.
+
+    jax2onnx replaces functions of jax.numpy while it traces and leaves some in place; its cumsum refuses arguments that
+    JAX's own takes, so that a program would fail at its next trace.
+    """
+    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("jax", "flax") and module]
+    before = [(module, dict(vars(module))) for module in modules]
+    try:
+        yield
+    finally:
+        for module, attributes in before:
+            for name, value in attributes.items():
+                if vars(module).get(name) is not value:
+                    setattr(module, name, value)
 
 
 def _name_outputs(model: Any, names: list[str]) -> None:

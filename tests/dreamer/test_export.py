@@ -235,3 +235,10 @@ def test_policy_of_the_learner_runs_on_the_vehicle_as_it_does_in_jax(tmp_path, e
         low, high = np.array(CONTRACT.action_low), np.array(CONTRACT.action_high)
         np.testing.assert_allclose(commands[-1], low + (high - low) * (np.asarray(action) + 1) / 2, atol=1e-5)
     assert np.ptp(commands, axis=0).min() > 1e-3  # the actions do depend on what is seen
+
+
+def test_exporting_leaves_jax_as_it_was(tmp_path):
+    before = dict(vars(jnp))
+    step = lambda carry, image: (carry, jnp.tanh(jnp.cumsum(carry["h"])))  # noqa: E731
+    export_policy(tmp_path / "p", step, {"h": np.zeros(2, np.float32)}, {}, CONTRACT, check_steps=1)
+    assert all(vars(jnp)[name] is value for name, value in before.items())
