@@ -39,6 +39,14 @@ def test_planner_arrives_in_time_with_the_return_the_course_was_set_for():
     assert 4.6 <= float(periods.mean()) * 0.1 <= 5.2  # 4.93 s over 128 worlds
 
 
+def test_planner_gets_past_the_box_in_the_corridor():
+    env, params = make_env("corridor")
+    drive = jax.jit(jax.vmap(lambda key: episode(env, params, key, 240)))
+    returns, distance, _, done = drive(jax.random.split(jax.random.key(2), 3))
+    assert np.asarray(done).all() and (np.asarray(distance) <= 1.0).all()
+    assert 170 <= float(returns.mean()) <= 215
+
+
 @pytest.mark.quick
 def test_predicted_return_of_full_speed_over_an_open_field_is_that_of_the_reward():
     env, _ = make_env("obstacle_course", layout="fixed")
