@@ -57,7 +57,9 @@ def for_task(task: Task) -> PlannerConfig:
     if task.v_max >= 0.8:
         return PlannerConfig()
     # A penalty for each period must not add up to more than a collision costs, or crashing early would pay.
-    return PlannerConfig(horizon_s=16.0, steps=64, knots=12, spread_v=0.6, spread_omega=0.6, hurry=0.05, margin_cost=2.0)
+    return PlannerConfig(
+        horizon_s=16.0, steps=64, knots=12, spread_v=0.6, spread_omega=0.6, hurry=0.05, margin_cost=2.0
+    )
 
 
 def first_plan(config: PlannerConfig, env: Env, state: State, key: jax.Array) -> jax.Array:
