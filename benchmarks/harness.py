@@ -60,7 +60,8 @@ def record(stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Pa
     path = folder / f"{stem}.json"
     old = json.loads(path.read_text()) if path.exists() else {}
     versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
-    stamp = {"command": " ".join(["python", "-m", _module_name(), *sys.argv[1:]]), "versions": versions,
+    arguments = [os.path.relpath(word) if os.path.isabs(word) else word for word in sys.argv[1:]]
+    stamp = {"command": " ".join(["python", "-m", _module_name(), *arguments]), "versions": versions,
              "commit": _commit(), "date": datetime.date.today().isoformat()}
     merged = {**old.get("figures", {}), **{name: {**value, **stamp} for name, value in figures.items()}}
     content = {"claim": claim, **stamp, "figures": merged}

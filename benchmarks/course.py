@@ -1,0 +1,179 @@
+"""The obstacle course: trainings with every seed shown, and the planner that is their ceiling.
+
+    python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
+    python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
+    python -m benchmarks.course planner
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.harness import RESULTS, device_name, figure, record
+from whill_mjx.train import TrainOptions, main
+
+CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
+
+
+def run(options: argparse.Namespace) -> None:
+    """One training of the main command; notes the device beside its results."""
+    result = main(
+        TrainOptions(
+            out=options.out, vehicle=options.vehicle, preset=options.preset, layout=options.layout, seed=options.seed,
+            steps=options.steps,
+        )
+    )  # fmt: skip
+    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed}
+    (options.out / "course.json").write_text(json.dumps({**note, **result}, indent=1) + "\n")
+
+
+def collect(options: argparse.Namespace) -> None:
+    """Merge finished runs into course.json and draw their curves."""
+    runs = sorted((load_run(path) for path in options.runs), key=lambda one: one["seed"])
+    figures: dict[str, Any] = {}
+    for preset in ("cpu", "paper"):
+        for layout in ("fixed", "randomised"):
+            chosen = [one for one in runs if one["preset"] == preset and one["layout"] == layout]
+            if chosen:
+                figures |= cpu_figures(chosen) if preset == "cpu" else paper_figures(chosen, layout)
+                draw(chosen, RESULTS / f"course_{preset}_{layout}.png")
+    record("course", CLAIM, figures)
+    for name, entry in figures.items():
+        print(f"{name:40s} {entry['value']:.4g} {entry['unit']:8s} {entry['repeats']}")
+
+
+def load_run(path: Path) -> dict[str, Any]:
+    """Result of one run with its metrics."""
+    content = json.loads((path / "course.json").read_text())
+    content["metrics"] = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    return content
+
+
+def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Success of each seed over 100 episodes, against a random policy in the same worlds."""
+    device = runs[0]["device"]
+    success = [one["policy"]["success"] for one in runs]
+    gain = [one["policy"]["success_interval_95"][0] - one["random"]["success"] for one in runs]
+    first = [first_sign(one) for one in runs]
+    return {
+        "cpu_success": {**figure(success, "share", device), "episodes": runs[0]["policy"]["episodes"]},
+        "cpu_random_success": figure([one["random"]["success"] for one in runs], "share", device),
+        "cpu_lower_bound_above_random": figure(gain, "share", device),
+        "cpu_minutes": figure([one["seconds"]["training"] / 60 for one in runs], "min", device),
+        "cpu_first_sign_minutes": figure(first, "min", device),
+    }
+
+
+def first_sign(run: dict[str, Any]) -> float:
+    """Minutes until an evaluation inside the run first succeeded in 30 % more episodes than a random policy."""
+    threshold = run["random"]["success"] + 0.3
+    return next((m["wall_s"] / 60 for m in run["metrics"] if m.get("eval/success", 0) > threshold), float("inf"))
+
+
+def paper_figures(runs: list[dict[str, Any]], layout: str) -> dict[str, Any]:
+    """Evaluation return from 18,000 control steps on, arrival time and wall-clock, per seed."""
+    device = runs[0]["device"]
+    late = [[m for m in one["metrics"] if m["env_steps"] >= 17_900 and "eval/return" in m] for one in runs]
+    returns = [statistics.median(m["eval/return"] for m in ms) for ms in late]
+    arrivals = [statistics.median(m["eval/arrival_s"] for m in ms if "eval/arrival_s" in m) for ms in late]
+    suffix = "" if layout == "randomised" else "_fixed"
+    return {
+        f"return_at_18000_median{suffix}": figure(returns, "-", device),
+        f"return_at_18000_worst{suffix}": {**figure(returns, "-", device), "value": min(returns)},
+        f"arrival_s_at_18000{suffix}": figure(arrivals, "s", device),
+        f"success_at_22000{suffix}": figure([one["policy"]["success"] for one in runs], "share", device),
+        f"wallclock_s{suffix}": figure([one["seconds"]["training"] for one in runs], "s", device),
+    }
+
+
+def draw(runs: list[dict[str, Any]], path: Path) -> None:
+    """Evaluation return and success of every seed."""
+    try:
+        import matplotlib
+    except ImportError:
+        return
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure_, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 6), layout="constrained")
+    for one in runs:
+        repeat = one["task"]["action_repeat"]
+        points = [(m["env_steps"] * repeat, m["eval/return"], m["eval/success"]) for m in one["metrics"]
+                  if "eval/return" in m]
+        steps, returns, success = zip(*points, strict=True)
+        axes[0].plot(steps, returns, "o-", markersize=3, label=f"seed {one['seed']}")
+        axes[1].plot(steps, success, "o-", markersize=3)
+    axes[0].set_ylabel("evaluation return")
+    axes[1].set_ylabel("evaluation success")
+    axes[1].set_xlabel("control steps (0.1 s), summed over instances")
+    axes[0].legend(fontsize=8)
+    for one_axes in axes:
+        one_axes.grid(alpha=0.3)
+    figure_.savefig(path, dpi=130)
+    plt.close(figure_)
+
+
+def planner(options: argparse.Namespace) -> None:
+    """Return, success and arrival of the ground-truth planner over `episodes` randomised worlds."""
+    from whill_mjx.env import make_env, reset_state, step_state
+    from whill_mjx.planner import first_plan, for_task, plan_action
+
+    env, params = make_env("obstacle_course")
+    config = for_task(env.task)
+
+    def episode(key: jax.Array) -> tuple[jax.Array, ...]:
+        reset_key, plan_key, drive_key = jax.random.split(key, 3)
+        state = reset_state(env, params, reset_key)
+
+        def one(carry: tuple, step_key: jax.Array) -> tuple[tuple, None]:
+            state, plan = carry
+            action, plan = plan_action(config, env, state, plan, step_key)
+            return (step_state(env, params, state, action)[0], plan), None
+
+        start = (state, first_plan(config, env, state, plan_key))
+        (state, _), _ = jax.lax.scan(one, start, jax.random.split(drive_key, env.task.max_steps))
+        return state.episode_return, state.goal_distance <= env.task.goal_radius, state.step_count * 0.1
+
+    returns, reached, seconds = map(np.asarray, jax.jit(jax.vmap(episode))(
+        jax.random.split(jax.random.key(5), options.episodes)))
+    figures = {
+        "planner_return": {**figure([float(returns.mean())], "-"), "episodes": options.episodes,
+                           "sd": float(returns.std())},
+        "planner_success": figure([float(reached.mean())], "share"),
+        "planner_arrival_s": figure([float(seconds[reached].mean())], "s"),
+    }
+    record("course", CLAIM, figures)
+    print({name: entry["value"] for name, entry in figures.items()})
+
+
+def parse() -> argparse.Namespace:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    one = commands.add_parser("run")
+    one.add_argument("--out", type=Path, required=True)
+    one.add_argument("--seed", type=int, default=0)
+    one.add_argument("--preset", default="auto")
+    one.add_argument("--layout", default="randomised")
+    one.add_argument("--vehicle", type=Path)
+    one.add_argument("--steps", type=int)
+    one.set_defaults(call=run)
+    several = commands.add_parser("collect")
+    several.add_argument("--runs", type=Path, nargs="+", required=True)
+    several.set_defaults(call=collect)
+    ceiling = commands.add_parser("planner")
+    ceiling.add_argument("--episodes", type=int, default=200)
+    ceiling.set_defaults(call=planner)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    arguments = parse()
+    arguments.call(arguments)
