@@ -11,6 +11,7 @@ from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, ideal_replay
 
 MAX_PANELS = 12
+SMALLEST_PANEL = 0.2  # m; a turn on the spot would fill the panel with its noise
 COLOURS = {"measured": "black", "ideal": "tab:gray", "initial": "tab:orange", "fitted": "tab:blue"}
 STYLES = {"measured": "-", "ideal": ":", "initial": "--", "fitted": "-"}
 
@@ -52,6 +53,8 @@ def write_plots(
             axis.tick_params(labelsize=7)
             axis.grid(alpha=0.3)
             if name == "trajectories":
+                reach = np.array([-0.5, 0.5]) * SMALLEST_PANEL
+                axis.plot(trial.start.x + reach, trial.start.y + reach, alpha=0.0)
                 axis.axis("equal")
         axes.flat[0].legend(fontsize=7)
         paths.append(folder / f"{name}.png")
@@ -94,6 +97,7 @@ def _error_bars(pyplot: Any, path: Path, rows: list[dict[str, Any]], names: set[
             axis.bar(np.arange(len(mine)) + 0.27 * (k - 1), [row["metrics"][metric][replay] for row in mine], 0.27,
                      color=COLOURS[replay], label=replay)
         axis.set_ylabel(f"{metric} RMSE [{unit}]")
+        axis.set_yscale("log")
         axis.grid(axis="y", alpha=0.3)
     axes[0].legend()
     axes[0].set_title(f"Error per trial, {channel.replace('_', ' ')} (* held out)")

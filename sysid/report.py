@@ -89,14 +89,14 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
 
 def table(report: dict[str, Any]) -> str:
     """The summary as text."""
-    lines = [f"{'':10} {'channel':13} {'metric':17} {'ideal':>9} {'initial':>9} {'fitted':>9} {'floor':>9}"]
+    lines = [f"{'trials':9} {'channel':13} {'RMSE':23} {'ideal':>9} {'initial':>9} {'fitted':>9} {'floor':>9}"]
     for part, channels in report["summary"].items():
         for channel, metrics in channels.items():
             for metric in (name for name in METRICS if name in metrics):
                 one = metrics[metric]
                 floor = "-" if one["noise_floor"] is None else f"{one['noise_floor']:.4f}"
-                lines.append(f"{part:10} {channel:13} {metric + ' ' + one['unit']:22} " + " ".join(
-                    f"{one[replay]:9.4f}" for replay in REPLAYS).replace("     ", "", 1) + f" {floor:>9}")
+                errors = " ".join(f"{one[replay]:9.4f}" for replay in REPLAYS)
+                lines.append(f"{part:9} {channel:13} {metric + ' ' + one['unit']:23} {errors} {floor:>9}")
     return "\n".join(lines)
 
 
