@@ -1,4 +1,4 @@
-"""Writes benchmarks/README.md from benchmarks/results/*.json: `python -m benchmarks.tables`. Nothing is typed by hand."""
+"""Writes benchmarks/README.md from benchmarks/results/*.json: `python -m benchmarks.tables`."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ single times.
 | `python -m benchmarks.fit` | fits against planted truth, contact-plant logs and measured robots |
 | `python -m benchmarks.bridge` | latencies, stops and losses of the ROS 2 bridge |
 
-All run on a CPU as well, in smaller sizes. The logs of measured robots are other people's: the script reads them from the
-folder that `--shared` names.
+All run on a CPU as well, in smaller sizes. The logs of measured robots are other people's: the script reads them from
+the folder that `--shared` names.
 """
 TITLES = {
     "physics": "Physics",
