@@ -44,6 +44,8 @@ class Benchmark:
     """Iterations of the gradient search."""
     starts: int = 3
     """Starts of the gradient search."""
+    physics_dt: float = 0.005
+    """Physics step of the fits of measured sets [s]."""
     presets: tuple[Literal["paper", "physical"], ...] = ("physical", "paper")
     """Base models."""
 
@@ -81,7 +83,8 @@ def gains(summary: dict[str, Any], prefix: str) -> dict[str, dict[str, Any]]:
 def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -> FitConfig:
     # The paper's drive has no wheel-spin state: its odometry is its body's motion, so it can only fit the pose.
     return FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations, starts=settings.starts,
-                     robust=True, channels="both" if preset == "physical" else "ground_truth")
+                     physics_dt=settings.physics_dt, robust=True,
+                     channels="both" if preset == "physical" else "ground_truth")
 
 
 def drive(settings: Benchmark) -> None:
@@ -161,7 +164,7 @@ def planted(settings: Benchmark) -> None:
                        starts=settings.starts)
     fit = fit_log(log, config)
     one = evaluate(fit, log.held_out)["summary"]["held_out"]["ground_truth"]["trajectory"]
-    space = make_space(truth)
+    space = make_space(truth, WHILL_CR)
     inside = [estimate.low <= value <= estimate.high for estimate, value in zip(
         fit.uncertainty.estimates, np.asarray(get_values(truth, space.names)), strict=True) if estimate.identifiable]
     figures = {"noise_floor_ratio": figure([one["fitted"] / one["noise_floor"]], "-"),

@@ -100,7 +100,7 @@ def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
     params = preset_params(log.spec, config.preset) if params is None else params
-    space = make_space(params, config.parameters or None, log.spec.track)
+    space = make_space(params, log.spec, config.parameters or None)
     objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
 
     scan = search = None

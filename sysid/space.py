@@ -1,6 +1,6 @@
 """Which parameters are searched, between which bounds, and on which scale.
 
-The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 20.
+The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 10.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-LOG_SPAN = 20.0
+from whill_mjx.specs import VehicleSpec
+
+LOG_SPAN = 10.0
 # Parameters that no driving log tells, or that only act through another one; they keep their value unless named.
 FIXED = {
     "air_drag.area": "acts only as a product with air_drag.c_d",
@@ -78,18 +80,28 @@ class Space:
 BOUNDS = {"slip_traction.slip_speed": (0.03, 2.0)}
 
 
-def heavy_bounds(mass: float, track: float) -> dict[str, tuple[float, float]]:
-    """Bounds of torques that grow with the vehicle: scrub up to the full weight sliding at a quarter of the track."""
-    return {"yaw_scrub.torque": (0.0, max(9.81 * mass * track / 4, 20.0))}
+# Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
+FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
+           "torque_drive.limit": (1 / 10, 30.0)}
 
 
-def make_space(params: Any, names: Sequence[str] | None = None, track: float = 0.5) -> Space:
-    """Space of a vehicle's parameters, with their described bounds or those of `BOUNDS` and `heavy_bounds`.
+def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
+    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track, and
+    a centre of mass between the axles."""
+    scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
+              for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
+    length, width = 0.45 * spec.wheelbase, 0.2 * spec.track
+    return {**scaled, "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
+            "body.com_x": (-length, length), "body.com_y": (-width, width)}
+
+
+def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
+    """Space of a vehicle's parameters, with their described bounds or those of `BOUNDS` and `vehicle_bounds`.
 
     Args:
         params: `VehicleParams`; their values are where the search starts.
+        spec: its nominal geometry and mass.
         names: what to search; by default everything but `FIXED`.
-        track: of the vehicle [m].
     """
     from whill_mjx.parameters import describe, get_values
 
@@ -99,10 +111,10 @@ def make_space(params: Any, names: Sequence[str] | None = None, track: float = 0
     unknown = sorted(set(names) - set(about))
     if unknown:
         raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")
-    bounds = {**BOUNDS, **heavy_bounds(float(params.body.mass), track)}
+    initial = np.asarray(get_values(params, names), float)
+    bounds = {**BOUNDS, **vehicle_bounds(names, initial, spec)}
     low = np.array([bounds.get(name, (about[name].low, 0))[0] for name in names], float)
     high = np.array([bounds.get(name, (0, about[name].high))[1] for name in names], float)
-    initial = np.asarray(get_values(params, names), float)
     low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range
     log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
     kept = [(name, FIXED.get(name, "not selected")) for name in about if name not in names]
