@@ -31,7 +31,8 @@ def random_instances(vehicle: str, count: int) -> tuple[VehicleModel, VehiclePar
 
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))
-    scattered = tree.unflatten([scatter(leaf, leaf_key) for leaf, leaf_key in zip(leaves, keys, strict=True)])
+    spread = [scatter(leaf, leaf_key) for leaf, leaf_key in zip(leaves, keys, strict=True)]
+    scattered = jax.tree.unflatten(tree, spread)
     states = jax.jit(jax.vmap(lambda params: place(model, params, 0.0, 0.0, 0.0)))(scattered)
     return model, scattered, states
 

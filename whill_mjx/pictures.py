@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -73,6 +74,7 @@ def camera_video(drives: Drives, out: Path, rate_hz: float, scale: int = 4) -> P
     videos = drives.frames.shape[0]
     length = int(drives.length[:videos].max()) + 1
     out.parent.mkdir(parents=True, exist_ok=True)
+    writer: Any  # its type stub lacks append_data
     with imageio.get_writer(out, fps=max(1, round(rate_hz)), macro_block_size=8, quality=7) as writer:
         for step in range(length):
             tiles = [drives.frames[i, min(step, int(drives.length[i]))] for i in range(videos)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects import (
@@ -51,44 +50,41 @@ def preset_params(spec: VehicleSpec, kind: str = "paper") -> VehicleParams:
 
 def paper_initial(spec: VehicleSpec) -> VehicleParams:
     """The paper's base model at its initial values (reference paper, Table II)."""
-    return _arrays(
-        VehicleParams(
-            default_body(spec),
-            (
-                PidDrive(kp=10.0, ki=0.0, kd=0.0, integral_limit=0.5),
-                ForwardSlip(eta=1.0),
-                RollingContact(grip=1.0),
-                LateralDamping(c_rear=1.0, c_front=0.1),
-                RollingResistance(mu_r=0.002),
-                AirDrag(c_d=0.2, area=0.8),
-            ),
-        )
+    return VehicleParams(
+        default_body(spec),
+        (
+            with_values(PidDrive, kp=10.0, ki=0.0, kd=0.0, integral_limit=0.5),
+            with_values(ForwardSlip, eta=1.0),
+            with_values(RollingContact, grip=1.0),
+            with_values(LateralDamping, c_rear=1.0, c_front=0.1),
+            with_values(RollingResistance, mu_r=0.002),
+            with_values(AirDrag, c_d=0.2, area=0.8),
+        ),
     )
 
 
 def paper_optimised(spec: VehicleSpec) -> VehicleParams:
     """The paper's base model at its optimised values (reference paper, Table II)."""
-    body = default_body(spec).replace(com_x=-0.2654, com_y=0.0044, com_z=0.1215)
-    return _arrays(
-        VehicleParams(
-            body,
-            (
-                PidDrive(kp=27.70, ki=0.4025, kd=0.7384, integral_limit=1.431),
-                ForwardSlip(eta=0.84),
-                RollingContact(grip=1.0),
-                LateralDamping(c_rear=34.79, c_front=0.4056),
-                RollingResistance(mu_r=0.0033),
-                AirDrag(c_d=1.132, area=1.062),
-            ),
-        )
+    com = {"com_x": -0.2654, "com_y": 0.0044, "com_z": 0.1215}
+    body = with_values(Body, mass=spec.mass, yaw_inertia=box_inertia(spec)[2], **com)
+    return VehicleParams(
+        body,
+        (
+            with_values(PidDrive, kp=27.70, ki=0.4025, kd=0.7384, integral_limit=1.431),
+            with_values(ForwardSlip, eta=0.84),
+            with_values(RollingContact, grip=1.0),
+            with_values(LateralDamping, c_rear=34.79, c_front=0.4056),
+            with_values(RollingResistance, mu_r=0.0033),
+            with_values(AirDrag, c_d=1.132, area=1.062),
+        ),
     )
 
 
 def paper_ramp(spec: VehicleSpec) -> VehicleParams:
     """The paper's optimised vehicle behind the maker's ramp of 1.7 m/s^2 on v, and as much at the wheels on omega."""
     params = paper_optimised(spec)
-    ramp = _arrays(AccelerationLimit(linear=1.7, angular=1.7 / (spec.track / 2)))
-    return params.replace(effects=(ramp, *params.effects))
+    ramp = with_values(AccelerationLimit, linear=1.7, angular=1.7 / (spec.track / 2))
+    return VehicleParams(params.body, (ramp, *params.effects))
 
 
 def physical(spec: VehicleSpec) -> VehicleParams:
@@ -99,26 +95,24 @@ def physical(spec: VehicleSpec) -> VehicleParams:
     """
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # inertia that one side's motor sees [kg m^2]
     skid = spec.drive == "skid"
-    return _arrays(
-        VehicleParams(
-            default_body(spec),
-            (
-                CommandDelay(delay=0.02),
-                TorqueDrive(kp=10.0 * load, ki=10.0 * load, limit=3.0 * load / spec.wheel_radius),
-                SlipTraction(mu=0.7, slip_speed=0.05, mu_free=0.0 if skid else 0.02),
-                YawScrub(torque=0.01 * spec.mass * spec.track),
-                RollingResistance(mu_r=0.01),
-                OdometryLag(time_constant=0.03),
-            ),
-        )
+    return VehicleParams(
+        default_body(spec),
+        (
+            with_values(CommandDelay, delay=0.02),
+            with_values(TorqueDrive, kp=10.0 * load, ki=10.0 * load, limit=3.0 * load / spec.wheel_radius),
+            with_values(SlipTraction, mu=0.7, slip_speed=0.05, mu_free=0.0 if skid else 0.02),
+            with_values(YawScrub, torque=0.01 * spec.mass * spec.track),
+            with_values(RollingResistance, mu_r=0.01),
+            with_values(OdometryLag, time_constant=0.03),
+        ),
     )
 
 
 def default_body(spec: VehicleSpec) -> Body:
     """Nominal mass, the yaw inertia of a box of the vehicle's size, centre of mass at the chassis origin."""
-    return Body(mass=spec.mass, yaw_inertia=box_inertia(spec)[2], com_x=0.0, com_y=0.0, com_z=0.0)
+    return with_values(Body, mass=spec.mass, yaw_inertia=box_inertia(spec)[2], com_x=0.0, com_y=0.0, com_z=0.0)
 
 
-def _arrays(tree: Any) -> Any:
-    """Leaves as arrays of the default float type."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), tree)
+def with_values(kind: type, **values: float) -> Any:
+    """A `kind` (an effect or the body) with these values as arrays of the default float type."""
+    return kind(**{name: jnp.asarray(value, dtype=jnp.result_type(float)) for name, value in values.items()})

@@ -201,7 +201,8 @@ def save_drives(path: Path, drives: Drives) -> None:
     """Paths, lengths and endings of the evaluation drives as plain arrays."""
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
-        np.savez_compressed(file, path=drives.path, length=drives.length, **drives.metrics)
+        arrays: dict[str, Any] = {"path": drives.path, "length": drives.length, **drives.metrics}
+        np.savez_compressed(file, **arrays)
     os.replace(temporary, path)
 
 

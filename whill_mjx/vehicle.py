@@ -137,7 +137,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
     )  # each (4,), chassis frame
 
     def along(axis: jax.Array) -> jax.Array:
-        return sum(axis[i] * point_velocity[i] for i in range(3))
+        return axis[0] * point_velocity[0] + axis[1] * point_velocity[1] + axis[2] * point_velocity[2]
 
     height = state.qpos[2] + normal[0] * x + normal[1] * y  # of the wheel centres [m]
     stiffness, damping = suspension(params.body.mass)

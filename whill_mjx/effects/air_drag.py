@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -27,4 +29,4 @@ class AirDrag(Effect):
         """Wrench along the chassis x axis."""
         speed = motion.velocity[0] - (motion.rotation.T @ motion.world.wind)[0]
         force = -0.5 * AIR_DENSITY * self.c_d * self.area * jnp.abs(speed) * speed
-        return memory, Wrench.zero().replace(fx=force)
+        return memory, replace(Wrench.zero(), fx=force)

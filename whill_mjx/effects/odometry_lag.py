@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -27,4 +29,4 @@ class OdometryLag(Effect):
         """Reading with filtered v and omega."""
         raw = jnp.stack([reading.v, reading.omega])
         filtered = raw + (memory - raw) * self.time_constant / (self.time_constant + motion.dt)
-        return filtered, reading.replace(v=filtered[0], omega=filtered[1])
+        return filtered, replace(reading, v=filtered[0], omega=filtered[1])

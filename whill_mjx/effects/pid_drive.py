@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 from flax import struct
 
@@ -29,7 +31,7 @@ class PidDrive(Effect):
         memory, acceleration = pid(
             self.kp, self.ki, self.kd, self.integral_limit, memory, drive.target, speed, motion.dt
         )
-        return memory, drive.replace(force=drive.force + motion.mass / 2 * acceleration)
+        return memory, replace(drive, force=drive.force + motion.mass / 2 * acceleration)
 
 
 @struct.dataclass
@@ -41,7 +43,7 @@ class ForwardSlip(Effect):
 
     def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
         """Scales the force (2,) of each side."""
-        return memory, drive.replace(force=self.eta * drive.force)
+        return memory, replace(drive, force=self.eta * drive.force)
 
 
 @struct.dataclass
@@ -59,4 +61,4 @@ class RollingContact(Effect):
         """Wrench with a torque on the driven wheels only."""
         ground_speed = driven_mean(motion, motion.contact_vx) / motion.world.geometry.wheel_radius
         torque = self.grip * motion.wheel_inertia * (ground_speed - motion.spin) / motion.dt
-        return memory, Wrench.zero().replace(spin_torque=torque)
+        return memory, replace(Wrench.zero(), spin_torque=torque)

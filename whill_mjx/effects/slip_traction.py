@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -51,4 +53,4 @@ class SlipTraction(Effect):
         free = self.mu_free * motion.normal_force * (1 - geometry.driven)
         left = left + free * slide_y / jnp.sqrt(slide_y**2 + self.slip_speed**2)
         wrench = contact_wrench(motion, forward, left)
-        return memory, wrench.replace(spin_torque=-radius * per_side(forward))
+        return memory, replace(wrench, spin_torque=-radius * per_side(forward))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -28,4 +30,4 @@ class TorqueDrive(Effect):
         wanted = self.kp * error + self.ki * memory
         torque = jnp.clip(wanted, -self.limit, self.limit)
         free = (jnp.abs(wanted) < self.limit) | (wanted * error < 0)  # integrate only where it does not wind up
-        return memory + jnp.where(free, error, 0.0) * motion.dt, drive.replace(torque=drive.torque + torque)
+        return memory + jnp.where(free, error, 0.0) * motion.dt, replace(drive, torque=drive.torque + torque)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -22,4 +24,4 @@ class YawScrub(Effect):
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench with a yaw torque only."""
         yaw_rate = (motion.ground_axes[2] * motion.angular_velocity).sum()
-        return memory, Wrench.zero().replace(tz=-self.torque * jnp.tanh(yaw_rate / REST_RATE))
+        return memory, replace(Wrench.zero(), tz=-self.torque * jnp.tanh(yaw_rate / REST_RATE))
