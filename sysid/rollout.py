@@ -45,7 +45,7 @@ class Plant:
     """state -> (9,): x, y, yaw of the reference point; x, y, yaw, v, omega of the odometry; 1 if it diverged."""
     dt: float
     """Physics step [s]."""
-    move: Callable[[Any, jax.Array], Any] = lambda state, start: state
+    move: Callable[[Any, jax.Array], Any]
     """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
 
 

@@ -41,7 +41,10 @@ def unicycle_plant(dt: float = 0.02) -> Plant:
         wrapped = jnp.arctan2(jnp.sin(yaw), jnp.cos(yaw))
         return jnp.stack([x, y, wrapped, ox, oy, oyaw, v, omega, jnp.zeros_like(x)])
 
-    return Plant(place, substep, observe, dt)
+    def move(state, start):
+        return jnp.concatenate([start[:3], state[3:5], jnp.zeros(3)])
+
+    return Plant(place, substep, observe, dt, move)
 
 
 TRUTH = np.array([0.25, 0.15, 0.9])
