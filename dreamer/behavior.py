@@ -11,7 +11,6 @@ from flax import struct
 from dreamer import distributions as dist
 from dreamer import rssm, world_model
 from dreamer.config import DreamerConfig
-from dreamer.replay import Batch
 from dreamer.rssm import Latent
 from dreamer.types import Params
 
@@ -223,7 +222,14 @@ def stop_rollout(rollout: Imagined) -> Imagined:
 
 
 def replay_loss(
-    config: DreamerConfig, params: Params, slow: Params, latent: Latent, batch: Batch, start_return: jax.Array
+    config: DreamerConfig,
+    params: Params,
+    slow: Params,
+    latent: Latent,
+    reward: jax.Array,
+    is_last: jax.Array,
+    is_terminal: jax.Array,
+    start_return: jax.Array,
 ) -> jax.Array:
     """Critic loss (T - 1, B) along the replayed sequence; its gradient reaches the world model.
 
@@ -234,14 +240,16 @@ def replay_loss(
         params: of the whole agent.
         slow: slow critic.
         latent: posterior states (T, B, ...).
-        batch: the sequence.
+        reward: (T, B), is_last and is_terminal alike.
+        is_last: cuts the mixing: what follows belongs to another episode.
+        is_terminal: ends the value.
         start_return: (T, B) imagined returns.
     """
     features = latent.features()
-    last = batch.is_last.astype(jnp.float32)
-    live = config.discount * (1.0 - batch.is_terminal.astype(jnp.float32))
+    last = is_last.astype(jnp.float32)
+    live = config.discount * (1.0 - is_terminal.astype(jnp.float32))
     returns = lambda_return(
-        batch.reward, live, config.return_lambda * (1.0 - last), start_return, min(config.scan_unroll, last.shape[0])
+        reward, live, config.return_lambda * (1.0 - last), start_return, min(config.scan_unroll, last.shape[0])
     )
     logits = world_model.head(params["value"], features)[:-1]
     slow_logits = world_model.head(slow, jax.lax.stop_gradient(features))[:-1]

@@ -76,6 +76,8 @@ class DreamerConfig:
     """Effective horizon [steps]; discount 1 - 1/horizon, contained in the continue head."""
     imag_horizon: int = 15
     """Imagined steps."""
+    imag_last: int = 0
+    """Imagine from the last so many states of each sequence, and train the critic's replay loss there; 0 means all."""
     return_lambda: float = 0.95
     """Lambda of the returns."""
     entropy_scale: float = 3e-4
@@ -133,6 +135,7 @@ class DreamerConfig:
             (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.batch_length >= 2, "batch_length", "must be at least 2"),
+            (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),
             (self.steps_per_iter >= 1, "steps_per_iter", "must be at least 1"),
             (self.kernel == 5, "kernel", "must be 5: the 2x2-block form of the convolutions is written for it"),
         )
@@ -154,6 +157,11 @@ class DreamerConfig:
     def discount(self) -> float:
         """Discount per step."""
         return 1.0 - 1.0 / self.horizon
+
+    @property
+    def start_steps(self) -> int:
+        """States of each sequence from which imagination starts."""
+        return min(self.imag_last or self.batch_length, self.batch_length)
 
     @property
     def replayed_per_update(self) -> int:
@@ -181,6 +189,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         warmup=200,
         value_layers=2,
         policy_layers=2,
+        imag_last=16,
         compute_dtype="float32",
         scan_unroll=1,
     ),

@@ -91,7 +91,9 @@ def init_decoder(config: DreamerConfig, obs_shape: Shape, key: jax.Array) -> Par
 def decode_blocks(
     config: DreamerConfig, params: Params, deter: jax.Array, stoch: jax.Array, obs_shape: Shape
 ) -> jax.Array:
-    """Image logits in the form of `to_blocks`, float32.
+    """Predicted images in the form of `to_blocks`, float32, about 0 to 1.
+
+    The convolutions end in a sigmoid as in the source; patches do not, since it costs as much as their products.
 
     Args:
         config: sizes.
@@ -109,13 +111,13 @@ def decode_blocks(
     flat = nets.linear(params["stoch1"], nets.layer(params["stoch0"], stoch)).reshape(rows, cells, side)
     x = nets.norm_act(spread + flat, params["scale"])
     if config.encoder == "patch":
-        return nets.linear(params["patch"], x).astype(jnp.float32)
+        return nets.linear(params["patch"], x).astype(jnp.float32) + 0.5  # mid-grey at the start
     x = x.reshape(rows, height, width, side)
     for i in reversed(range(len(config.mults) - 1)):
         y = nets.norm_act(nets.upsample_conv(params[f"conv{i}"], x), params[f"conv{i}"]["scale"])
         x = nets.depth_to_space(y.reshape(*y.shape[:-2], -1))
     y = nets.upsample_conv(params["out"], x)
-    return y.reshape(*y.shape[:-2], -1).astype(jnp.float32)
+    return jax.nn.sigmoid(y.reshape(*y.shape[:-2], -1).astype(jnp.float32))
 
 
 def reconstruction_loss(
@@ -127,13 +129,13 @@ def reconstruction_loss(
     """
     obs_shape = (image.shape[1], image.shape[2], image.shape[3])
     target = to_blocks(config, image).astype(jnp.float32) / 255
-    error = jax.nn.sigmoid(decode_blocks(config, params, deter, stoch, obs_shape)) - target
+    error = decode_blocks(config, params, deter, stoch, obs_shape) - target
     return jnp.sum(jnp.square(error), range(1, error.ndim))
 
 
 def decode(config: DreamerConfig, params: Params, deter: jax.Array, stoch: jax.Array, obs_shape: Shape) -> jax.Array:
     """Predicted images (M, H, W, C) in [0, 1], for videos."""
-    blocks = jax.nn.sigmoid(decode_blocks(config, params, deter, stoch, obs_shape))
+    blocks = jnp.clip(decode_blocks(config, params, deter, stoch, obs_shape), 0.0, 1.0)
     if config.encoder == "conv":
         return nets.depth_to_space(blocks)
     return from_patches(blocks, config.patch, obs_shape)

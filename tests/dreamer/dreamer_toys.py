@@ -72,6 +72,27 @@ def corridor_env(num_envs: int, length: int = 4, limit: int = 12) -> FunctionalE
     return FunctionalEnv(num_envs, SHAPE, 1, reset, step)
 
 
+def echo_env(num_envs: int) -> FunctionalEnv:
+    """Shows the sign of the previous action, black or white: only a model fed the right action can foresee it."""
+
+    def emit(state: ToyState, level: jax.Array, first: jax.Array) -> Transition:
+        return Transition(
+            obs=shade(level), reward=jnp.zeros((num_envs,)), is_first=first, is_last=jnp.zeros_like(first),
+            is_terminal=jnp.zeros_like(first), metrics={},
+        )
+
+    def reset(key: jax.Array) -> tuple[ToyState, Transition]:
+        zeros = jnp.zeros((num_envs,), jnp.int32)
+        state = ToyState(key, zeros, zeros, zeros.astype(bool))
+        return state, emit(state, jnp.zeros((num_envs,)), jnp.ones((num_envs,), bool))
+
+    def step(state: ToyState, action: jax.Array) -> tuple[ToyState, Transition]:
+        level = (action[:, 0] > 0).astype(jnp.float32)
+        return state, emit(state, level, jnp.zeros((num_envs,), bool))
+
+    return FunctionalEnv(num_envs, SHAPE, 1, reset, step)
+
+
 def counting_env(num_envs: int, limits: tuple[int, ...]) -> FunctionalEnv:
     """Instance n ends (by time-out) after limits[n] steps and pays 1 per step: length and return are limits[n]."""
     limit = jnp.array(limits)

@@ -1,0 +1,163 @@
+"""Measures the learner: whole updates (draw from the replay, gradient step, latents written back), and their parts.
+
+    python -m benchmarks.learner                  # size12m on an accelerator, the cpu preset on a CPU
+    python -m benchmarks.learner --preset size25m --batch-size 32
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import harness
+from dreamer import agent as agents
+from dreamer import behavior, distributions, image, optim, replay, rssm
+from dreamer.agent import AgentState
+from dreamer.config import DreamerConfig, preset
+from dreamer.replay import Replay
+from dreamer.rssm import Latent
+
+OBS_SHAPE = (64, 64, 3)
+ACTION_DIM = 2
+STREAMS = 16
+ROWS = 1024
+CLAIM = "One DreamerV3 update, all of it on the device, as the training loop runs it."
+
+
+def random_replay(config: DreamerConfig, key: jax.Array) -> Replay:
+    """A full memory of noise, with an episode start every 100 rows."""
+    memory = replay.init(config, STREAMS, OBS_SHAPE, ACTION_DIM)
+    keys = jax.random.split(key, 4)
+    rows = memory.reward.shape[0]
+    starts = jnp.broadcast_to((jnp.arange(rows) % 100 == 0)[:, None], (rows, STREAMS))
+    return dataclasses.replace(
+        memory,
+        obs=jax.random.bits(keys[0], memory.obs.shape, jnp.uint8),
+        reward=jax.random.normal(keys[1], memory.reward.shape),
+        is_first=starts,
+        is_last=jnp.roll(starts, -1, 0),
+        action=jax.random.normal(keys[2], memory.action.shape),
+        stoch=jax.random.randint(keys[3], memory.stoch.shape, 0, config.classes).astype(jnp.uint8),
+        written=jnp.asarray(rows, jnp.int32),
+        online_next=jnp.asarray(rows * STREAMS, jnp.int32),  # no fresh sequences: all draws are uniform
+    )
+
+
+def time_updates(config: DreamerConfig, blocks: int, per_block: int) -> tuple[list[float], float]:
+    """Seconds per update of each block, and seconds to compile."""
+
+    def run(agent: AgentState, memory: Replay, key: jax.Array) -> tuple[AgentState, Replay]:
+        def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[AgentState, Replay]:
+            agent, memory = carry
+            sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+            memory, batch, window = replay.sample(config, memory, sample_key)
+            agent, latent, _ = agents.update(config, agent, batch, update_key)
+            return agent, replay.write_back(config, memory, window, latent)
+
+        return jax.lax.fori_loop(0, per_block, one, (agent, memory))
+
+    key = jax.random.PRNGKey(0)
+    agent = jax.jit(lambda k: agents.init_agent(config, OBS_SHAPE, ACTION_DIM, k))(key)
+    memory = jax.jit(lambda k: random_replay(config, k))(key)
+    start = time.perf_counter()
+    compiled = jax.jit(run, donate_argnums=(0, 1)).lower(agent, memory, key).compile()
+    compile_s = time.perf_counter() - start
+    seconds = []
+    for block in range(blocks + 1):
+        start = time.perf_counter()
+        agent, memory = compiled(agent, memory, jax.random.fold_in(key, block))
+        jax.block_until_ready(agent)
+        seconds.append((time.perf_counter() - start) / per_block)
+    return seconds[1:], compile_s
+
+
+def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
+    """The parts of an update as separate calls. They overlap and miss what connects them, so they do not add up."""
+    key = jax.random.PRNGKey(0)
+    agent = agents.init_agent(config, OBS_SHAPE, ACTION_DIM, key)
+    memory = jax.jit(lambda k: random_replay(config, k))(key)
+    _, batch, _ = jax.jit(lambda m, k: replay.sample(config, m, k))(memory, key)
+    steps = batch.reward.shape
+    tokens = jnp.zeros((*steps, image.token_size(config, OBS_SHAPE)), config.dtype)
+    latent = rssm.initial(config, steps[0] * steps[1])
+    start = rssm.initial(config, config.start_steps * steps[1])
+
+    def observe(params: Any, tokens: jax.Array) -> jax.Array:
+        uniform = jax.random.uniform(key, (*steps, config.stoch))
+        args = (batch.start, batch.prev_action, tokens, batch.is_first, uniform)
+        states, post = rssm.observe(config, params["dyn"], *args)
+        prior = rssm.prior_probs(config, params["dyn"], states.deter)
+        features = states.features().astype(jnp.float32)
+        return jnp.mean(jnp.square(features)) + jnp.mean(distributions.categorical_kl(post, prior))
+
+    def images(params: Any, latent: Latent) -> jax.Array:
+        encoded = image.encode(config, params["enc"], batch.obs).astype(jnp.float32)
+        frames = batch.obs.reshape(-1, *OBS_SHAPE)
+        recon = image.reconstruction_loss(config, params["dec"], latent.deter, latent.stoch, frames)
+        return jnp.mean(jnp.square(encoded)) + jnp.mean(recon)
+
+    def behave(params: Any, latent: Latent) -> jax.Array:
+        losses, *_ = behavior.imagination_loss(config, params, agent.slow_value, agent.return_norm, latent, key)
+        return sum((jnp.mean(value) for value in losses.values()), jnp.zeros(()))
+
+    calls: dict[str, tuple[Callable[..., Any], tuple]] = {
+        "observe": (jax.grad(observe, argnums=(0, 1)), (agent.params, tokens)),
+        "images": (jax.grad(images, argnums=(0, 1)), (agent.params, latent)),
+        "behavior": (jax.grad(behave), (agent.params, start)),
+        "imagine": (lambda p, s: _arrays(behavior.imagine(config, p, s, key)), (agent.params, start)),
+        "optimiser": (lambda p, o: optim.update(config, p, p, o), (agent.params, agent.opt)),
+        "draw": (lambda m: replay.sample(config, m, key)[1], (memory,)),
+    }
+    return {name: _bind(jax.jit(function), arguments) for name, (function, arguments) in calls.items()}
+
+
+def _arrays(rollout: behavior.Imagined) -> tuple[jax.Array, jax.Array]:
+    return rollout.features, rollout.actions
+
+
+def _bind(function: Callable[..., Any], arguments: tuple) -> Callable[[], Any]:
+    return lambda: function(*arguments)
+
+
+def main() -> None:
+    """Measure and write benchmarks/results/learner.json."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", help="size; size12m on an accelerator and cpu on a CPU unless given")
+    parser.add_argument("--batch-size", type=int)
+    parser.add_argument("--unroll", type=int)
+    parser.add_argument("--blocks", type=int, default=5)
+    parser.add_argument("--per-block", type=int, default=10)
+    parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
+    parser.add_argument("--dry", action="store_true", help="print only")
+    args = parser.parse_args()
+    on_cpu = jax.devices()[0].platform == "cpu"
+    name = args.preset or ("cpu" if on_cpu else "size12m")
+    given = {"batch_size": args.batch_size, "scan_unroll": args.unroll, "replay_capacity": STREAMS * ROWS}
+    config = preset(name, **{field: value for field, value in given.items() if value is not None})
+    seconds, compile_s = time_updates(config, args.blocks, args.per_block)
+    rates = [1.0 / s for s in seconds]
+    replayed = [config.replayed_per_update * rate for rate in rates]
+    label = name.removeprefix("size") + (f"_batch{args.batch_size}" if args.batch_size else "")
+    figures = {f"compile_s_{label}": harness.figure([compile_s], "s")}
+    if name == "cpu":
+        figures["cpu_replayed_steps_per_s"] = harness.figure(replayed, "1/s")
+    else:
+        figures[f"updates_per_s_{label}"] = harness.figure(rates, "1/s")
+        figures[f"replayed_steps_per_s_{label}"] = harness.figure(replayed, "1/s")
+    for part, call in (parts(config) if args.parts else {}).items():
+        times = [1e3 * s for s in harness.time_calls(call, repeats=args.per_block, warm_up=2)]
+        figures[f"{part}_ms_{label}"] = harness.figure(times, "ms")
+    for key, value in figures.items():
+        print(f"{key}: {value['value']:.4g} {value['unit']}", flush=True)
+    if not args.dry:
+        harness.record("learner", CLAIM, figures)
+
+
+if __name__ == "__main__":
+    main()

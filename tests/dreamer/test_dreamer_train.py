@@ -1,0 +1,205 @@
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from dreamer_toys import corridor_env, counting_env, tiny_config
+
+from dreamer import checkpoint, iteration
+from dreamer.train import evaluate, train
+
+ENV = corridor_env(4)
+CONFIG = tiny_config(lr=1e-3, train_ratio=64.0)
+QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
+ROOT = Path(__file__).parents[2]
+
+
+def lines(out):
+    return [json.loads(text) for text in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("learned"), 1200, 0, **{**QUIET, "log_every_s": 1.0})
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """An uninterrupted run of 400 steps."""
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("straight"), 400, 0, **QUIET)
+
+
+def test_the_corridor_is_learned_to_its_best_return(learned):
+    result = evaluate(ENV, CONFIG, learned.agent.params, jax.random.PRNGKey(1), 6)
+    np.testing.assert_allclose(result["return"], np.full(6, 1.0 - 0.05 * 3), atol=1e-5)
+    np.testing.assert_array_equal(result["length"], 4)
+    np.testing.assert_array_equal(result["success"], 1.0)
+
+
+def test_the_reward_head_knows_the_goal_and_the_value_is_right(learned):
+    last = learned.last_metrics
+    assert last["goal_reward_predicted"] > 0.9
+    assert last["kl"] < 2.0 and 0.1 <= last["policy_std"] < 0.8
+    assert last["loss_recon"] < 10.0
+
+
+def test_the_goal_step_is_stored_with_its_own_frame(learned):
+    state = jax.jit(lambda: iteration.init_state(ENV, CONFIG, 0))()
+    memory = checkpoint.restore(learned.out / "checkpoints", state, CONFIG)[0].replay
+    terminal, frames = np.asarray(memory.is_terminal), np.asarray(memory.obs)[..., 0, 0, 0]
+    assert terminal.sum() > 20
+    np.testing.assert_array_equal(frames[terminal], 255)
+    np.testing.assert_array_equal(np.asarray(memory.reward)[terminal], 1.0)
+    assert np.all(np.asarray(memory.is_last)[terminal])
+    after = np.roll(terminal, 1, 0)
+    after[0] = after[int(memory.written) % len(after)] = False
+    np.testing.assert_array_equal(np.asarray(memory.is_first)[after], True)
+    np.testing.assert_array_equal(frames[after], 0)
+
+
+def test_updates_follow_the_train_ratio_and_nothing_is_caught_up(straight):
+    logged = lines(straight.out)
+    first = next(line for line in logged if line["updates"])
+    assert first["env_steps"] >= CONFIG.learning_starts and first["updates_per_env_step"] <= 2.0
+    assert logged[-1]["updates_per_env_step"] == pytest.approx(64.0 / CONFIG.replayed_per_update)
+    waited = first["env_steps"] - ENV.num_envs
+    assert straight.updates == (400 - waited) * 2
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("num_envs, ratio", [(16, 512.0), (4096, 16.0), (3, 0.7), (1, 33.3)])
+def test_credit_buys_exactly_the_ratio(num_envs, ratio):
+    config = tiny_config(train_ratio=ratio)
+    gain, price = iteration.credit_rates(config, num_envs)
+    assert gain / price == pytest.approx(num_envs * ratio / config.replayed_per_update, rel=1e-6)
+    assert gain + price < 2**31
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(straight, tmp_path):
+    train(ENV, CONFIG, tmp_path, 200, 0, **QUIET)
+    resumed = train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+    assert_equal(resumed.agent, straight.agent)
+    assert [line["env_steps"] for line in lines(tmp_path)] == [line["env_steps"] for line in lines(straight.out)]
+    rates = {line["updates_per_env_step"] for line in lines(tmp_path)[30:]}
+    assert rates == {2.0}
+    times = [line["wall_s"] for line in lines(tmp_path)]
+    assert times == sorted(times)
+
+
+CHILD = """
+import sys
+from dreamer.train import train
+from dreamer_toys import corridor_env, tiny_config
+train(corridor_env(4), tiny_config(lr=1e-3, train_ratio=64.0), sys.argv[1], 10**6, 0, progress=False,
+      log_every_s=0.0, checkpoint_every_s=0.0)
+"""
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(straight, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{Path(__file__).parent}"}
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], env=environment)
+    deadline = time.monotonic() + 240
+    try:
+        while time.monotonic() < deadline and child.poll() is None:
+            newest = [int(path.name) for path in checkpoint.complete(tmp_path / "checkpoints")]
+            if newest and newest[-1] >= 80:
+                break
+            time.sleep(0.02)
+        assert child.poll() is None and newest and newest[-1] < 400
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    resumed = train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+    assert_equal(resumed.agent, straight.agent)
+    assert [line["env_steps"] for line in lines(tmp_path)] == [line["env_steps"] for line in lines(straight.out)]
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A folder with two small checkpoints and the function that reads them."""
+    state = {"a": np.arange(5000.0), "key": jax.random.key(3), "empty": np.zeros((0, 2))}
+    for steps in (100, 200, 300):
+        checkpoint.save(tmp_path, {**state, "a": state["a"] + steps}, CONFIG, steps)
+    return tmp_path, lambda config=CONFIG, state=state: checkpoint.restore(tmp_path, state, config)
+
+
+def damage(folder, steps):
+    victim = max((folder / f"{steps:012d}" / "state").rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    victim.write_bytes(data)
+
+
+def test_the_last_two_checkpoints_are_kept_and_the_newest_is_read(saved):
+    folder, read = saved
+    assert sorted(path.name for path in folder.iterdir()) == ["000000000200", "000000000300"]
+    state, meta = read()
+    np.testing.assert_array_equal(state["a"], np.arange(5000.0) + 300)
+    np.testing.assert_array_equal(jax.random.key_data(state["key"]), jax.random.key_data(jax.random.key(3)))
+    assert meta["env_steps"] == 300
+
+
+def test_a_damaged_checkpoint_is_passed_over_with_a_warning(saved):
+    folder, read = saved
+    damage(folder, 300)
+    with pytest.warns(UserWarning, match="000000000300.*damaged"):
+        assert read()[1]["env_steps"] == 200
+
+
+def test_with_no_whole_checkpoint_left_the_error_names_file_rule_and_remedy(saved):
+    folder, read = saved
+    damage(folder, 200)
+    (folder / "000000000300" / "meta.json").write_text("{")
+    with pytest.warns(UserWarning), pytest.raises(checkpoint.CheckpointError, match="000000000200.*checksum.*Delete"):
+        read()
+
+
+def test_an_unfinished_checkpoint_is_not_seen(saved):
+    folder, read = saved
+    (folder / ".unfinished-x").mkdir()
+    (folder / "000000000900").mkdir()  # without meta.json, which is written last
+    assert read()[1]["env_steps"] == 300
+
+
+def test_another_configuration_or_environment_is_refused_by_name(saved):
+    _, read = saved
+    with pytest.raises(checkpoint.CheckpointError, match="lr: saved 0.001, now 0.5"):
+        read(config=dataclasses.replace(CONFIG, lr=0.5))
+    with pytest.raises(checkpoint.CheckpointError, match="no array 'b'"):
+        read(state={"b": np.zeros(3)})
+    with pytest.raises(checkpoint.CheckpointError, match="array 'a' is .*5000.* where .*10, 2"):
+        read(state={"a": np.zeros((10, 2))})
+
+
+def test_each_instance_counts_one_episode_however_short():
+    env = counting_env(4, (3, 5, 9, 2))
+    config = tiny_config()
+    params = jax.jit(lambda: iteration.init_state(env, config, 0).agent.params)()
+    result = evaluate(env, config, params, jax.random.PRNGKey(0), 6)
+    np.testing.assert_array_equal(result["length"], [3, 5, 9, 2, 3, 5])
+    np.testing.assert_array_equal(result["return"], [3, 5, 9, 2, 3, 5])
+    np.testing.assert_array_equal(result["mark"], [3, 5, 9, 2, 3, 5])
+    assert np.all(result["finished"])
+
+
+def test_several_steps_in_one_dispatch_are_the_same_run(straight):
+    config = dataclasses.replace(CONFIG, steps_per_iter=10)
+    state = jax.jit(lambda: iteration.init_state(ENV, config, 0))()
+    iterate = iteration.compile_iteration(ENV, config, state)
+    updates = episodes = 0
+    for _ in range(10):
+        state, metrics = iterate(state)
+        updates, episodes = updates + int(metrics["updates"]), episodes + float(metrics["episodes"])
+    assert int(state.env_steps) == 400 and int(state.agent.updates) == updates == straight.updates
+    assert episodes == sum(line["episodes"] for line in lines(straight.out))
