@@ -36,6 +36,8 @@ class Benchmark:
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/plant and data/measured."""
     parts: tuple[Literal["planted", "plant", "drive", "mrclam", "speed"], ...] = ("planted", "plant", "drive", "mrclam")
+    terrains: tuple[Literal["asphalt", "sand", "pooled"], ...] = ("asphalt", "sand", "pooled")
+    """Fits of the DRIVE runs."""
     windows: int = 100
     """Training windows of a measured set that are fitted, spread evenly; all held-out windows are scored."""
     evaluations: int = 96
@@ -94,7 +96,8 @@ def drive(settings: Benchmark) -> None:
     everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))
     choices = {name: (DRIVE_TRAIN[name], DRIVE_HELD_OUT[name]) for name in DRIVE_TRAIN} | {"pooled": everything}
     for preset in settings.presets:
-        for name, (train, held_out) in choices.items():
+        for name in settings.terrains:
+            train, held_out = choices[name]
             log = split(native, train, held_out)
             fit = fit_log(thin(log, settings.windows), measured_config(settings, preset))
             result = evaluate(fit, log.held_out)

@@ -156,7 +156,10 @@ def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
 
 
 class Replay:
-    """Compiled replay of one batch for many parameter sets: `values` (N, P) go in, host arrays come out."""
+    """Compiled replay of one batch for many parameter sets: `values` (N, P) go in, host arrays come out.
+
+    A call with fewer sets than an earlier one is padded to that size: a few spare rows cost less than compiling again.
+    """
 
     def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
         """`set_values` turns values (P,) into the vehicle's parameters."""
@@ -174,14 +177,24 @@ class Replay:
         self._batch = batch
         self._simulate = jax.jit(jax.vmap(one, in_axes=(0, None)))
         self._jacobian = jax.jit(jax.vmap(one_jacobian, in_axes=(0, None)))
+        self._sizes: dict[Any, set[int]] = {self._simulate: set(), self._jacobian: set()}
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay with each of values (N, P); leaves gain the axis N in front."""
-        return jax.tree.map(np.asarray, self._simulate(jnp.asarray(values, jnp.result_type(float)), self._batch))
+        return self._call(self._simulate, values)
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
-        return jax.tree.map(np.asarray, self._jacobian(jnp.asarray(values, jnp.result_type(float)), self._batch))
+        return self._call(self._jacobian, values)
+
+    def _call(self, function: Any, values: np.ndarray) -> Any:
+        count = len(values)
+        sizes = self._sizes[function]
+        size = min((size for size in sizes if size >= count), default=count)
+        sizes.add(size)
+        padded = np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
+        output = function(jnp.asarray(padded, jnp.result_type(float)), self._batch)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], output)
 
 
 def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Prediction]:
