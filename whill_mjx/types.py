@@ -42,12 +42,23 @@ class Geometry:
 
 
 @struct.dataclass
+class Payload:
+    """Point mass on board, at a place in the chassis frame."""
+
+    mass: jax.Array  # () kg
+    x: jax.Array  # () m
+    y: jax.Array  # () m
+    z: jax.Array  # () m
+
+
+@struct.dataclass
 class World:
     """Surroundings as the effects of place `world` leave them."""
 
     geometry: Geometry
     gravity: jax.Array  # (3,) world frame [m/s^2]
     wind: jax.Array  # (3,) world frame [m/s]
+    payload: Payload | None = None
 
 
 @struct.dataclass
@@ -55,7 +66,7 @@ class Motion:
     """What an effect may look at: the present motion of one instance in the chassis frame."""
 
     world: World
-    mass: jax.Array  # () kg
+    mass: jax.Array  # () kg, without payload
     heading: jax.Array  # () rad
     ground_axes: jax.Array  # (3, 3) rows: forward along the ground, left along the ground, ground normal; chassis frame
     rotation: jax.Array  # (3, 3) chassis to world
@@ -104,13 +115,14 @@ class Drive:
 
 @struct.dataclass
 class Odometry:
-    """What the vehicle's own odometry reports; it starts at the origin with heading 0."""
+    """What the vehicle's own odometry and gyro report; the odometry starts at the origin with heading 0."""
 
     x: jax.Array  # () m
     y: jax.Array  # () m
     yaw: jax.Array  # () rad, unwrapped
     v: jax.Array  # () m/s
     omega: jax.Array  # () rad/s
+    gyro: jax.Array | float = 0.0  # () rad/s, rate of the chassis about its own z axis
 
 
 @struct.dataclass

@@ -15,7 +15,7 @@ from whill_mjx.effects.base import (
 )
 from whill_mjx.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.model import VehicleModel, box_inertia
-from whill_mjx.types import Drive, Geometry, Motion, Odometry, VehicleParams, VehicleState, World, Wrench
+from whill_mjx.types import Drive, Geometry, Motion, Odometry, Payload, VehicleParams, VehicleState, World, Wrench
 
 STATIC_SAG = 0.005  # [m] suspension and tyre compression under the static load
 DAMPING_RATIO = 0.5  # [-] of the suspension
@@ -39,7 +39,7 @@ def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, com
     qpos, qvel = integrate(model, params, motion.world, state, force)
     healthy = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
     qpos, qvel = jnp.where(healthy, qpos, state.qpos), jnp.where(healthy, qvel, state.qvel)
-    encoder = advance_odometry(state.encoder, qvel[6:8], model)
+    encoder = dataclasses.replace(advance_odometry(state.encoder, qvel[6:8], model), gyro=qvel[5])
     memory, reading = apply_chain(params.effects, memory, "sensing", encoder, motion)
     return VehicleState(qpos, qvel, memory, encoder, reading, state.diverged | ~healthy)
 
@@ -87,17 +87,33 @@ def integrate(
 def instance_model(model: VehicleModel, params: VehicleParams, world: World):
     """The mjx.Model with this instance's mass distribution and gravity."""
     body = params.body
+    mass = body.mass
     roll, pitch, _ = box_inertia(model.spec)
-    scale = body.mass / model.spec.mass
+    scale = mass / model.spec.mass
     inertia = jnp.stack([roll * scale, pitch * scale, body.yaw_inertia])
     com = jnp.stack([body.com_x, body.com_y, body.com_z])
+    if world.payload is not None:
+        mass, inertia, com = add_payload(mass, inertia, com, world.payload)
     nominal = model.mjx
     return nominal.replace(
-        body_mass=jnp.concatenate([nominal.body_mass[:1], body.mass[None], nominal.body_mass[2:]]),
+        body_mass=jnp.concatenate([nominal.body_mass[:1], mass[None], nominal.body_mass[2:]]),
         body_inertia=jnp.concatenate([nominal.body_inertia[:1], inertia[None], nominal.body_inertia[2:]]),
         body_ipos=jnp.concatenate([nominal.body_ipos[:1], com[None], nominal.body_ipos[2:]]),
         opt=nominal.opt.replace(gravity=world.gravity),
     )
+
+
+def add_payload(
+    mass: jax.Array, inertia: jax.Array, com: jax.Array, payload: Payload
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mass (), inertia (3,) about the centre of mass and centre of mass (3,) with a point mass on board.
+
+    Parallel axes; products of inertia are left out. A payload of 0 kg changes no bit.
+    """
+    share = payload.mass / (mass + payload.mass)
+    arm = jnp.stack([payload.x, payload.y, payload.z]) - com
+    square = arm * arm
+    return mass + payload.mass, inertia + mass * share * (square.sum() - square), com + share * arm
 
 
 def nominal_world(model: VehicleModel) -> World:
@@ -219,7 +235,7 @@ def place(
     spin = wheel_speeds(jnp.stack([v, omega]), spec.track) / spec.wheel_radius
     zero = jnp.zeros_like(v)
     qvel = jnp.concatenate([velocity, jnp.stack([zero, zero, zero, omega]), spin])
-    odometry = Odometry(zero, zero, zero, v, omega)
+    odometry = Odometry(zero, zero, zero, v, omega, omega)
     memory = tuple(effect.init() for effect in params.effects)
     return VehicleState(qpos, qvel, memory, odometry, odometry, jnp.zeros((), bool))
 

@@ -19,6 +19,8 @@ class AccelerationLimit(Effect):
     """
 
     name = "acceleration_limit"
+    typical = {"linear": (0.5, 2.0), "angular": (1.0, 8.0)}
+    source = "maker's protocol specification, 3.2.8: about 1.7 m/s^2 on velocity commands"
     linear: jax.Array = parameter("m/s^2", 0.1, 5.0, float("inf"), "largest change of v")
     angular: jax.Array = parameter("rad/s^2", 0.2, 15.0, float("inf"), "largest change of omega")
 

@@ -22,6 +22,8 @@ class AirDrag(Effect):
     """
 
     name = "air_drag"
+    typical = {"c_d": (0.2, 1.2), "area": (0.6, 1.1)}
+    source = "reference paper, Table II"
     c_d: jax.Array = parameter("-", 0.0, 3.0, 0.0, "drag coefficient")
     area: jax.Array = parameter("m^2", 0.0, 2.0, 0.0, "frontal area")
 

@@ -14,7 +14,7 @@ Effects of one place act in the order of the tuple; forces add up. At its neutra
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,11 @@ PLACES = ("command", "actuation", "force", "world", "sensing")
 class Effect:
     """Base of all effects: no memory unless `init` says so."""
 
-    name: str = ""
+    name: ClassVar[str] = ""
+    typical: ClassVar[dict[str, tuple[float, float]]] = {}
+    """Usual values on a real vehicle by parameter, lowest and highest."""
+    source: ClassVar[str] = ""
+    """Where equation and usual values come from; "estimate" where no source is known."""
 
     def init(self) -> Any:
         """Memory at the start of a drive."""

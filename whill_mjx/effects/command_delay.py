@@ -29,10 +29,12 @@ class CommandDelay(Effect):
     """
 
     name = "command_delay"
+    typical = {"delay": (0.02, 0.2)}
+    source = "estimate; a command takes 2.6 ms on the serial line alone"
     delay: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time from sending a command to its effect")
 
     def init(self) -> CommandMemory:
-        return CommandMemory(jnp.zeros((SLOTS, 2)), jnp.full(SLOTS, 1e3))
+        return CommandMemory(jnp.zeros((SLOTS, 2)), 1e3 * jnp.ones(SLOTS))
 
     def command(self, memory: CommandMemory, command: jax.Array, motion: Motion) -> tuple[CommandMemory, jax.Array]:
         """Delayed command (2,)."""

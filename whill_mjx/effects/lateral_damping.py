@@ -17,6 +17,8 @@ class LateralDamping(Effect):
     """F_y = -c (N / g) v_y at each contact, c of its axle. Source: reference paper, Table II."""
 
     name = "lateral_damping"
+    typical = {"c_rear": (1.0, 35.0), "c_front": (0.1, 0.5)}
+    source = "reference paper, Table II"
     c_rear: jax.Array = parameter("1/s", 0.0, 60.0, 0.0, "lateral damping of the rear axle")
     c_front: jax.Array = parameter("1/s", 0.0, 60.0, 0.0, "lateral damping of the front axle")
 

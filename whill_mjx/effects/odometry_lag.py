@@ -20,6 +20,8 @@ class OdometryLag(Effect):
     """
 
     name = "odometry_lag"
+    typical = {"time_constant": (0.02, 0.1)}
+    source = "maker's driver documentation: the motor speed is low-pass filtered"
     time_constant: jax.Array = parameter("s", 0.0, 0.3, 0.0, "time constant of the low-pass")
 
     def init(self) -> jax.Array:

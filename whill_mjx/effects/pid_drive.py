@@ -17,6 +17,8 @@ class PidDrive(Effect):
     """F = m/2 PID(v_target - v_wheel) on each side, the mass shared equally. Source: reference paper, Table II."""
 
     name = "pid_drive"
+    typical = {"kp": (10.0, 28.0), "ki": (0.0, 0.5), "kd": (0.0, 0.75), "integral_limit": (0.5, 1.5)}
+    source = "reference paper, Table II"
     kp: jax.Array = parameter("1/s", 0.5, 60.0, 0.0, "proportional gain")
     ki: jax.Array = parameter("1/s^2", 0.0, 20.0, 0.0, "integral gain")
     kd: jax.Array = parameter("-", 0.0, 0.9, 0.0, "derivative gain")
@@ -39,6 +41,8 @@ class ForwardSlip(Effect):
     """Traction that reaches the ground: F -> eta F. Source: reference paper, Table II (forward slip multiplier)."""
 
     name = "forward_slip"
+    typical = {"eta": (0.8, 1.0)}
+    source = "reference paper, Table II"
     eta: jax.Array = parameter("-", 0.3, 1.2, 1.0, "forward slip multiplier")
 
     def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
@@ -55,6 +59,8 @@ class RollingContact(Effect):
     """
 
     name = "rolling_contact"
+    typical = {"grip": (1.0, 1.0)}
+    source = "definition of the paper's model, which has no wheel speeds"
     grip: jax.Array = parameter("-", 0.0, 1.0, 0.0, "share of the speed difference removed in one step")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:

@@ -17,6 +17,8 @@ class RollingResistance(Effect):
     """F = -mu_r N tanh(v / v0) at each contact, smooth at rest. Source: reference paper, Table II."""
 
     name = "rolling_resistance"
+    typical = {"mu_r": (0.002, 0.015)}
+    source = "reference paper, Table II; carpet adds 0.0118 over linoleum: Hoffman 2003"
     mu_r: jax.Array = parameter("-", 0.0, 0.08, 0.0, "rolling resistance coefficient")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:

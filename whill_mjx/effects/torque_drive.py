@@ -17,6 +17,8 @@ class TorqueDrive(Effect):
     """T = clip(kp e + ki integral of e, +-limit) with e = v_target / r - spin; the integral stops in saturation."""
 
     name = "torque_drive"
+    typical = {"kp": (2.0, 20.0), "ki": (2.0, 30.0), "limit": (8.0, 30.0)}
+    source = "estimate, for the chair"
     kp: jax.Array = parameter("N m s/rad", 0.1, 200.0, 0.0, "proportional gain")
     ki: jax.Array = parameter("N m/rad", 0.0, 500.0, 0.0, "integral gain")
     limit: jax.Array = parameter("N m", 1.0, 2000.0, float("inf"), "largest torque of one side")

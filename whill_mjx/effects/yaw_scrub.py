@@ -19,6 +19,8 @@ class YawScrub(Effect):
     """Torque against turning: T_z = -T_s tanh(omega / omega_0). Typical 2 to 15 N m for a powered chair (estimate)."""
 
     name = "yaw_scrub"
+    typical = {"torque": (2.0, 15.0)}
+    source = "estimate; grows with the load of the drive wheels: Lin 2015"
     torque: jax.Array = parameter("N m", 0.0, 200.0, 0.0, "scrub torque")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:

@@ -1,0 +1,42 @@
+"""Swivelling casters that have to turn round."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect, contact_wrench
+from whill_mjx.types import Motion, Wrench, parameter
+
+REST_SPEED = 0.05  # [m/s], fades the kick at rest
+TIE_BREAK = 0.02  # [rad], lets an exactly straight reversal start the swivel, counter-clockwise
+
+
+@struct.dataclass
+class CasterKick(Effect):
+    """d(delta)/dt = (|v| / L) sin(phi - delta); F = F_k sin(phi - delta) across each free wheel, against its sliding.
+
+    delta is the direction in which a caster's wheel rolls, phi that of the motion at its pivot. A caster that trails
+    gives no force; after a reversal or from a parked angle it pushes until it has swivelled, over a path of a few
+    trails L. The force fades below 0.05 m/s. A skid drive has no free wheels: nothing happens there.
+    """
+
+    name = "caster_kick"
+    typical = {"force_limit": (5.0, 30.0), "trail": (0.1, 0.3), "start_angle": (-1.57, 1.57)}
+    source = "estimate; the largest error at a start angle of 90 degrees: reverse directional stability, 2003"
+    force_limit: jax.Array = parameter("N", 0.0, 200.0, 0.0, "sideways force of one caster across its wheel, F_k")
+    trail: jax.Array = parameter("m", 0.03, 0.5, 0.15, "path over which a caster swivels, L")
+    start_angle: jax.Array = parameter("rad", -3.2, 3.2, 0.0, "swivel angle at the start of the drive")
+
+    def init(self) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(self.start_angle), (4,)) + jnp.zeros(4)  # delta at each contact
+
+    def force(self, memory: jax.Array, motion: Motion) -> tuple[jax.Array, Wrench]:
+        """Wrench of the casters, and their swivel angles (4,) one step on."""
+        cos, sin = jnp.cos(memory), jnp.sin(memory)
+        speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
+        across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK * (speed - REST_SPEED)
+        swivelled = memory + across / self.trail * motion.dt
+        push = -self.force_limit * (1 - motion.world.geometry.driven) * across / speed
+        return swivelled, contact_wrench(motion, -push * sin, push * cos)

@@ -1,0 +1,25 @@
+"""Unequal drives."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.effects.smooth import scale_drive
+from whill_mjx.types import Drive, Motion, parameter
+
+
+@struct.dataclass
+class DriveGainDifference(Effect):
+    """F_left -> (1 + d/2) F_left, F_right -> (1 - d/2) F_right."""
+
+    name = "drive_gain_difference"
+    typical = {"difference": (-0.1, 0.1)}
+    source = "estimate"
+    difference: jax.Array = parameter("-", -0.8, 0.8, 0.0, "gain of the left drive less that of the right, of the mean")
+
+    def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
+        """Drive with unequal sides."""
+        return memory, scale_drive(drive, 1 + self.difference / 2 * jnp.array([1.0, -1.0]))

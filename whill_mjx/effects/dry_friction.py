@@ -1,0 +1,36 @@
+"""Coulomb and Stribeck friction of the driven wheels."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect, contact_wrench, driven_mean, side_forces
+from whill_mjx.effects.smooth import soft_sign
+from whill_mjx.types import Motion, Wrench, parameter
+
+REST_SPEED = 0.02  # [m/s], smooths the change of sign at rest
+
+
+@struct.dataclass
+class DryFriction(Effect):
+    """F = -(F_c + F_e exp(-(v / v_s)^2)) tanh(v / v_0) at the driven contacts of each side, v_0 = 0.02 m/s.
+
+    A force on the ground contact, not a torque on the wheel: where the wheels roll without slip it is the same, and
+    the paper's drive has no wheel speeds of its own. The smooth sign lets a pushed vehicle creep instead of stick.
+    """
+
+    name = "dry_friction"
+    typical = {"coulomb": (2.5, 10.0), "excess": (0.5, 10.0), "stribeck_speed": (0.05, 0.1)}
+    source = "estimate: 5 to 20 N for the vehicle, breakaway 1.2 to 2 times as much"
+    coulomb: jax.Array = parameter("N", 0.0, 200.0, 0.0, "friction of each side, F_c")
+    excess: jax.Array = parameter("N", 0.0, 200.0, 0.0, "friction near rest above F_c, of each side, F_e")
+    stribeck_speed: jax.Array = parameter("m/s", 0.02, 0.5, 0.08, "speed at which the excess has faded, v_s")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench of the friction at the driven contacts."""
+        speed = driven_mean(motion, motion.contact_vx)
+        size = self.coulomb + self.excess * jnp.exp(-jnp.square(speed / self.stribeck_speed))
+        friction = -size * soft_sign(speed, REST_SPEED)
+        return memory, contact_wrench(motion, side_forces(motion, friction), jnp.zeros(4))

@@ -1,0 +1,26 @@
+"""Errors of the gyro."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, Odometry, parameter
+
+
+@struct.dataclass
+class GyroBias(Effect):
+    """omega_gyro -> s omega_gyro + b; the wheel odometry is not touched."""
+
+    name = "gyro_bias"
+    typical = {"bias": (-0.0175, 0.0175), "scale": (0.99, 1.01)}
+    source = "estimate: 0.1 to 1 degree per second"
+    bias: jax.Array = parameter("rad/s", -0.2, 0.2, 0.0, "reading at standstill, b")
+    scale: jax.Array = parameter("-", 0.8, 1.2, 1.0, "scale, s")
+
+    def sensing(self, memory: tuple[()], reading: Odometry, motion: Motion) -> tuple[tuple[()], Odometry]:
+        """Reading with a wrong gyro."""
+        return memory, replace(reading, gyro=self.scale * reading.gyro + self.bias)

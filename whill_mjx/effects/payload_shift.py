@@ -1,0 +1,32 @@
+"""Extra mass on board."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Payload, World, parameter
+
+
+@struct.dataclass
+class PayloadShift(Effect):
+    """A point mass m_p fixed at (x, y, z): more weight and inertia, another centre of mass.
+
+    I + mu (d^2 1 - d d^T) on the diagonal, with mu = m m_p / (m + m_p) and d the arm between both centres (parallel
+    axes; products of inertia are left out). Springs and the drive's gains stay those of the vehicle without it.
+    """
+
+    name = "payload_shift"
+    typical = {"mass": (5.0, 40.0), "x": (-0.2, 0.2), "y": (-0.2, 0.2), "z": (0.1, 0.5)}
+    source = "estimate: bags of 5 to 40 kg; riders of 40 to 120 kg belong into the vehicle's mass"
+    mass: jax.Array = parameter("kg", 0.0, 150.0, 0.0, "extra mass, m_p")
+    x: jax.Array = parameter("m", -0.6, 0.6, 0.0, "its place ahead of the chassis origin")
+    y: jax.Array = parameter("m", -0.4, 0.4, 0.0, "its place to the left of the chassis origin")
+    z: jax.Array = parameter("m", -0.2, 1.0, 0.0, "its place above the chassis origin")
+
+    def world(self, memory: tuple[()], world: World) -> tuple[tuple[()], World]:
+        """World with a payload on the vehicle."""
+        return memory, replace(world, payload=Payload(self.mass, self.x, self.y, self.z))

@@ -1,0 +1,27 @@
+"""Drag that grows with the square of speed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, Wrench, parameter
+
+
+@struct.dataclass
+class QuadraticDrag(Effect):
+    """F = -c |v| v along the chassis x axis; `air_drag` with its two factors in one, and no wind."""
+
+    name = "quadratic_drag"
+    typical = {"coefficient": (0.2, 2.0)}
+    source = "rho C_d A / 2 with C_d 0.5 to 1.2 and 0.6 to 1.1 m^2; more on soft ground"
+    coefficient: jax.Array = parameter("N s^2/m^2", 0.0, 100.0, 0.0, "drag coefficient, c")
+
+    def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
+        """Wrench along the chassis x axis."""
+        speed = motion.velocity[0]
+        return memory, replace(Wrench.zero(), fx=-self.coefficient * jnp.abs(speed) * speed)

@@ -1,0 +1,53 @@
+"""Latency of the reported odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.types import Motion, Odometry, parameter
+
+SLOTS = 16  # readings kept; SLOTS * GAP is the longest delay
+GAP = 0.02  # [s] between them
+
+
+@struct.dataclass
+class PastReadings:
+    """Readings of the past, newest first."""
+
+    value: jax.Array  # (SLOTS, 5) x, y, yaw, v, omega
+    age: jax.Array  # (SLOTS,) s
+
+
+@struct.dataclass
+class SensorDelay(Effect):
+    """y(t) = x(t - tau) of pose and speeds of the odometry.
+
+    A reading is kept every 20 ms and those between are interpolated. Before the first one the vehicle is taken to have
+    stood at the odometry's origin.
+    """
+
+    name = "sensor_delay"
+    typical = {"delay": (0.005, 0.1)}
+    source = "estimate"
+    delay: jax.Array = parameter("s", 0.0, 0.3, 0.0, "age of a reading when it is reported")
+
+    def init(self) -> PastReadings:
+        return PastReadings(jnp.zeros((SLOTS, 5)), GAP * jnp.arange(1.0, SLOTS + 1.0))
+
+    def sensing(self, memory: PastReadings, reading: Odometry, motion: Motion) -> tuple[PastReadings, Odometry]:
+        """Late reading."""
+        now = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
+        value = jnp.concatenate([now[None], memory.value])
+        age = jnp.concatenate([jnp.zeros(1), memory.age])
+        # How much of each stretch between two readings lies within the delay.
+        share = jnp.clip((self.delay - age[:-1]) / (age[1:] - age[:-1]), 0.0, 1.0)
+        late = now + (share[:, None] * (value[1:] - value[:-1])).sum(0)
+        keep = memory.age[0] > GAP - motion.dt / 2
+        value, age = jnp.where(keep, value[:-1], memory.value), jnp.where(keep, age[:-1], memory.age)
+        x, y, yaw, v, omega = late
+        return PastReadings(value, age + motion.dt), replace(reading, x=x, y=y, yaw=yaw, v=v, omega=omega)

@@ -1,0 +1,29 @@
+"""Smooth forms of clipping and of the sign, shared by the effects; exact at an infinite limit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.types import Drive
+
+
+def soft_limit(value: jax.Array, limit: jax.Array) -> jax.Array:
+    """value / (1 + (value / limit)^4)^(1/4): `value` below its limit, the limit far above, 0.84 of it where they meet.
+
+    Sharper than limit * tanh(value / limit), and `value` to the last bit at limit = inf.
+    """
+    square = jnp.square(value / limit)
+    return value / jnp.sqrt(jnp.sqrt(1 + jnp.square(square)))
+
+
+def soft_sign(value: jax.Array, width: float) -> jax.Array:
+    """tanh(value / width): the sign of `value`, smooth over `width` around 0."""
+    return jnp.tanh(value / width)
+
+
+def scale_drive(drive: Drive, factor: jax.Array) -> Drive:
+    """Force and torque of the drive times `factor`, () or (2,): either drive uses one of the two."""
+    return replace(drive, force=drive.force * factor, torque=drive.torque * factor)

@@ -1,0 +1,30 @@
+"""Largest force of the drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+from flax import struct
+
+from whill_mjx.effects.base import Effect
+from whill_mjx.effects.smooth import soft_limit
+from whill_mjx.types import Drive, Motion, parameter
+
+
+@struct.dataclass
+class TorqueSaturation(Effect):
+    """F -> F / (1 + (F / F_max)^4)^(1/4) on each side; a motor torque is limited at F_max r.
+
+    The knee is that of `soft_limit`: 16 % below the corner of a hard limit.
+    """
+
+    name = "torque_saturation"
+    typical = {"limit": (60.0, 200.0)}
+    source = "estimate, per wheel"
+    limit: jax.Array = parameter("N", 5.0, 3000.0, float("inf"), "largest traction of one side")
+
+    def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
+        """Drive with limited force (2,) and torque (2,)."""
+        force = soft_limit(drive.force, self.limit)
+        return memory, replace(drive, force=force, torque=soft_limit(drive.torque, self.limit * motion.wheel_radius))

@@ -1,0 +1,36 @@
+"""Grip of the driven wheels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+from flax import struct
+
+from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.effects.smooth import soft_limit
+from whill_mjx.types import Drive, Motion, parameter
+
+TINY = 1e-3  # [N], keeps the limit defined where a wheel has lifted
+
+
+@struct.dataclass
+class TractionLimit(Effect):
+    """F -> F / (1 + (F / mu N)^4)^(1/4) on each side, N the load of its driven wheels; a torque is limited at mu N r.
+
+    As with traction control: the drive never asks for more than the ground gives along the wheels, so wheels and
+    odometry stay with the body. Wheels that break away, and the share of the grip that cornering takes, are
+    `slip_traction` in the physical base model. The knee is that of `soft_limit`.
+    """
+
+    name = "traction_limit"
+    typical = {"mu": (0.2, 0.9)}
+    source = "estimate: 0.6 to 0.9 dry, 0.2 to 0.4 wet"
+    mu: jax.Array = parameter("-", 0.02, 2.0, float("inf"), "traction coefficient of the driven wheels")
+
+    def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
+        """Drive with limited force (2,) and torque (2,)."""
+        wheels = motion.world.geometry.driven.sum() / 2  # of one side
+        grip = self.mu * (wheels * driven_mean(motion, motion.normal_force) + TINY)
+        torque = soft_limit(drive.torque, grip * motion.wheel_radius)
+        return memory, replace(drive, force=soft_limit(drive.force, grip), torque=torque)
