@@ -86,6 +86,15 @@ def test_images_that_are_not_square_keep_their_shape(encoder):
     assert tokens.shape == (3, 2, image.token_size(config, shape))
 
 
+def test_the_patch_encoder_sees_centred_pixels():
+    config = tiny_config()
+    params = init(config)["enc"]
+    frames = jax.random.randint(jax.random.PRNGKey(3), (2, *SHAPE), 0, 256).astype(jnp.uint8)
+    x = nets.layer(params["patch"], image.to_patches(frames / 255 - 0.5, config.patch))
+    expected = nets.layer(params["mix"], x.reshape(2, -1))
+    np.testing.assert_allclose(image.encode(config, params, frames), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_reconstruction_loss_is_the_squared_error_of_the_decoded_image():
     config = tiny_config(encoder="conv", depth=4)
     params = init(config)["dec"]
