@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +12,12 @@ import numpy as np
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.rollout import Plant, make_batch, simulate, vehicle_plant
 from sysid.scenarios import SCENARIOS, Scenario, command_sequence
+from whill_mjx.dataset import SensorNoise, write_csv, write_fields, write_text, write_trial
 from whill_mjx.specs import VehicleSpec
 
+__all__ = ["SensorNoise", "write_csv", "write_dataset", "write_text"]
+
 MEASUREMENT_DT = 0.05  # s
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations of white noise on every sample."""
-
-    position: float = 0.003
-    """Outside pose [m]."""
-    yaw: float = 0.003
-    """Outside pose [rad]."""
-    odometry_position: float = 0.001
-    odometry_yaw: float = 0.001
-    v: float = 0.005
-    omega: float = 0.01
 
 
 def write_dataset(
@@ -67,38 +54,10 @@ def write_dataset(
     for i, trial in enumerate(trials):
         assert trial.ground_truth is not None
         count = len(trial.ground_truth.t)
-        pose = np.array(simulated.pose[i, :count], float)
-        pose += random.normal(size=pose.shape) * [noise.position, noise.position, noise.yaw]
-        pose[:, 2] = np.pi - np.mod(np.pi - pose[:, 2], 2 * np.pi)
-        odometry = np.array(simulated.odometry[i, :count], float)
-        odometry += random.normal(size=odometry.shape) * [noise.odometry_position, noise.odometry_position,
-                                                          noise.odometry_yaw, noise.v, noise.omega]
-        path = folder / "trials" / trial.name
-        t = trial.ground_truth.t
-        write_csv(path / "command.csv", "t,v,omega", _columns(trial.command))
-        write_csv(path / "ground_truth.csv", "t,x,y,yaw", np.column_stack([t, pose]))
-        write_csv(path / "odometry.csv", "t,x,y,yaw,v,omega", np.column_stack([t, odometry]))
-    names = [trial.name for trial in trials if trial.manoeuvre in held_out]
-    lines = ["schema = 1", f'vehicle = "{spec.name}"', f'drive = "{spec.drive}"', f'driven_axle = "{spec.driven_axle}"',
-             *(f"{key} = {getattr(spec, key)}" for key in ("wheel_radius", "track", "wheelbase", "mass")),
-             f"command_limits = [{max(abs(spec.v_min), spec.v_max)}, {spec.omega_max}]",
-             f"held_out = [{', '.join(repr(name).replace(chr(39), chr(34)) for name in names)}]"]
-    write_text(folder / "dataset.toml", "\n".join(lines) + "\n")
+        write_trial(folder / "trials" / trial.name, trial.ground_truth.t, _columns(trial.command),
+                    simulated.pose[i, :count], simulated.odometry[i, :count], noise, random)
+    write_fields(folder, spec, [trial.name for trial in trials if trial.manoeuvre in held_out])
     return folder
-
-
-def write_csv(path: Path, header: str, table: np.ndarray) -> None:
-    """Write a table (T, C) with six decimals, whole or not at all."""
-    rows = [",".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in row) for row in table]
-    write_text(path, "\n".join([header, *rows]) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 def _columns(command: Command) -> np.ndarray:

@@ -1,0 +1,143 @@
+"""Manoeuvres, and the command that drives them into a dataset."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from whill_mjx.drive import DriveOptions, find_vehicle, main, parse_effect, with_effects
+from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
+from whill_mjx.vehicle_file import load_vehicle
+
+SHORT = Scenario(v=0.5, omega=0.6, length=2.0)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Two replicates of a circle with a late, slow vehicle, without noise."""
+    out = tmp_path_factory.mktemp("drive") / "late"
+    effects = ("command_delay:delay=0.2", "odometry_scale:linear=1.1")
+    return main(DriveOptions(out, ("circle",), effects=effects, replicates=2, held_out=("circle",), scenario=SHORT))
+
+
+def table(path):
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", MANOEUVRES)
+def test_every_manoeuvre_starts_and_ends_at_rest_within_its_limits(name):
+    t, v, omega = command_table(name, SHORT).T
+    np.testing.assert_allclose(np.diff(t), 0.1)
+    rest = t < 0.95
+    assert not v[rest].any() and not omega[rest].any() and v[-1] == omega[-1] == 0.0
+    assert np.abs(v).max() <= 0.5 and np.abs(omega).max() <= 0.6
+    assert (name == "standstill") == (not v.any() and not omega.any())
+
+
+@pytest.mark.quick
+def test_random_steps_are_the_same_every_time():
+    np.testing.assert_array_equal(command_table("random_steps", SHORT), command_table("random_steps", SHORT))
+
+
+def test_a_drive_writes_the_streams_of_every_trial(dataset):
+    assert sorted(path.name for path in (dataset / "trials").iterdir()) == ["circle_1", "circle_2"]
+    for trial in ("circle_1", "circle_2"):
+        folder = dataset / "trials" / trial
+        np.testing.assert_allclose(table(folder / "command.csv"), command_table("circle", SHORT), atol=1e-6)
+        odometry, truth = table(folder / "odometry.csv"), table(folder / "ground_truth.csv")
+        np.testing.assert_allclose(odometry[:, 0], np.arange(len(odometry)) * 0.05, atol=1e-6)
+        np.testing.assert_allclose(odometry[0], 0.0, atol=1e-3)
+        assert np.abs(truth[:, 3]).max() <= np.pi + 1e-6
+    fields = tomllib.loads((dataset / "dataset.toml").read_text())
+    assert fields["held_out"] == ["circle_1", "circle_2"] and fields["track"] == 0.496
+    assert not list(dataset.parent.glob(".*"))  # nothing half-written
+
+
+def test_the_effects_of_the_command_line_show_in_the_log(dataset):
+    odometry = table(dataset / "trials/circle_1/odometry.csv")
+    truth = table(dataset / "trials/circle_1/ground_truth.csv")
+    moving = truth[np.hypot(*(truth[:, 1:3] - truth[0, 1:3]).T) > 2e-3, 0][0]
+    assert 1.2 <= moving <= 1.4  # commanded at 1.0
+    driven = np.hypot(*np.diff(truth[:, 1:3], axis=0).T).sum()
+    reported = np.hypot(*np.diff(odometry[:, 1:3], axis=0).T).sum()
+    assert 1.05 < reported / driven < 1.15
+
+
+def test_replicates_start_elsewhere_and_drive_the_same(dataset):
+    first, second = (table(dataset / "trials" / name / "ground_truth.csv") for name in ("circle_1", "circle_2"))
+    assert np.hypot(*(first[0, 1:3] - second[0, 1:3])) > 0.05
+    turned = [np.unwrap(one[:, 3])[-1] - one[0, 3] for one in (first, second)]
+    assert turned[0] == pytest.approx(turned[1], abs=5e-3)
+
+
+def test_the_vehicle_that_was_driven_is_kept_and_can_be_driven_again(dataset):
+    _, params, provenance = load_vehicle(dataset / "vehicle.toml")
+    values = {effect.name: effect for effect in params.effects}
+    assert float(values["command_delay"].delay) == pytest.approx(0.2)
+    assert provenance["effects"] == "command_delay:delay=0.2 odometry_scale:linear=1.1"
+    _, again = find_vehicle(str(dataset / "vehicle.toml"))
+    assert [effect.name for effect in again.effects] == [effect.name for effect in params.effects]
+
+
+def test_the_dataset_is_read_by_the_fit(dataset):
+    from sysid.log import load_log
+
+    log = load_log(dataset)
+    assert [trial.name for trial in log.held_out] == ["circle_1", "circle_2"]
+    assert log.spec.name == "whill_cr"
+
+
+@pytest.mark.quick
+def test_an_effect_changes_in_place_or_is_appended():
+    _, params = find_vehicle("whill_cr_physical")
+    changed = with_effects(params, ["yaw_scrub:torque=6", "slope:along_x=0.02", "traction_limit"])
+    names = [effect.name for effect in changed.effects]
+    assert names == [*(effect.name for effect in params.effects), "slope", "traction_limit"]
+    by_name = {effect.name: effect for effect in changed.effects}
+    assert float(by_name["yaw_scrub"].torque) == 6.0
+    assert float(by_name["slope"].along_y) == 0.0
+    assert float(by_name["traction_limit"].mu) == pytest.approx(0.9)  # no value: the upper usual one
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gravity", "unknown effect 'gravity'.*known: "),
+        ("yaw_scrub:force=3", "no parameter 'force'.*torque"),
+        ("yaw_scrub:torque", "'torque' is not PARAMETER=NUMBER.*no =.*Write it like"),
+        ("yaw_scrub:torque=big", "'torque=big' is not PARAMETER=NUMBER.*Write it like"),
+        ("command_delay:delay=200", "delay is 200 s; it must lie within 0 to 0.5.*Check the unit"),
+        ("command_delay:delay=nan", "delay is nan s; it must lie within"),
+    ],
+)
+def test_a_bad_effect_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_effect(text)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"manoeuvre": ("spiral",)}, "unknown manoeuvre 'spiral'.*figure_eight"),
+        ({"manoeuvre": ("turn", "turn")}, "given twice.*--replicates"),
+        ({"replicates": 0}, "--replicates 0: must be at least 1"),
+        ({"held_out": ("turn",)}, "--held-out turn: not among the manoeuvres driven"),
+        ({"vehicle": "tricycle"}, "unknown vehicle 'tricycle'"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_is_written(tmp_path, change, message):
+    out = tmp_path / "new"
+    with pytest.raises(ValueError, match=message):
+        main(DriveOptions(**{"out": out, **change}))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.quick
+def test_a_drive_never_replaces_another(tmp_path):
+    with pytest.raises(ValueError, match="exists already; a drive never replaces another"):
+        main(DriveOptions(tmp_path))

@@ -1,0 +1,215 @@
+"""Drives manoeuvres with a simulated vehicle and writes them as a driving-log dataset.
+
+    python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical \
+        --effects command_delay:delay=0.2 yaw_scrub:torque=6 --replicates 3 --noise --out DATASET
+
+An effect is NAME, or NAME:PARAMETER=VALUE,...: a vehicle that has the effect gets the values given; any other gets the
+effect added, with those values and the rest neutral, or, where no value is given, the upper usual value of each.
+docs/effects.md lists them. DATASET/vehicle.toml is the vehicle that was driven: the planted truth.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.config import VehicleConfig
+from whill_mjx.dataset import SensorNoise, write_fields, write_trial
+from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.kinematics import reference_pose
+from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
+from whill_mjx.model import build_model
+from whill_mjx.presets import preset
+from whill_mjx.specs import VehicleSpec
+from whill_mjx.types import VehicleParams, VehicleState, parameters_of
+from whill_mjx.vehicle import place, substep
+from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+
+MEASUREMENT_DT = 0.05  # s
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """Options of the command."""
+
+    out: Path
+    """Dataset folder to write; it must not exist."""
+    manoeuvre: tuple[str, ...] = ("figure_eight",)
+    """Manoeuvres to drive, or `all`."""
+    vehicle: str = "whill_cr_physical"
+    """Built-in vehicle, or a vehicle file."""
+    effects: tuple[str, ...] = ()
+    """Effects to add to the vehicle, or to change: NAME or NAME:PARAMETER=VALUE,..."""
+    replicates: int = 1
+    """Drives of each manoeuvre: the same commands from another pose, with other noise."""
+    noise: bool = False
+    """Add white noise to the measurements."""
+    held_out: tuple[str, ...] = ()
+    """Manoeuvres that the dataset declares as never to be fitted."""
+    seed: int = 0
+    """Of start poses and noise."""
+    scenario: Scenario = field(default_factory=Scenario)
+    """How hard the manoeuvres are driven."""
+
+
+def main(options: DriveOptions) -> Path:
+    """Drive and write the dataset; returns its folder.
+
+    Raises:
+        ValueError, FileNotFoundError: naming the option, its value, the rule and the remedy.
+    """
+    names = tuple(MANOEUVRES) if options.manoeuvre == ("all",) else options.manoeuvre
+    commands = [command_table(name, options.scenario) for name in names]
+    _check(options, names)
+    spec, params = find_vehicle(options.vehicle)
+    params = with_effects(params, options.effects)
+    random = np.random.default_rng(options.seed)
+    trials = [
+        (f"{name}_{replicate}", command, (*random.uniform(-1.0, 1.0, 2), random.uniform(-np.pi, np.pi)))
+        for name, command in zip(names, commands, strict=True)
+        for replicate in range(1, options.replicates + 1)
+    ]
+    poses, odometries, diverged = record(spec, params, [trial[1] for trial in trials], [trial[2] for trial in trials])
+    if diverged.any():
+        lost = ", ".join(name for (name, _, _), bad in zip(trials, diverged, strict=True) if bad)
+        raise ValueError(
+            f"vehicle {options.vehicle!r} with effects {' '.join(options.effects) or 'none'}: the motion became "
+            f"non-finite in {lost}. Bring the effects' values closer to those in docs/effects.md."
+        )
+    partial = options.out.with_name(f".{options.out.name}.partial-{os.getpid()}")
+    try:
+        for (name, command, _), pose, odometry in zip(trials, poses, odometries, strict=True):
+            count = math.floor(command[-1, 0] / MEASUREMENT_DT + 1e-6) + 1
+            t = np.arange(count) * MEASUREMENT_DT
+            noise = SensorNoise() if options.noise else None
+            write_trial(partial / "trials" / name, t, command, pose[:count], odometry[:count], noise, random)
+        write_fields(partial, spec, [name for name, _, _ in trials if name.rsplit("_", 1)[0] in options.held_out])
+        truth = {"vehicle": options.vehicle, "effects": " ".join(options.effects), "seed": options.seed}
+        save_vehicle(partial / "vehicle.toml", spec, params, provenance=truth)
+        os.replace(partial, options.out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return options.out
+
+
+def find_vehicle(name: str) -> tuple[VehicleSpec, VehicleParams]:
+    """Spec and parameters of a vehicle file (by its ending) or of a built-in vehicle."""
+    if name.endswith(".toml"):
+        spec, params, _ = load_vehicle(name)
+        return spec, params
+    return preset(name)
+
+
+def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:
+    """The vehicle with effects given as NAME or NAME:PARAMETER=VALUE,...
+
+    An effect that the vehicle has keeps its place and the values that are not given; others are appended, so that
+    those of place `actuation` act behind the drive.
+    """
+    effects = list(params.effects)
+    for text in texts:
+        name, values = parse_effect(text)
+        new = make_effect(name, **(values or {key: high for key, (_, high) in EFFECTS[name].typical.items()}))
+        index = next((i for i, effect in enumerate(effects) if effect.name == name), None)
+        if index is None:
+            effects.append(new)
+        else:
+            effects[index] = replace(effects[index], **{key: getattr(new, key) for key in values})
+    return replace(params, effects=tuple(effects))
+
+
+def parse_effect(text: str) -> tuple[str, dict[str, float]]:
+    """Name and values of "NAME:PARAMETER=VALUE,..."; ValueError names what is wrong and what is known."""
+    name, _, rest = text.partition(":")
+    values: dict[str, float] = {}
+    for pair in filter(None, rest.split(",")):
+        key, equals, number = pair.partition("=")
+        try:
+            values[key] = float(number)
+        except ValueError:
+            raise ValueError(
+                f"effect {text!r}: {pair!r} is not PARAMETER=NUMBER{'' if equals else ' (no =)'}. "
+                "Write it like command_delay:delay=0.2."
+            ) from None
+    make_effect(name, **values)  # unknown names
+    for key, value in values.items():
+        about = parameters_of(EFFECTS[name])[key]
+        if not (about.low <= value <= about.high or value == about.neutral):
+            raise ValueError(
+                f"effect {text!r}: {key} is {value:g} {about.unit}; it must lie within {about.low:g} to "
+                f"{about.high:g}, or be {about.neutral:g} for no effect. Check the unit."
+            )
+    return name, values
+
+
+def record(
+    spec: VehicleSpec, params: VehicleParams, commands: Sequence[np.ndarray], starts: Sequence[Sequence[float]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drive B command tables (T, 3) from B starts (x [m], y [m], yaw [rad]) at rest, all in one compiled call.
+
+    Returns:
+        Every MEASUREMENT_DT from t = 0 on, to the end of the longest: poses (B, M, 3) of the reference point, odometry
+        (B, M, 5); and (B,) bool where the motion became non-finite.
+    """
+    config = VehicleConfig()
+    model = build_model(spec, config)
+    stride = round(MEASUREMENT_DT / config.physics_dt)
+    duration = max(float(command[-1, 0]) for command in commands)
+    t = (np.arange(math.ceil(duration / MEASUREMENT_DT) * stride) + 0.5) * config.physics_dt
+    held = [command[np.searchsorted(command[:, 0], t, side="right") - 1, 1:] for command in commands]
+    table = np.stack(held).reshape(len(held), -1, stride, 2)  # (B, M - 1, stride, 2)
+
+    def physics(state: VehicleState, command: jax.Array) -> tuple[VehicleState, None]:
+        return substep(model, params, state, command), None
+
+    def observe(state: VehicleState) -> jax.Array:
+        odometry = state.odometry
+        reported = (odometry.x, odometry.y, odometry.yaw, odometry.v, odometry.omega)
+        return jnp.stack([*reference_pose(model, state.qpos), *reported])
+
+    def one(command: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def measure(state: VehicleState, commands: jax.Array) -> tuple[VehicleState, jax.Array]:
+            state, _ = jax.lax.scan(physics, state, commands)
+            return state, observe(state)
+
+        first = place(model, params, *start)
+        last, seen = jax.lax.scan(measure, first, command)
+        return jnp.concatenate([observe(first)[None], seen]), last.diverged
+
+    dtype = jnp.result_type(float)
+    seen, diverged = jax.jit(jax.vmap(one))(jnp.asarray(table, dtype), jnp.asarray(np.asarray(starts), dtype))
+    seen = np.asarray(seen)
+    return seen[..., :3], seen[..., 3:], np.asarray(diverged)
+
+
+def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
+    if len(set(names)) != len(names):
+        raise ValueError(f"--manoeuvre {' '.join(names)}: one is given twice. Repeat a drive with --replicates.")
+    if options.replicates < 1:
+        raise ValueError(f"--replicates {options.replicates}: must be at least 1. Leave it out for a single drive.")
+    absent = sorted(set(options.held_out) - set(names))
+    if absent:
+        raise ValueError(f"--held-out {absent[0]}: not among the manoeuvres driven ({', '.join(names)}). Add it there.")
+    if options.out.exists():
+        raise ValueError(f"--out {options.out}: exists already; a drive never replaces another. Choose another folder.")
+
+
+if __name__ == "__main__":
+    import tyro
+
+    chosen = tyro.cli(DriveOptions)
+    try:
+        folder = main(chosen)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"whill_mjx.drive: {error}")
+    count = len(list((folder / "trials").iterdir()))
+    print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
