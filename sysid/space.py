@@ -74,12 +74,6 @@ class Space:
                        initial=self.initial[index], log=self.log[index])
 
 
-# Bounds that differ from the described ones where the search needs it.
-# Below 0.03 m/s the sideways slip force, which is advanced explicitly, oscillates at a physics step of 5 ms with a grip
-# near 1; above 0.5 m/s lies soft ground.
-BOUNDS = {"slip_traction.slip_speed": (0.03, 2.0)}
-
-
 # Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
 FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
            "torque_drive.limit": (1 / 10, 30.0)}
@@ -90,13 +84,13 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
     a centre of mass between the axles."""
     scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
               for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
-    length, width = 0.45 * spec.wheelbase, 0.2 * spec.track
+    middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
     return {**scaled, "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
-            "body.com_x": (-length, length), "body.com_y": (-width, width)}
+            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
-    """Space of a vehicle's parameters, with their described bounds or those of `BOUNDS` and `vehicle_bounds`.
+    """Space of a vehicle's parameters, with their described bounds or those of `vehicle_bounds`.
 
     Args:
         params: `VehicleParams`; their values are where the search starts.
@@ -112,7 +106,7 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
     if unknown:
         raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")
     initial = np.asarray(get_values(params, names), float)
-    bounds = {**BOUNDS, **vehicle_bounds(names, initial, spec)}
+    bounds = vehicle_bounds(names, initial, spec)
     low = np.array([bounds.get(name, (about[name].low, 0))[0] for name in names], float)
     high = np.array([bounds.get(name, (0, about[name].high))[1] for name in names], float)
     low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range

@@ -76,7 +76,8 @@ def test_yaw_scrub_opposes_turning(omega):
 def test_slip_force_never_exceeds_the_friction_circle():
     motion = motion_at(v=0.5, omega=0.5, sideways=0.8)
     motion = motion.replace(spin=motion.spin * 4, drive_torque=jnp.array([500.0, -500.0]))
-    _, wrench = SlipTraction(mu=jnp.array(0.6), slip_speed=jnp.array(0.05), mu_free=jnp.array(0.0)).force((), motion)
+    values = {"mu": 0.6, "slip_speed": 0.02, "side_slip_speed": 0.05, "mu_free": 0.0}
+    _, wrench = SlipTraction(**{name: jnp.array(value) for name, value in values.items()}).force((), motion)
     driven_load = float(motion.normal_force[:2].sum())
     assert np.hypot(float(wrench.fx), float(wrench.fy)) <= 0.6 * driven_load * 1.001
 
