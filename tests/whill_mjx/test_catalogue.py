@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -126,6 +127,17 @@ def test_every_effect_vanishes_to_the_last_bit_at_its_neutral_value(name):
             if after.payload is not None:
                 body = jnp.array(60.3), jnp.array([5.1, 4.2, 3.3]), jnp.array([0.1, -0.02, 0.3])
                 jax.tree.map(np.testing.assert_array_equal, add_payload(*body, after.payload), body)
+
+
+@quick
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_every_effect_is_on_the_page_of_effects_with_its_parameters(name):
+    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text().splitlines()
+    rows = [line for line in page if line.startswith(f"| `{name}` |")]
+    remedy = "write the page again: python -m benchmarks.effects page"
+    assert len(rows) == 1, remedy
+    for field, about in parameters_of(EFFECTS[name]).items():
+        assert f"`{field}` [{about.unit}]" in rows[0], remedy
 
 
 @quick
