@@ -70,6 +70,7 @@ def drives_from_above(drives: Drives, goal_radius: float, out: Path, columns: in
 def camera_video(drives: Drives, out: Path, rate_hz: float, scale: int = 4) -> Path:
     """H.264 video of the recorded cameras side by side, each until its episode ends."""
     import imageio.v2 as imageio
+    import imageio_ffmpeg  # noqa: F401  without it imageio would take another writer for the file
 
     videos = drives.frames.shape[0]
     length = int(drives.length[:videos].max()) + 1
