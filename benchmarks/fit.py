@@ -147,7 +147,7 @@ def plant(settings: Benchmark) -> None:
         figures[f"seconds_plant_{preset}"] = figure([fit.seconds], "s")
         if preset == "physical":
             figures["plant_replicate_ratio"] = figures[f"plant_replicate_ratio_{preset}"]
-        record("fit", "The fit reaches the noise floor of its data", figures)
+        record("fit", "How near a fit comes to the noise floor of its data", figures)
         show(figures)
         show_parameters(fit)
 
@@ -173,7 +173,7 @@ def planted(settings: Benchmark) -> None:
     figures = {"noise_floor_ratio": figure([one["fitted"] / one["noise_floor"]], "-"),
                "planted_identifiable": figure([float(len(inside))], "count"),
                "planted_inside_interval": figure([float(np.mean(inside))], "share")}
-    record("fit", "The fit reaches the noise floor of its data", figures)
+    record("fit", "How near a fit comes to the noise floor of its data", figures)
     show(figures)
     show_parameters(fit)
 
@@ -194,7 +194,7 @@ def speed(settings: Benchmark) -> None:
         else:
             tpe.fit(objective, fit.space, evaluations=500)
         figures[name] = figure([time.perf_counter() - began], "s")
-    record("fit", "The fit reaches the noise floor of its data", figures)
+    record("fit", "How near a fit comes to the noise floor of its data", figures)
     show(figures)
 
 
