@@ -125,11 +125,16 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
-    from sysid.fit import fit_dataset
+    from sysid.fit import FitConfig, expected_steps, fit_dataset, progress_bar
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
-    fit_dataset(log, options.out / "fit", quick=True)
+    config = FitConfig(quick=True)
+    progress, close = progress_bar(expected_steps(config))
+    try:
+        fit_dataset(log, options.out / "fit", config=config, progress=progress)
+    finally:
+        close()
     text = (options.out / "fit" / "vehicle.toml").read_text()
     write_text(target, text)
     return target
