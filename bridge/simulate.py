@@ -9,6 +9,7 @@ tolerates: so it stops, forgets, and no frame of an episode can reach the next o
 
 import argparse
 import array
+import ast
 import importlib
 import math
 import sys
@@ -74,14 +75,17 @@ class ChairSimulator:
     one control period.
     """
 
-    def __init__(self, task: str = "corridor", vehicle: str | None = None) -> None:
-        """Compile the environment of a task, with a vehicle file, a preset or (None) the built-in chair."""
+    def __init__(self, task: str = "corridor", vehicle: str | None = None, **changes: Any) -> None:
+        """Compile the environment of a task with some of its fields changed, and of a vehicle file or preset.
+
+        Without a vehicle: the built-in chair.
+        """
         import jax
 
         from whill_mjx import env as environment
         from whill_mjx.task import make_task
 
-        env, params = environment.make_env(make_task(task, action_repeat=1), vehicle)
+        env, params = environment.make_env(make_task(task, **changes, action_repeat=1), vehicle)
         self.period = float(env.model.config.control_dt)
         self._low = np.array([env.task.v_min, -env.task.omega_max])
         self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
@@ -300,13 +304,26 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     except (ImportError, AttributeError, ValueError) as error:
         raise SystemExit(f"bridge.simulate: --simulator {options.simulator}: {error}. It must be MODULE:FACTORY, "
                          "called with task and vehicle. Correct it or leave it out.") from error
-    return factory(task=options.task, vehicle=options.vehicle)
+    return factory(task=options.task, vehicle=options.vehicle, **dict(options.set))
+
+
+def field(text: str) -> tuple[str, Any]:
+    """Name and value of a NAME=VALUE option; values are Python literals or plain words."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, such as gates=1")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = argparse.ArgumentParser(prog="bridge.simulate", description="Serve the simulator on the vehicle's topics.")
     parser.add_argument("--task", default="corridor")
+    parser.add_argument("--set", type=field, action="append", default=[], metavar="NAME=VALUE",
+                        help="change a field of the task, such as gates=1 or layout=fixed; repeat for more")
     parser.add_argument("--vehicle", help="vehicle file; default: the task's own vehicle")
     parser.add_argument("--episodes", type=int, default=0, help="end after so many; 0: never")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; each next one adds 1")

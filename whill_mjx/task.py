@@ -6,7 +6,7 @@ neither the course's layout nor the corridor's width; both are chosen here and s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import jax
@@ -97,9 +97,13 @@ TASKS: dict[str, type[Task]] = {"obstacle_course": ObstacleCourse, "corridor": C
 
 
 def make_task(name: str, **changes) -> Task:
-    """Task by name, with some of its fields changed; ValueError names the known tasks."""
+    """Task by name, with some of its fields changed; ValueError names the known tasks and fields."""
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r} (known: {', '.join(TASKS)}).")
+    known = {field.name for field in fields(TASKS[name])}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise ValueError(f"task {name!r} has no field {unknown[0]!r} (known: {', '.join(sorted(known))}).")
     return TASKS[name](**changes)
 
 

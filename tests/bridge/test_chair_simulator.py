@@ -1,9 +1,11 @@
 """The real simulator behind the bridge's protocol."""
 
+import argparse
+
 import numpy as np
 import pytest
 
-from bridge.simulate import ChairSimulator, _halfway
+from bridge.simulate import ChairSimulator, _halfway, field
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +43,21 @@ def test_pose_between_two_frames_takes_the_short_way_round(chair):
             for f, x, yaw, v in ((a, 1.0, 3.1, 0.1), (b, 2.0, -3.1, 0.3)))
     middle = _halfway(a, b)
     assert middle.x == 1.5 and abs(abs(middle.yaw) - np.pi) < 1e-6 and middle.odometry[3] == pytest.approx(0.2)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("text", "pair"), [("gates=1", ("gates", 1)), ("layout=fixed", ("layout", "fixed"))])
+def test_fields_of_the_task_are_read_as_numbers_or_words(text, pair):
+    assert field(text) == pair
+
+
+@pytest.mark.quick
+def test_a_field_without_a_value_is_refused():
+    with pytest.raises(argparse.ArgumentTypeError, match="'gates' is not NAME=VALUE"):
+        field("gates")
+
+
+@pytest.mark.quick
+def test_a_field_that_the_task_does_not_have_is_named():
+    with pytest.raises(ValueError, match="no field 'doors' .*known: .*box_x"):
+        ChairSimulator("corridor", doors=3)
