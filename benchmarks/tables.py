@@ -1,4 +1,4 @@
-"""Writes benchmarks/README.md from benchmarks/results/*.json: `python -m benchmarks.tables`."""
+"""Writes benchmarks/README.md and the headlines in README.md from the result files: `python -m benchmarks.tables`."""
 
 from __future__ import annotations
 
@@ -39,6 +39,21 @@ TITLES = {
     "bridge": "Bridge",
 }
 PICTURES = "course_*.png"
+HEADLINES = (  # file, figure, factor, what it says
+    ("physics", "steps_per_s_32768", 1e-6, "M physics steps/s: free chassis, paper's base model, 32,768 chairs"),
+    ("camera", "jnp_frames_per_s", 1e-6, "M camera frames/s, 64x64 RGB, 32 boxes, 16,384 worlds, plain JAX"),
+    ("environment", "control_steps_per_s_course", 1e-6, "M control steps/s of the obstacle course, image included"),
+    ("learner", "updates_per_s_12m", 1.0, "DreamerV3 updates/s, size12m, batch 16 x 64"),
+    ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (one seed)"),
+    ("course", "success_at_22000_fixed", 100.0, "% in the one fixed world (one seed): it stays before the second gate"),
+    ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),
+    ("course", "cpu_minutes", 1.0, "minutes of training for that (the fit and the installation come on top)"),
+    ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay: Warthog, asphalt"),
+    ("measured", "drive_gain_over_ideal_sand", 100.0, "% the same on sand"),
+    ("measured", "gain_mrclam_physical", 100.0, "% the same for two Create robots that were not fitted"),
+    ("fit", "plant_replicate_ratio", 1.0, "times the replicate spread: held-out pose error, contact-plant logs"),
+)
+MARKS = ("<!-- figures -->", "<!-- /figures -->")
 
 
 def table(content: dict[str, Any]) -> str:
@@ -76,13 +91,39 @@ def page(results: Path) -> str:
     return "\n".join(parts)
 
 
-def main() -> None:
-    """Write the page."""
-    path = RESULTS.parent / "README.md"
+def headlines(results: Path) -> str:
+    """Markdown table of HEADLINES."""
+    rows = ["| | | device |", "|---:|---|---|"]
+    for stem, name, factor, text in HEADLINES:
+        path = results / f"{stem}.json"
+        entry = json.loads(path.read_text())["figures"].get(name) if path.exists() else None
+        if entry:
+            rows.append(f"| {entry['value'] * factor:.3g} | {text} | {entry['device']} |")
+    return "\n".join(rows)
+
+
+def put_between_marks(text: str, block: str) -> str:
+    """`text` with what stands between MARKS replaced; ValueError if they are missing."""
+    before, opening, rest = text.partition(MARKS[0])
+    _, closing, after = rest.partition(MARKS[1])
+    if not opening or not closing:
+        raise ValueError(f"README.md: no {MARKS[0]} ... {MARKS[1]}; put both lines where the figures belong.")
+    return f"{before}{opening}\n{block}\n{closing}{after}"
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file, whole or not at all."""
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(page(RESULTS))
+    temporary.write_text(text)
     os.replace(temporary, path)
     print(path)
+
+
+def main() -> None:
+    """Write both pages."""
+    write(RESULTS.parent / "README.md", page(RESULTS))
+    readme = RESULTS.parent.parent / "README.md"
+    write(readme, put_between_marks(readme.read_text(), headlines(RESULTS)))
 
 
 if __name__ == "__main__":

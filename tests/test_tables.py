@@ -7,7 +7,8 @@ import json
 import pytest
 
 from benchmarks.harness import figure, record
-from benchmarks.tables import page
+from benchmarks.merge import merge
+from benchmarks.tables import MARKS, page, put_between_marks
 
 pytestmark = pytest.mark.quick
 
@@ -29,3 +30,18 @@ def test_recorded_commands_name_no_absolute_path(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["x", "--shared", str(tmp_path / "shared")])
     content = json.loads(record("camera", "it runs", {"a": figure([1.0], "s", "x")}, tmp_path).read_text())
     assert not any(word.startswith("/") for word in content["command"].split())
+
+
+def test_headlines_replace_what_stands_between_the_marks_and_nothing_else():
+    text = f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n"
+    assert put_between_marks(text, "new") == f"before\n{MARKS[0]}\nnew\n{MARKS[1]}\nafter\n"
+    with pytest.raises(ValueError, match="put both lines"):
+        put_between_marks("no marks", "new")
+
+
+def test_a_merged_file_keeps_figures_that_the_other_machine_did_not_measure(tmp_path):
+    (tmp_path / "here").mkdir()
+    here = record("camera", "it runs", {"a": figure([1.0], "s", "x")}, tmp_path / "here")
+    there = record("camera", "it runs", {"b": figure([2.0], "s", "y")}, tmp_path)
+    merge(there, tmp_path / "here")
+    assert set(json.loads(here.read_text())["figures"]) == {"a", "b"}
