@@ -48,8 +48,8 @@ HEADLINES = (  # file, figure, factor, what it says
     ("course", "success_at_22000_fixed", 100.0, "% in the one fixed world (one seed): it stays before the second gate"),
     ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),
     ("course", "cpu_minutes", 1.0, "minutes of training for that (the fit and the installation come on top)"),
-    ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay: Warthog, asphalt"),
-    ("measured", "drive_gain_over_ideal_sand", 100.0, "% the same on sand"),
+    ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay, asphalt"),
+    ("measured", "drive_gain_over_ideal_sand", 100.0, "% the same on sand (Warthog robot both)"),
     ("measured", "gain_mrclam_physical", 100.0, "% the same for two Create robots that were not fitted"),
     ("fit", "plant_replicate_ratio", 1.0, "times the replicate spread: held-out pose error, contact-plant logs"),
 )
