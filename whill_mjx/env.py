@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.augment import Photometry, augment, draw_photometry, neutral
-from whill_mjx.effects.acceleration_limit import AccelerationLimit
 from whill_mjx.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.model import VehicleModel, build_model
 from whill_mjx.presets import preset
@@ -24,8 +23,6 @@ from whill_mjx.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle import drive, place
 from whill_mjx.vehicle_file import load_vehicle as load_vehicle_file
 
-RAMP = 1.7
-"""Change of wheel speed that the maker documents for velocity commands [m/s^2]."""
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode."""
 
@@ -111,10 +108,7 @@ def make_env(
 def load_vehicle(vehicle: str | Path | None) -> tuple[VehicleSpec, VehicleParams]:
     """Spec and parameters of a vehicle file or a preset; None: the paper's identified WHILL with its ramp."""
     if vehicle is None:
-        spec, params = preset("whill_cr_paper")
-        # The ramp acts on each wheel here, so the yaw rate may change by twice 1.7 m/s^2 over the track.
-        ramp = AccelerationLimit(linear=jnp.array(RAMP, float), angular=jnp.array(2 * RAMP / spec.track, float))
-        return spec, dataclasses.replace(params, effects=(*params.effects, ramp))
+        return preset("whill_cr_ramp")
     if Path(vehicle).suffix == ".toml":
         spec, params, _ = load_vehicle_file(vehicle)
         return spec, params
