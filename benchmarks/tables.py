@@ -51,6 +51,7 @@ HEADLINES = (  # file, figure, factor, what it says
     ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay, asphalt"),
     ("measured", "drive_gain_over_ideal_sand", 100.0, "% the same on sand (Warthog robot both)"),
     ("measured", "gain_mrclam_physical", 100.0, "% the same for two Create robots that were not fitted"),
+    ("fit", "noise_floor_ratio", 1.0, "times the sensor noise: held-out error where the truth was planted"),
     ("fit", "plant_replicate_ratio", 1.0, "times the replicate spread: held-out pose error, contact-plant logs"),
 )
 MARKS = ("<!-- figures -->", "<!-- /figures -->")
