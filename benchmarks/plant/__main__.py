@@ -1,0 +1,46 @@
+"""Drive a dataset with the contact plant.
+
+    python -m benchmarks.plant --out DIR --effects '{"slope": 0.02}' --seed 3 --answers FILE
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.make import make_log
+
+
+def main(arguments: list[str] | None = None) -> Path:
+    """Parse the command line and write the dataset; returns its folder."""
+    table = "\n".join(f"  {name} [{entry.unit}], base {entry.base:g}: {entry.form}" for name, entry in EFFECTS.items())
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.plant", description=__doc__, epilog=f"effects:\n{table}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, help="dataset folder to write; it must not exist")
+    parser.add_argument("--effects", default="{}", help="JSON: size by name")
+    parser.add_argument("--seed", type=int, default=0, help="of commands, day, disturbances and noise")
+    parser.add_argument("--noise", type=float, default=1.0, help="factor on disturbances and sensor noise")
+    parser.add_argument("--nominal", action="store_true", help="the nominal chair instead of one of a day")
+    parser.add_argument("--no-ground-truth", action="store_true", help="leave out the outside pose")
+    parser.add_argument("--manoeuvres", nargs="+", help="some of the nine")
+    parser.add_argument("--replicates", type=int, default=3)
+    parser.add_argument("--answers", type=Path, help="file, outside the dataset, that tells what was driven")
+    parser.add_argument("--processes", type=int, default=1)
+    given = parser.parse_args(arguments)
+    effects = json.loads(given.effects)
+    return make_log(
+        given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
+        given.replicates, given.answers, given.processes,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    try:
+        print(main())
+    except (ValueError, FileExistsError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,178 @@
+"""Writes a dataset driven by the contact plant: nine manoeuvres, three replicates, undeclared effects."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.plant.base import Effect
+from benchmarks.plant.chair import NOMINAL_MASS, NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELBASE, Chair
+from benchmarks.plant.commands import nine
+from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.sensors import odometry, outside_pose
+from benchmarks.plant.trial import Noise, Plant
+from whill_mjx.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
+
+HELD_OUT = ("figure_eight_1", "figure_eight_2", "figure_eight_3", "s_curve_3", "random_3", "stop_and_go_3", "reverse_3")
+FIELDS = f"""schema = 1
+vehicle = "differential-drive powered chair"
+wheel_radius = {NOMINAL_RADIUS}      # m, nominal
+track = {NOMINAL_TRACK}              # m, nominal, between drive wheels
+wheelbase = {NOMINAL_WHEELBASE}           # m, drive axle to front axle
+mass = {NOMINAL_MASS}                # kg, nominal
+command_limits = [1.0, 1.0]  # m/s, rad/s
+reference_point = "drive axle centre"
+odometry = "wheel encoders"
+"""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One trial to drive."""
+
+    name: str
+    index: int
+    messages: np.ndarray
+    session: float
+    """Time of the dataset before it [s]."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all trials of a dataset share."""
+
+    effects: tuple[tuple[str, float], ...]
+    seed: int
+    noise: float
+    chair: Chair
+
+
+def make_log(
+    out: Path | str, effects: Mapping[str, float] | None = None, seed: int = 0, noise: float = 1.0, day: bool = True,
+    ground_truth: bool = True, manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
+    answers: Path | str | None = None, processes: int = 1,
+) -> Path:  # fmt: skip
+    """Drive a dataset and write it; returns its folder. The same arguments give the same files.
+
+    Args:
+        out: folder to write; it must not exist.
+        effects: sizes by name, in the units of `effects.EFFECTS`.
+        seed: of command levels, day, start headings, disturbances and sensor noise.
+        noise: factor on all disturbances and sensor noise.
+        day: whether gains, mass and friction differ from the nominal chair's.
+        ground_truth: whether the outside pose is written.
+        manoeuvres: names out of the nine, or command tables (T, 3) t, v, omega by name; default: the nine.
+        replicates: drives of each manoeuvre.
+        answers: file that tells what was driven; it must lie outside `out`.
+        processes: 1 drives here, more in as many processes.
+
+    Raises:
+        ValueError, FileExistsError: naming the value, the rule and the remedy.
+    """
+    out = Path(out)
+    setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates)
+    if out.exists():
+        raise FileExistsError(f"{out}: exists. Name a new folder, or delete this one.")
+    if answers is not None and Path(answers).resolve().is_relative_to(out.resolve()):
+        raise ValueError(f"answers {answers}: lies inside the dataset {out}. Put it elsewhere: the dataset is blind.")
+    if processes > 1:
+        with ProcessPoolExecutor(processes) as pool:
+            parts = [jobs[i::processes] for i in range(processes)]
+            results = [result for part in pool.map(drive_all, [setting] * processes, parts) for result in part]
+    else:
+        results = drive_all(setting, jobs)
+    write_dataset(out, {job.name: job.messages for job in jobs}, results, ground_truth)
+    if answers is not None:
+        truth = {"effects": dict(setting.effects), "seed": seed, "noise": noise, "day": day}
+        write_text(Path(answers), json.dumps(truth, indent=1) + "\n")
+    return out
+
+
+def plan(
+    effects: Mapping[str, float], seed: int, noise: float, day: bool,
+    manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
+) -> tuple[Setting, list[Job]]:  # fmt: skip
+    """Check the arguments of `make_log`, draw the day, list the trials."""
+    unknown = sorted(set(effects) - set(EFFECTS))
+    if unknown:
+        raise ValueError(f"unknown effect {unknown[0]!r} (known: {', '.join(EFFECTS)}). Correct the name.")
+    active = tuple((name, float(size)) for name, size in sorted(effects.items()) if size != 0)
+    bad = [f"{name}={size}" for name, size in active if not np.isfinite(size)]
+    if bad or not noise >= 0:
+        raise ValueError(f"{(bad or [f'noise={noise}'])[0]}: must be finite, noise not negative. Give another number.")
+    chair = Chair().on_day(np.random.default_rng([seed, 1])) if day else Chair()
+    for name, size in active:
+        chair = EFFECTS[name].make.change(chair, size)
+    tables: Mapping[str, np.ndarray] = nine(seed)
+    if isinstance(manoeuvres, Mapping):
+        tables = manoeuvres
+    elif manoeuvres is not None:
+        missing = sorted(set(manoeuvres) - set(tables))
+        if missing:
+            raise ValueError(f"unknown manoeuvre {missing[0]!r} (known: {', '.join(tables)}). Correct the name.")
+        tables = {name: tables[name] for name in manoeuvres}
+    jobs: list[Job] = []
+    session = 0.0
+    for replicate in range(1, replicates + 1):
+        for name, messages in tables.items():
+            jobs.append(Job(f"{name}_{replicate}", len(jobs), np.asarray(messages, float), session))
+            session += float(messages[-1, 0]) + 5.0
+    return Setting(active, seed, noise, chair), jobs
+
+
+Result = tuple[str, np.ndarray, np.ndarray]
+"""Name of the trial, odometry (M, 6), outside pose (M, 4)."""
+
+
+def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
+    """Drive trials one after the other; each has random numbers of its own."""
+    plant = Plant(setting.chair)
+    noise = Noise().scaled(setting.noise)
+    results = []
+    for job in jobs:
+        random, reading = (np.random.default_rng([setting.seed, 2 + part, job.index]) for part in (0, 1))
+        start = (0.0, 0.0, float(np.random.default_rng([setting.seed, 4, job.index]).uniform(-np.pi, np.pi)))
+        effects = make_effects(setting, job.index)
+        drive = plant.drive(job.messages, start, effects, noise, random, job.session)
+        if not np.isfinite(drive.pose).all():
+            raise ValueError(f"{job.name}: motion became non-finite with {dict(setting.effects)}. Use smaller sizes.")
+        results.append((job.name, odometry(drive, effects, noise, reading), outside_pose(drive, noise, reading)))
+    return results
+
+
+def make_effects(setting: Setting, index: int) -> list[Effect]:
+    """Fresh effects for one trial, with random numbers that no other trial or effect uses."""
+    names = list(EFFECTS)
+    return [
+        EFFECTS[name].make(size, np.random.default_rng([setting.seed, 5, names.index(name), index]), setting.chair)
+        for name, size in setting.effects
+    ]
+
+
+def write_dataset(out: Path, messages: Mapping[str, np.ndarray], results: Sequence[Result], ground_truth: bool) -> None:
+    """Write all trials, or nothing."""
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    try:
+        for name, rows, pose in results:
+            folder = partial / "trials" / name
+            write_csv(folder / "command.csv", COMMAND_HEADER, messages[name])
+            write_csv(folder / "odometry.csv", ODOMETRY_HEADER, rows)
+            if ground_truth:
+                write_csv(folder / "ground_truth.csv", POSE_HEADER, pose)
+        held_out = ", ".join(json.dumps(name) for name in HELD_OUT if name in messages)
+        outside = 'ground_truth = "overhead motion capture"\n' if ground_truth else ""
+        note = "   # trials to be predicted, never fitted"
+        write_text(partial / "dataset.toml", f"{FIELDS}{outside}held_out = [{held_out}]{note}\n")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+

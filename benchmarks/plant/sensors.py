@@ -1,0 +1,57 @@
+"""What is reported of a drive: odometry from encoders, and an outside pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from benchmarks.plant.base import FRAME, TICK, Effect
+from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK
+from benchmarks.plant.trial import ENCODER, REPORT, Drive, Noise
+
+
+def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.random.Generator) -> np.ndarray:
+    """Rows (M, 6) t, x, y, yaw, v, omega every 50 ms of an odometry that is computed every 20 ms.
+
+    Encoder ticks of both wheels add up along arcs of the nominal geometry; speeds are ticks per frame through a
+    first-order low-pass, with white noise.
+    """
+    every = round(FRAME / TICK)
+    ticks = np.floor(drive.encoder[::every] / ENCODER + random.uniform(size=2))
+    ticks -= ticks[0]
+    radius = NOMINAL_RADIUS
+    for effect in effects:
+        ticks = effect.ticks_per_frame(ticks)
+        radius *= effect.scale()
+    path = radius * ENCODER * np.diff(ticks, axis=0, prepend=ticks[:1])
+    step, turn = path.mean(axis=1), (path[:, 1] - path[:, 0]) / NOMINAL_TRACK
+    yaw = np.cumsum(turn)
+    middle = yaw - turn / 2
+    pose = np.column_stack([np.cumsum(step * np.cos(middle)), np.cumsum(step * np.sin(middle)), yaw])
+    speed = low_pass(np.column_stack([step, turn]) / FRAME, noise.low_pass)
+    due = np.arange(math.floor(drive.t[-1] / REPORT + 1e-6) + 1) * REPORT
+    true, written = due, due
+    for effect in effects:
+        shifted, stamped = effect.stamps(due)
+        true, written = true + (shifted - due), written + (stamped - due)
+    frame = np.clip(np.floor(true / FRAME + 1e-6).astype(int), 0, len(pose) - 1)  # the newest frame that is ready
+    speed = speed[frame] + random.standard_normal((len(due), 2)) * [noise.v, noise.omega]
+    return np.column_stack([written, pose[frame], speed])
+
+
+def low_pass(values: np.ndarray, time_constant: float) -> np.ndarray:
+    """First-order low-pass (F, C) at the odometry's frames."""
+    from scipy.signal import lfilter
+
+    keep = math.exp(-FRAME / time_constant)
+    return lfilter([1 - keep], [1.0, -keep], values, axis=0)
+
+
+def outside_pose(drive: Drive, noise: Noise, random: np.random.Generator) -> np.ndarray:
+    """Rows (M, 4) t, x, y, yaw of the drive-axle centre every 50 ms, yaw in (-pi, pi]."""
+    due = np.arange(math.floor(drive.t[-1] / REPORT + 1e-6) + 1) * REPORT
+    pose = np.column_stack([np.interp(due, drive.t, column) for column in drive.pose.T])
+    pose += random.standard_normal(pose.shape) * [noise.position, noise.position, noise.yaw]
+    pose[:, 2] = np.pi - np.mod(np.pi - pose[:, 2], 2 * np.pi)
+    return np.column_stack([due, pose])

@@ -1,0 +1,189 @@
+"""Drives one trial: controllers, disturbances, contact dynamics, encoders."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from benchmarks.plant.base import TICK, Effect, Load, Moment
+from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, TIMESTEP, Chair, build
+
+SUBSTEPS = round(TICK / TIMESTEP)
+REPORT = 0.05  # s between rows of odometry and outside pose
+ENCODER = 2 * math.pi / 4096  # rad per tick
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Disturbances on the chair and noise of its sensors: standard deviations."""
+
+    road_force: float = 2.0
+    """Along the chair [N], first-order, `correlation`."""
+    yaw_torque: float = 0.3
+    """[N m], the same."""
+    correlation: float = 0.3
+    """[s]"""
+    position: float = 0.003
+    yaw: float = 0.003
+    """White, of the outside pose [m, rad]."""
+    v: float = 0.0039
+    omega: float = 0.0043
+    """White, of the reported speeds [m/s, rad/s]."""
+    low_pass: float = 0.03
+    """Time constant of the reported speeds [s]."""
+
+    def scaled(self, noise: float) -> Noise:
+        """All standard deviations times `noise`."""
+        names = ("road_force", "yaw_torque", "position", "yaw", "v", "omega")
+        return Noise(**{name: noise * getattr(self, name) for name in names})
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What was true in one trial, at every tick (K)."""
+
+    t: np.ndarray
+    """(K,) [s]"""
+    pose: np.ndarray
+    """(K, 3) x, y, yaw of the drive-axle centre in the room, yaw continuous."""
+    speed: np.ndarray
+    """(K, 3) forward, to the left, yaw rate."""
+    encoder: np.ndarray
+    """(K, 2) angles that the encoders see [rad]."""
+    torque: np.ndarray
+    """(K, 2) drive torques [N m]."""
+
+
+class Plant:
+    """A chair ready to drive: its model is compiled and settled once."""
+
+    def __init__(self, chair: Chair) -> None:
+        self.chair, self.model = chair, build(chair)
+        self.data = mujoco.MjData(self.model)
+        joint = {name: self.model.joint(name) for name in ("wheel_left", "wheel_right")}
+        encoder = [f"rotor_{side}" if chair.play else f"wheel_{side}" for side in ("left", "right")]
+        self.wheel_q = [int(joint[name].qposadr[0]) for name in joint]
+        self.wheel_v = [int(joint[name].dofadr[0]) for name in joint]
+        self.encoder_q = [int(self.model.joint(name).qposadr[0]) for name in encoder]
+        self.encoder_v = [int(self.model.joint(name).dofadr[0]) for name in encoder]
+        for _ in range(round(1.0 / TIMESTEP)):
+            self.data.qfrc_applied[self.encoder_v] = -20.0 * self.data.qvel[self.encoder_v]  # brakes on
+            mujoco.mj_step(self.model, self.data)
+        self.rest = self.data.qpos.copy()
+
+    def drive(
+        self, messages: np.ndarray, start: tuple[float, float, float], effects: list[Effect], noise: Noise,
+        random: np.random.Generator, session: float = 0.0,
+    ) -> Drive:
+        """One trial from rest.
+
+        Args:
+            messages: (T, 3) t, v, omega as sent.
+            start: x, y, yaw in the room.
+            effects: fresh ones.
+            noise: disturbances of the drive; sensors are read by `sensors.py`.
+            random: of the disturbances.
+            session: time since the dataset began [s].
+        """
+        chair, model, data = self.chair, self.model, self.data
+        count = math.ceil((messages[-1, 0] + REPORT) / TICK - 1e-6) + 1
+        t = np.arange(count) * TICK
+        target = wheel_targets(chair, messages, t, effects)
+        force, twist = disturbances(noise, count, random)
+        self._place(start)
+        makers = [effect for effect in effects if type(effect).torque is not Effect.torque]
+        loaders = [effect for effect in effects if type(effect).load is not Effect.load]
+        (left_q, right_q), (left_v, right_v), (el, er) = self.wheel_q, self.wheel_v, self.encoder_v
+        applied, kp, ki, limit = data.qfrc_applied, chair.kp, chair.ki, chair.torque_limit
+        qpos, qvel = np.empty((count, model.nq)), np.empty((count, model.nv))
+        torques = np.empty((count, 2))
+        origin = (self.rest[left_q], self.rest[right_q])
+        integral = [0.0, 0.0]
+        moment = Moment(session=session)
+        for k in range(count):
+            q, w = data.qpos.tolist(), data.qvel.tolist()
+            qpos[k], qvel[k] = q, w
+            yaw = math.atan2(2 * (q[3] * q[6] + q[4] * q[5]), 1 - 2 * (q[5] ** 2 + q[6] ** 2))
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            errors = target[k, 0] - w[el], target[k, 1] - w[er]
+            integral[0] += errors[0] * TICK
+            integral[1] += errors[1] * TICK
+            left = min(limit, max(-limit, kp * errors[0] + ki * integral[0]))
+            right = min(limit, max(-limit, kp * errors[1] + ki * integral[1]))
+            load = Load()
+            if makers or loaders:
+                moment.t, moment.session = k * TICK, session + k * TICK
+                moment.x, moment.y, moment.yaw = q[0], q[1], yaw
+                moment.v, moment.side, moment.omega = cos * w[0] + sin * w[1], cos * w[1] - sin * w[0], w[5]
+                moment.spin, moment.angle = (w[left_v], w[right_v]), (q[left_q] - origin[0], q[right_q] - origin[1])
+                for effect in makers:
+                    left, right = effect.torque(moment, left, right)
+                moment.torque = left, right
+                for effect in loaders:
+                    effect.load(moment, load)
+            forward = load.forward + force[k]
+            applied[0], applied[1] = cos * forward - sin * load.left, sin * forward + cos * load.left
+            applied[3], applied[4], applied[5] = load.roll, load.pitch, load.yaw + twist[k]
+            applied[left_v], applied[right_v] = load.wheel
+            applied[el] += left
+            applied[er] += right
+            torques[k] = left, right
+            mujoco.mj_step(model, data, SUBSTEPS)
+        return _record(t, qpos, qvel, torques, self.encoder_q)
+
+    def _place(self, start: tuple[float, float, float]) -> None:
+        """At rest, settled, at x, y, yaw: the settled attitude is turned with the heading."""
+        data = self.data
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = self.rest
+        turn = np.array([math.cos(start[2] / 2), 0.0, 0.0, math.sin(start[2] / 2)])
+        attitude = np.empty(4)
+        mujoco.mju_mulQuat(attitude, turn, self.rest[3:7])
+        data.qpos[:2], data.qpos[3:7] = start[:2], attitude
+
+
+def wheel_targets(chair: Chair, messages: np.ndarray, t: np.ndarray, effects: list[Effect]) -> np.ndarray:
+    """Wanted wheel speeds (K, 2) [rad/s]: a message holds until the next one arrives."""
+    messages = np.column_stack([messages[:, 0] + chair.delay, messages[:, 1:]])
+    for effect in effects:
+        messages = effect.messages(messages)
+    latest = np.searchsorted(messages[:, 0], t + 1e-9, side="right") - 1
+    command = np.where(latest[:, None] >= 0, messages[np.maximum(latest, 0), 1:], 0.0)
+    for effect in effects:
+        command = effect.command(command)
+    half = NOMINAL_TRACK / 2
+    target = np.column_stack([command[:, 0] - half * command[:, 1], command[:, 0] + half * command[:, 1]])
+    target /= NOMINAL_RADIUS
+    for effect in effects:
+        target = effect.target(target)
+    return target
+
+
+def disturbances(noise: Noise, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Road force [N] and yaw torque [N m] (K,), first-order autoregressive."""
+    force = noise.road_force * autoregressive(count, noise.correlation, random)
+    return force, noise.yaw_torque * autoregressive(count, noise.correlation, random)
+
+
+def autoregressive(count: int, correlation: float, random: np.random.Generator) -> np.ndarray:
+    """Noise (K,) of unit variance at the ticks, correlated over `correlation` [s]."""
+    from scipy.signal import lfilter
+
+    rho = math.exp(-TICK / correlation)
+    white = random.standard_normal(count)
+    white[0] /= math.sqrt(1 - rho**2)  # stationary from the first tick
+    return lfilter([math.sqrt(1 - rho**2)], [1.0, -rho], white)
+
+
+def _record(t: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray, encoder_q: list[int]) -> Drive:
+    w, x, y, z = qpos[:, 3:7].T
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    forward, left = cos * qvel[:, 0] + sin * qvel[:, 1], cos * qvel[:, 1] - sin * qvel[:, 0]
+    return Drive(
+        t=t, pose=np.column_stack([qpos[:, :2], yaw]), speed=np.column_stack([forward, left, qvel[:, 5]]),
+        encoder=qpos[:, encoder_q] - qpos[0, encoder_q], torque=torque,
+    )  # fmt: skip
