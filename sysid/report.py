@@ -83,7 +83,7 @@ def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str
 def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(_plain(report), indent=1) + "\n")
+    temporary.write_text(json.dumps(plain(report), indent=1) + "\n")
     os.replace(temporary, path)
 
 
@@ -110,15 +110,16 @@ def parameter_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The same with arrays as lists, numpy numbers as Python ones and numbers that are not finite as null."""
     if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [plain(one) for one in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value

@@ -1,0 +1,210 @@
+"""Looking at a log: sampling, clocks, signs, excitation, and what it cannot tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import shared_folder
+
+import sysid
+import sysid.inspect as inspect_module
+from sysid.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
+from sysid.inspect import InspectConfig, inspect, load_whole, main, text
+from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
+from sysid.metrics import ideal_replay
+from sysid.streams import LAGS, clock_shift, find_shift, quality, response_shift, standstill
+from whill_mjx.specs import WHILL_CR
+
+pytestmark = pytest.mark.quick
+DT = 0.02
+CHAIR = Path(sysid.__file__).parent / "data" / "chair"
+
+
+def steps(seconds=20.0, dt=DT, seed=0):
+    """Random steps every half second."""
+    levels = np.random.default_rng(seed).uniform(-1, 1, int(seconds / 0.5))
+    return np.repeat(levels, round(0.5 / dt))
+
+
+def delayed(signal, delay, lag):
+    """The signal on a 1 ms grid, delayed and lagged, back on the grid."""
+    fine = np.repeat(signal, 20)
+    moved = np.concatenate([np.full(round(delay * 1000), fine[0]), fine])[: len(fine)]
+    out, y = np.empty_like(moved), moved[0]
+    for i, u in enumerate(moved):
+        y += (u - y) * (1 - np.exp(-0.001 / lag)) if lag else u - y
+        out[i] = y
+    return out[::20]
+
+
+def trial_of(command, name="drive_1", offset=0.0, held_out=False, yaw=0.0):
+    """A trial that follows its commands exactly, with the outside pose's clock `offset` seconds late."""
+    t = np.arange(0.0, command.t[-1], 0.05)
+    blank = np.zeros_like(t)
+    shell = Trial(name, manoeuvre_of(name), command, OdometryStream(t, blank, blank, blank, blank, blank),
+                  PoseStream(t, blank, blank, blank), Start(yaw=yaw), held_out)
+    seen = ideal_replay(shell)
+    return replace(shell, odometry=seen.odometry, ground_truth=replace(seen.ground_truth, t=t + offset))
+
+
+def smooth_command(v=0.5, omega=0.6, seconds=20.0):
+    t = np.arange(0.0, seconds, 0.01)
+    wave = np.clip(t - 1.0, 0.0, 1.0)
+    return Command(t, v * wave * (1 + 0.5 * np.sin(1.3 * t)), omega * wave * np.sin(0.9 * t))
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.0), (0.14, 0.0), (0.06, 0.3), (-0.1, 0.0)])
+def test_delay_and_lag_of_a_response_are_told_apart(delay, lag):
+    signal = steps()
+    late = delayed(signal, delay, lag) if delay >= 0 else np.roll(signal, round(delay / DT))
+    shift = find_shift(signal, 0.8 * late, DT, lags=LAGS)
+    assert shift.delay == pytest.approx(delay, abs=0.01)
+    assert shift.lag == pytest.approx(lag, abs=1e-9)
+    assert shift.gain == pytest.approx(0.8, abs=0.01)
+
+
+def test_a_reversed_sign_is_found_as_a_negative_gain():
+    shift = find_shift(steps(), -0.9 * delayed(steps(), 0.1, 0.0), DT)
+    assert shift.gain == pytest.approx(-0.9, abs=0.02) and shift.correlation < -0.95
+
+
+@pytest.mark.parametrize("signal", [np.zeros(1000), np.r_[np.zeros(5), np.ones(995)]])
+def test_a_signal_that_hardly_changes_tells_no_shift(signal):
+    assert find_shift(signal, signal + 0.0, DT) is None
+
+
+def test_sampling_counts_gaps_jitter_and_repeats():
+    t = np.arange(0, 200) * 0.05
+    t[::2] += 0.004
+    keep = np.ones(200, bool)
+    keep[100:110] = False
+    values = np.cumsum(np.ones((200, 2)), axis=0)
+    values[50] = values[49]
+    found = quality(t[keep], values[keep], np.ones(190, bool))
+    assert found.rate == pytest.approx(20, rel=0.1)
+    assert found.gaps == 1 and found.longest == pytest.approx(0.55, abs=0.01)
+    assert found.missing == pytest.approx(0.05, abs=0.01)
+    assert found.jitter == pytest.approx(0.004, abs=1e-3)
+    assert found.held == pytest.approx(1 / 189)
+
+
+def test_a_vehicle_at_rest_may_repeat_its_pose():
+    t = np.arange(10) * 0.1
+    assert quality(t, np.ones((10, 3)), np.zeros(10, bool)).held == 0.0
+
+
+@pytest.mark.parametrize("offset", [-0.08, 0.0, 0.12])
+def test_the_clock_offset_between_odometry_and_outside_pose_is_found(offset):
+    shifts = clock_shift(trial_of(smooth_command(), offset=offset))
+    assert shifts["v"].delay == pytest.approx(offset, abs=0.01)
+    assert shifts["omega"].delay == pytest.approx(offset, abs=0.01)
+
+
+def test_an_ideal_vehicle_has_no_delay_after_its_command():
+    for shift in response_shift(trial_of(smooth_command()), "odometry").values():
+        assert abs(shift.delay) < 0.03 and shift.gain == pytest.approx(1.0, abs=0.02)
+
+
+def test_standstill_is_counted_before_and_after():
+    command = Command(np.array([0.0, 2.0, 5.0]), np.array([0.0, 0.5, 0.0]), np.zeros(3))
+    assert standstill(command, 9.0) == (2.0, 4.0)
+    assert standstill(Command(np.array([0.0]), np.zeros(1), np.zeros(1)), 3.0) == (3.0, 3.0)
+
+
+def test_sign_changes_ignore_noise_around_zero():
+    assert sign_changes(np.array([0.5, 0.01, -0.01, 0.4, -0.3, 0.0, -0.2, 0.6]), 0.02) == 2
+
+
+def test_excitation_counts_reversals_steps_and_path():
+    t = np.arange(0.0, 6.0, 1.0)
+    command = Command(t, np.array([0.0, 0.5, 0.5, -0.5, 0.05, 0.0]), np.zeros(6))
+    found = excitation(trial_of(command))
+    assert found.v == (-0.5, 0.5) and found.reversals == 2
+    assert found.slow_seconds == pytest.approx(1.0)
+    assert found.distance == pytest.approx(0.5 + 0.5 + 0.5 + 0.05)
+    assert found.steps == 4
+
+
+def log_of(*trials):
+    return Log("toy", WHILL_CR, trials, "")
+
+
+def test_units_and_signs_that_the_commands_contradict_are_named():
+    good = trial_of(smooth_command())
+    assert sanity(log_of(good)) == []
+    flipped = replace(good, odometry=replace(good.odometry, omega=-good.odometry.omega))
+    assert any("odometry: omega" in one and "sign is reversed" in one for one in sanity(log_of(flipped)))
+    degrees = replace(good, odometry=replace(good.odometry, omega=np.rad2deg(good.odometry.omega)))
+    assert any("check its unit (rad/s)" in one for one in sanity(log_of(degrees)))
+    millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
+                                                     y=1e3 * good.ground_truth.y))
+    assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
+
+
+def causes(log):
+    return {one.cause for one in blind_spots(log, {trial.name: excitation(trial) for trial in log.trials})}
+
+
+def test_blind_spots_name_what_a_poor_log_lacks():
+    straight = Command(np.array([0.0, 4.0]), np.array([0.5, 0.0]), np.zeros(2))
+    poor = trial_of(straight)
+    found = causes(log_of(replace(poor, ground_truth=None)))
+    assert found >= {"no outside pose", "no reversal", "no turn", "no slow crossing of zero", "nothing held out",
+                     "no replicates", "no standstill before the first command", "hardly any standstill"}
+    assert "no odometry" in causes(log_of(replace(poor, odometry=None)))
+    assert "one heading of the room" in causes(log_of(poor))
+
+
+def test_a_rich_log_has_only_the_blind_spot_that_driving_cannot_cure():
+    t = np.arange(0.0, 40.0, 0.1)
+    going = (t > 3) & (t < 36)
+    v = np.where(going, 0.8 * np.sin(0.35 * (t - 3)), 0.0)
+    omega = np.where(going, 0.9 * np.sin(0.21 * (t - 3)) * np.sign(np.sin(2.1 * t)), 0.0)
+    slow = (t > 28) & (t < 36)
+    v[slow], omega[slow] = 0.04, 0.0
+    trials = [trial_of(Command(t, v, omega), f"mix_{k}", yaw=yaw) for k, yaw in ((1, 0.0), (2, 3.0))]
+    abrupt = trials[1].odometry
+    trials[1] = replace(trials[1], odometry=replace(abrupt, v=abrupt.v + (abrupt.t % 4 > 2) * 1.5))
+    held = trial_of(Command(t, v, omega), "other_1", held_out=True)
+    assert causes(log_of(*trials, held)) == {"velocities and poses only"}
+
+
+def test_replicate_spread_is_the_deviation_between_drives():
+    command = smooth_command()
+    first, second = trial_of(command, "drive_1"), trial_of(command, "drive_2")
+    second = replace(second, odometry=replace(second.odometry, v=second.odometry.v + 0.02))
+    (group,) = replicate_spread((first, second))
+    assert group.trials == ("drive_1", "drive_2")
+    assert group.spread["odometry.v"] == pytest.approx(0.02 / np.sqrt(2), rel=1e-6)
+    assert group.spread["ground_truth.x"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_command_writes_text_json_and_picture(tmp_path, capsys):
+    main(InspectConfig(CHAIR, out=tmp_path / "seen"))
+    printed = capsys.readouterr().out
+    assert "What this log cannot tell" in printed and "figure_eight_1*" in printed
+    found = json.loads((tmp_path / "seen" / "inspect.json").read_text())
+    assert found["log"]["sha256"] == load_log(CHAIR).sha256
+    assert found["streams"]["ground_truth"]["rate"] == pytest.approx(20, rel=0.01)
+    assert (tmp_path / "seen" / "inspect.png").stat().st_size > 20_000
+    main(InspectConfig(CHAIR, json=True))
+    assert json.loads(capsys.readouterr().out)["clocks"].keys() == found["clocks"].keys()
+
+
+def test_a_missing_folder_ends_with_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["inspect", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match="error: .*nowhere: no such folder"):
+        inspect_module.cli()
+
+
+@pytest.mark.parametrize(("name", "select", "channel"), [
+    ("drive_norlab", ("warthog_grass_2024_07_18_continuous",), "odometry"), ("mrclam", ("robot1",), "ground_truth")])
+def test_measured_sets_are_inspected_in_their_original_form(name, select, channel):
+    log = load_whole(shared_folder(name), select)
+    found = inspect(log)
+    assert found["streams"][channel]["samples"] > 100 and found["trials"][0]["seconds"] > 1
+    assert "nothing held out" in text(found)
