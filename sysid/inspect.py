@@ -18,9 +18,10 @@ import numpy as np
 from sysid.coverage import blind_spots, excitation, replicate_spread, sanity
 from sysid.log import Log, load_log
 from sysid.measured import detect_format, drive_spec, load_drive, load_mrclam, split
-from sysid.streams import Shift, StreamQuality, clock_shift, response_shift, trial_quality
+from sysid.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
 
 MAX_ROWS = 40  # trials listed one by one; more are summed up by group
+POSE_JITTER = 0.003  # s, more than rounding and noise of the speeds explain
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ def drive_runs(folder: str | Path) -> tuple[str, ...]:
 def inspect(log: Log) -> dict[str, Any]:
     """All findings on a log as plain numbers and sentences (keys below); see `text` for how they read.
 
-    `log`, `streams` (per stream, over all trials), `clocks`, `sanity`, `trials` (excitation and shifts of each),
-    `replicates`, `blind_spots`.
+    `log`, `streams` (per stream, over all trials), `clocks`, `pose_jitter` [s], `sanity`, `trials` (excitation and
+    shifts of each), `replicates`, `blind_spots`.
     """
     excitations = {trial.name: excitation(trial) for trial in log.trials}
     qualities = {trial.name: trial_quality(trial) for trial in log.trials}
@@ -89,6 +90,7 @@ def inspect(log: Log) -> dict[str, Any]:
             **{f"{channel} after command": _pooled(list(found.values())) for channel, found in responses.items()
                if any(found.values())},
             **({"ground_truth after odometry": _pooled(list(clocks.values()))} if any(clocks.values()) else {})},
+        "pose_jitter": _median([pose_jitter(trial) for trial in log.trials]),
         "sanity": sanity(log),
         "trials": [{"trial": trial.name, "group": trial.group, "manoeuvre": trial.manoeuvre, "seconds": trial.duration,
                     "held_out": trial.held_out, "excitation": asdict(excitations[trial.name]),
@@ -109,6 +111,11 @@ def _over_trials(found: Sequence[StreamQuality]) -> dict[str, float]:
             "longest": max(one.longest for one in found), "gaps": sum(one.gaps for one in found),
             "missing": float(np.mean([one.missing for one in found])),
             "held": float(np.mean(held)) if held else float("nan")}
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else float("nan")
 
 
 def _pooled(found: Sequence[dict[str, Shift]]) -> dict[str, dict[str, float]]:
@@ -139,6 +146,12 @@ def text(found: dict[str, Any]) -> str:
         held = "-" if not np.isfinite(one["held"]) else f"{one['held']:.1%}"
         lines.append(f"  {name:13} {one['rate']:6.1f} {1e3 * one['jitter']:9.1f} {1e3 * one['longest']:9.0f} "
                      f"{one['gaps']:8d} {one['missing']:8.1%} {held:>10}")
+    repeated = [name for name, one in found["streams"].items() if np.isfinite(one["held"]) and one["held"] > 0.05]
+    if repeated:
+        lines.append(f"  {' and '.join(repeated)}: pose or speeds repeat between updates; count each update once")
+    if found["pose_jitter"] > POSE_JITTER:
+        lines.append(f"  odometry: its pose is {1e3 * found['pose_jitter']:.0f} ms out of step with its speeds: it is "
+                     "updated on another clock than it is sampled")
     lines += ["", "Clocks and response: clock offset plus transport delay (median over trials +- standard error)"]
     for name, channels in found["clocks"].items():
         for channel, one in channels.items():

@@ -1,4 +1,6 @@
-"""The report of a fit: `report.json` (versioned, below), and the table and plots that people read.
+"""The report of a fit: `report.json` (versioned, below), and the tables and the page that people read.
+
+`python -m sysid.report RUN` writes the page RUN/report.html of an earlier fit.
 
     schema, kind          1, "sysid-report"
     dataset               name, path, format, sha256, notes, training and held_out trial names
@@ -10,6 +12,7 @@
     fixed                 name, value, reason
     weak_combinations     combinations of parameters that the log does not tell
     search                method, evaluations, seconds, cost before and after, cost of each start, delay profiles
+    code                  SHA-256 over the sources of the packages, their versions and those of what they run on
     errors                per trial and channel: metric -> ideal, initial, fitted
     summary               training, held_out -> channel -> metric -> mean of ideal, initial, fitted, and noise_floor
     groups                the same per group (terrain, robot), where there are several
@@ -19,16 +22,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid.log import Trial
 from sysid.metrics import METRICS, UNITS, Prediction, ideal_replay, noise_floor, score
+
+if TYPE_CHECKING:
+    from sysid.html import Section
+    from sysid.series import TrialSeries
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -82,9 +91,71 @@ def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
+    _write(path, json.dumps(plain(report), indent=1) + "\n")
+
+
+def read_report(run: Path) -> dict[str, Any]:
+    """Content of RUN/report.json; FileNotFoundError, ValueError where it is missing or none of a fit."""
+    path = Path(run) / "report.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.")
+    try:
+        report: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not valid JSON ({error}). Fit the log again.") from None
+    if report.get("kind") != KIND or report.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: kind {report.get('kind')!r}, schema {report.get('schema')!r}; this program reads "
+                         f"{KIND!r}, schema {SCHEMA}. Fit the log again.")
+    return report
+
+
+def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections: Sequence[Section] = ()) -> Path:
+    """Write RUN/report.html from RUN/report.json, self-contained.
+
+    Args:
+        run: folder of a fit.
+        series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
+        sections: more sections, shown first.
+    """
+    from sysid.html import html_page
+    from sysid.report_html import fit_sections
+    from sysid.series import FILE, load, replay
+
+    run = Path(run)
+    report = read_report(run)
+    if series is None:
+        series = load(run) if (run / FILE).is_file() else replay(run, report)
+    page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
+                     [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
+    return _write(run / "report.html", page)
+
+
+def code_hashes() -> dict[str, str]:
+    """SHA-256 over names and contents of the packages' sources, and the versions of what they run on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    import sysid
+    import whill_mjx
+
+    found = {}
+    for package in (whill_mjx, sysid):
+        root, digest = Path(str(package.__file__)).parent, hashlib.sha256()
+        for path in sorted(root.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+        found[f"{package.__name__} sources SHA-256"] = digest.hexdigest()
+    for name in ("jax", "mujoco-mjx", "numpy", "optuna"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _write(path: Path, text: str) -> Path:
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(plain(report), indent=1) + "\n")
+    temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
+    return path
 
 
 def table(report: dict[str, Any]) -> str:
@@ -123,3 +194,20 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def cli() -> None:
+    """Command line: `python -m sysid.report RUN`."""
+    import argparse
+
+    parser = argparse.ArgumentParser(prog="sysid.report", description="Write RUN/report.html of an earlier fit.")
+    parser.add_argument("run", type=Path, help="folder that sysid.fit wrote")
+    run = parser.parse_args().run
+    try:
+        print(f"wrote {write_html(run)}")
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    cli()

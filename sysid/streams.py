@@ -7,6 +7,7 @@ of clock offset and transport delay, which no drive can tell apart.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,8 @@ class StreamQuality:
     missing: float
     """Share of samples that the mean interval outside gaps promises and the stream lacks."""
     held: float
-    """Share of samples that repeat the one before in all columns while the command moves; nan for commands."""
+    """Share of samples that repeat the one before while the command moves: of the pose or of the speeds, whichever
+    repeats more; nan for commands."""
 
     @property
     def rate(self) -> float:
@@ -45,12 +47,14 @@ class StreamQuality:
         return 1.0 / self.period
 
 
-def quality(t: np.ndarray, values: np.ndarray | None = None, moving: np.ndarray | None = None) -> StreamQuality:
+def quality(
+    t: np.ndarray, values: Sequence[np.ndarray] = (), moving: np.ndarray | None = None
+) -> StreamQuality:
     """Sampling of a stream.
 
     Args:
         t: (T,) times [s], increasing.
-        values: (T, C) its columns, where repeated samples count.
+        values: tables (T, C) whose repeated rows count, each for itself: a pose may be updated less often than speeds.
         moving: (T,) bool, where the vehicle should move: a vehicle at rest rightly repeats its pose.
     """
     steps = np.diff(t)
@@ -59,10 +63,9 @@ def quality(t: np.ndarray, values: np.ndarray | None = None, moving: np.ndarray 
     regular = steps[~gaps]
     low, high = np.percentile(regular, [5, 95]) if len(regular) else (period, period)
     held = np.nan
-    if values is not None and moving is not None:
-        known = values[:, np.isfinite(values).all(axis=0)]
-        repeated = (np.diff(known, axis=0) == 0).all(axis=1) & moving[1:]
-        held = float(repeated.sum() / max(moving[1:].sum(), 1))
+    if values and moving is not None:
+        repeated = [((np.diff(table, axis=0) == 0).all(axis=1) & moving[1:]).sum() for table in values]
+        held = float(max(repeated) / max(moving[1:].sum(), 1))
     expected = (t[-1] - t[0]) / (regular.mean() if len(regular) else period) + 1
     return StreamQuality(len(t), period, float(high - low) / 2, float(steps.max()), int(gaps.sum()),
                          float(max(1 - len(t) / expected, 0.0)), held)
@@ -76,10 +79,11 @@ def trial_quality(trial: Trial) -> dict[str, StreamQuality]:
     for name, stream in (("odometry", trial.odometry), ("ground_truth", trial.ground_truth)):
         if stream is None or len(stream.t) < 2:
             continue
-        columns = [stream.x, stream.y, stream.yaw]
+        values = []
+        if stream.x is not None and stream.y is not None and stream.yaw is not None:
+            values.append(np.column_stack([stream.x, stream.y, stream.yaw]))
         if isinstance(stream, OdometryStream):
-            columns += [stream.v, stream.omega]
-        values = np.column_stack([column for column in columns if column is not None])
+            values.append(np.column_stack([stream.v, stream.omega]))
         held = np.maximum(command_in_force(trial.command, stream.t), 0)
         moving = (np.abs(trial.command.v[held]) > 0.05) | (np.abs(trial.command.omega[held]) > 0.05)
         found[name] = quality(stream.t, values, moving)
@@ -184,6 +188,23 @@ def speeds(trial: Trial, stream: str, smooth: bool = False) -> tuple[np.ndarray,
         inside = (grid >= grid[0] + half) & (grid <= grid[-1] - half)
         return grid[inside], columns[0][inside], columns[1][inside]
     return grid, columns[0], columns[1]
+
+
+def pose_jitter(trial: Trial) -> float:
+    """Seconds by which the odometry's pose is out of step with its own speeds, as a standard deviation; nan where slow.
+
+    A pose that is updated on one clock and sampled on another moves by uneven steps at a steady speed.
+    """
+    odometry = trial.odometry
+    if odometry is None or odometry.x is None or odometry.y is None or len(odometry.t) < 20:
+        return float("nan")
+    dt = np.diff(odometry.t)
+    speed = np.abs(odometry.v[1:] + odometry.v[:-1]) / 2
+    steady = (speed > 0.2) & (np.abs(np.diff(odometry.v)) < 0.05 * speed) & (dt < GAP * np.median(dt))
+    if steady.sum() < 20:
+        return float("nan")
+    steps = np.hypot(np.diff(odometry.x), np.diff(odometry.y))[steady] / speed[steady]
+    return float(np.std(steps / np.mean(steps / dt[steady]) - dt[steady]) / np.sqrt(2))
 
 
 def standstill(command: Command, end: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from sysid.coverage import blind_spots, excitation, replicate_spread, sanity, si
 from sysid.inspect import InspectConfig, inspect, load_whole, main, text
 from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
 from sysid.metrics import ideal_replay
-from sysid.streams import LAGS, clock_shift, find_shift, quality, response_shift, standstill
+from sysid.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from whill_mjx.specs import WHILL_CR
 
 pytestmark = pytest.mark.quick
@@ -84,7 +84,7 @@ def test_sampling_counts_gaps_jitter_and_repeats():
     keep[100:110] = False
     values = np.cumsum(np.ones((200, 2)), axis=0)
     values[50] = values[49]
-    found = quality(t[keep], values[keep], np.ones(190, bool))
+    found = quality(t[keep], [values[keep], np.arange(190.0)[:, None]], np.ones(190, bool))
     assert found.rate == pytest.approx(20, rel=0.1)
     assert found.gaps == 1 and found.longest == pytest.approx(0.55, abs=0.01)
     assert found.missing == pytest.approx(0.05, abs=0.01)
@@ -94,7 +94,7 @@ def test_sampling_counts_gaps_jitter_and_repeats():
 
 def test_a_vehicle_at_rest_may_repeat_its_pose():
     t = np.arange(10) * 0.1
-    assert quality(t, np.ones((10, 3)), np.zeros(10, bool)).held == 0.0
+    assert quality(t, [np.ones((10, 3))], np.zeros(10, bool)).held == 0.0
 
 
 @pytest.mark.parametrize("offset", [-0.08, 0.0, 0.12])
@@ -107,6 +107,14 @@ def test_the_clock_offset_between_odometry_and_outside_pose_is_found(offset):
 def test_an_ideal_vehicle_has_no_delay_after_its_command():
     for shift in response_shift(trial_of(smooth_command()), "odometry").values():
         assert abs(shift.delay) < 0.03 and shift.gain == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_pose_updated_on_another_clock_than_it_is_sampled_is_out_of_step():
+    straight = trial_of(Command(np.arange(0.0, 20.0, 0.1), np.full(200, 0.6), np.zeros(200)))
+    assert pose_jitter(straight) < 1e-3
+    updated = np.floor(straight.odometry.t / 0.02 + 1e-6) * 0.02
+    stale = replace(straight, odometry=replace(straight.odometry, x=0.6 * updated))
+    assert pose_jitter(stale) == pytest.approx(0.01 / np.sqrt(2), rel=0.1)
 
 
 def test_standstill_is_counted_before_and_after():
