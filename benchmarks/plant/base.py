@@ -103,9 +103,9 @@ class Effect:
     def load(self, moment: Moment, load: Load) -> None:
         """Add forces and torques."""
 
-    def ticks_per_frame(self, ticks: np.ndarray) -> np.ndarray:
-        """Encoder ticks (F, 2) of the wheels as the odometry counts them."""
-        return ticks
+    def encoder(self, turned: np.ndarray) -> np.ndarray:
+        """Ticks (F, 2) that the wheels have turned at the odometry's frames, with fractions, as the encoders count."""
+        return turned
 
     def scale(self) -> float:
         """Radius that the odometry assumes, over the nominal one."""

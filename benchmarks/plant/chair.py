@@ -28,22 +28,24 @@ class Chair:
     """True distance between the drive wheels' contacts [m]."""
     mass: float = NOMINAL_MASS
     """All of it, wheels included [kg]."""
-    com: tuple[float, float, float] = (0.15, 0.0, 0.16)
+    com: tuple[float, float, float] = (0.157, 0.0, 0.17)
     """Centre of mass of the frame from the drive axle [m]."""
     gyration: tuple[float, float, float] = (0.24, 0.27, 0.29)
     """Radii of gyration of the frame about its centre of mass [m]."""
     wheel_mass: float = 2.0
     """One drive wheel with its hub motor [kg]."""
-    armature: float = 0.02
+    armature: float = 0.021
     """Rotor inertia of one drive, seen at the wheel [kg m^2]."""
-    damping: float = 0.15
+    damping: float = 0.16
     """Viscous friction of one wheel's bearing [N m s/rad]."""
-    friction: float = 0.9
+    friction: float = 0.82
     """Tyre on floor [-]."""
-    patch: float = 0.004
-    """Radius of the tyre's friction patch: torsional friction is patch * friction limit [m]."""
-    roller: float = 0.008
+    patch: float = 0.0015
+    """Torsional friction of one tyre per load: the radius of its friction patch [m]."""
+    roller: float = 0.002
     """Sliding friction of the front wheels [-]."""
+    roller_drag: float = 5.0
+    """Viscous friction of one front wheel's rollers against sideways motion [N s/m]."""
     kp: float = 9.0
     """Of the wheel-speed controller [N m s/rad]."""
     ki: float = 12.0

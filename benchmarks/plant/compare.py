@@ -49,13 +49,13 @@ def spread(groups_of: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.sqrt(rows.var(axis=0, ddof=1).mean(axis=0)) for name, rows in groups_of.items()}
 
 
-def drive_like(reference: Path, out: Path, seed: int = 1, effects: dict[str, float] | None = None) -> Path:
+def drive_like(reference: Path, out: Path, seed: int = 1, replicates: int = 3) -> Path:
     """Drive the commands of a reference dataset with the nominal chair."""
     tables = {
         folder.name[:-2]: np.loadtxt(folder / "command.csv", delimiter=",", skiprows=1)
         for folder in sorted((reference / "trials").glob("*_1"))
     }
-    return make_log(out, effects, seed, day=False, manoeuvres=tables)
+    return make_log(out, seed=seed, day=False, manoeuvres=tables, replicates=replicates)
 
 
 def plot(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], out: Path) -> None:

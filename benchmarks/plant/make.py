@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
@@ -107,6 +108,9 @@ def plan(
     bad = [f"{name}={size}" for name, size in active if not np.isfinite(size)]
     if bad or not noise >= 0:
         raise ValueError(f"{(bad or [f'noise={noise}'])[0]}: must be finite, noise not negative. Give another number.")
+    backward = [f"{name}={size:g}" for name, size in active if size < 0 and not EFFECTS[name].signed]
+    if backward:
+        raise ValueError(f"effect {backward[0]}: must not be negative [{EFFECTS[backward[0].split('=')[0]].unit}].")
     chair = Chair().on_day(np.random.default_rng([seed, 1])) if day else Chair()
     for name, size in active:
         chair = EFFECTS[name].make.change(chair, size)
@@ -149,9 +153,8 @@ def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
 
 def make_effects(setting: Setting, index: int) -> list[Effect]:
     """Fresh effects for one trial, with random numbers that no other trial or effect uses."""
-    names = list(EFFECTS)
     return [
-        EFFECTS[name].make(size, np.random.default_rng([setting.seed, 5, names.index(name), index]), setting.chair)
+        EFFECTS[name].make(size, np.random.default_rng([setting.seed, 5, crc32(name.encode()), index]), setting.chair)
         for name, size in setting.effects
     ]
 

@@ -14,22 +14,20 @@ from benchmarks.plant.trial import ENCODER, REPORT, Drive, Noise
 def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.random.Generator) -> np.ndarray:
     """Rows (M, 6) t, x, y, yaw, v, omega every 50 ms of an odometry that is computed every 20 ms.
 
-    Encoder ticks of both wheels add up along arcs of the nominal geometry; speeds are ticks per frame through a
-    first-order low-pass, with white noise.
+    Encoder ticks of both wheels add up along arcs of the nominal geometry. Speeds come from the timing of the ticks, so
+    they are not quantised; they pass a first-order low-pass and carry white noise.
     """
     every = round(FRAME / TICK)
-    ticks = np.floor(drive.encoder[::every] / ENCODER + random.uniform(size=2))
-    ticks -= ticks[0]
+    turned = drive.encoder[::every] / ENCODER + random.uniform(size=2)
     radius = NOMINAL_RADIUS
     for effect in effects:
-        ticks = effect.ticks_per_frame(ticks)
+        turned = effect.encoder(turned)
         radius *= effect.scale()
-    path = radius * ENCODER * np.diff(ticks, axis=0, prepend=ticks[:1])
-    step, turn = path.mean(axis=1), (path[:, 1] - path[:, 0]) / NOMINAL_TRACK
+    step, turn = arcs(radius * ENCODER * np.floor(turned))
     yaw = np.cumsum(turn)
     middle = yaw - turn / 2
     pose = np.column_stack([np.cumsum(step * np.cos(middle)), np.cumsum(step * np.sin(middle)), yaw])
-    speed = low_pass(np.column_stack([step, turn]) / FRAME, noise.low_pass)
+    speed = low_pass(np.column_stack(arcs(radius * ENCODER * turned)) / FRAME, noise.low_pass)
     due = np.arange(math.floor(drive.t[-1] / REPORT + 1e-6) + 1) * REPORT
     true, written = due, due
     for effect in effects:
@@ -37,7 +35,13 @@ def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.rando
         true, written = true + (shifted - due), written + (stamped - due)
     frame = np.clip(np.floor(true / FRAME + 1e-6).astype(int), 0, len(pose) - 1)  # the newest frame that is ready
     speed = speed[frame] + random.standard_normal((len(due), 2)) * [noise.v, noise.omega]
-    return np.column_stack([written, pose[frame], speed])
+    return np.column_stack([written, pose[frame], speed])[written >= 0]
+
+
+def arcs(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Step [m] and turn [rad] (F,) per frame, from both wheels' paths (F, 2) and the nominal track."""
+    moved = np.diff(path, axis=0, prepend=path[:1])
+    return moved.mean(axis=1), (moved[:, 1] - moved[:, 0]) / NOMINAL_TRACK
 
 
 def low_pass(values: np.ndarray, time_constant: float) -> np.ndarray:

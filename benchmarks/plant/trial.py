@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from benchmarks.plant.base import TICK, Effect, Load, Moment
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, TIMESTEP, Chair, build
+from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELBASE, TIMESTEP, Chair, build
 
 SUBSTEPS = round(TICK / TIMESTEP)
 REPORT = 0.05  # s between rows of odometry and outside pose
@@ -20,25 +20,27 @@ ENCODER = 2 * math.pi / 4096  # rad per tick
 class Noise:
     """Disturbances on the chair and noise of its sensors: standard deviations."""
 
-    road_force: float = 2.0
+    road_force: float = 1.5
     """Along the chair [N], first-order, `correlation`."""
-    yaw_torque: float = 0.3
+    yaw_torque: float = 0.42
     """[N m], the same."""
-    correlation: float = 0.3
+    correlation: float = 0.35
     """[s]"""
+    grip: float = 0.01
+    """Of each tyre's friction from trial to trial, of its value: another stretch of floor [-]."""
     position: float = 0.003
     yaw: float = 0.003
     """White, of the outside pose [m, rad]."""
     v: float = 0.0039
     omega: float = 0.0043
     """White, of the reported speeds [m/s, rad/s]."""
-    low_pass: float = 0.03
+    low_pass: float = 0.045
     """Time constant of the reported speeds [s]."""
 
     def scaled(self, noise: float) -> Noise:
         """All standard deviations times `noise`."""
-        names = ("road_force", "yaw_torque", "position", "yaw", "v", "omega")
-        return Noise(**{name: noise * getattr(self, name) for name in names})
+        names = ("road_force", "yaw_torque", "grip", "position", "yaw", "v", "omega")
+        return replace(self, **{name: noise * getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class Plant:
         t = np.arange(count) * TICK
         target = wheel_targets(chair, messages, t, effects)
         force, twist = disturbances(noise, count, random)
+        model.pair_friction[:2, :2] = chair.friction * np.exp(noise.grip * random.standard_normal((2, 1)))
         self._place(start)
         makers = [effect for effect in effects if type(effect).torque is not Effect.torque]
         loaders = [effect for effect in effects if type(effect).load is not Effect.load]
@@ -114,19 +117,22 @@ class Plant:
             left = min(limit, max(-limit, kp * errors[0] + ki * integral[0]))
             right = min(limit, max(-limit, kp * errors[1] + ki * integral[1]))
             load = Load()
+            side, omega = cos * w[1] - sin * w[0], w[5]
+            rollers = -2 * chair.roller_drag * (side + NOMINAL_WHEELBASE * omega)
             if makers or loaders:
                 moment.t, moment.session = k * TICK, session + k * TICK
                 moment.x, moment.y, moment.yaw = q[0], q[1], yaw
-                moment.v, moment.side, moment.omega = cos * w[0] + sin * w[1], cos * w[1] - sin * w[0], w[5]
+                moment.v, moment.side, moment.omega = cos * w[0] + sin * w[1], side, omega
                 moment.spin, moment.angle = (w[left_v], w[right_v]), (q[left_q] - origin[0], q[right_q] - origin[1])
                 for effect in makers:
                     left, right = effect.torque(moment, left, right)
                 moment.torque = left, right
                 for effect in loaders:
                     effect.load(moment, load)
-            forward = load.forward + force[k]
-            applied[0], applied[1] = cos * forward - sin * load.left, sin * forward + cos * load.left
-            applied[3], applied[4], applied[5] = load.roll, load.pitch, load.yaw + twist[k]
+            forward, left_force = load.forward + force[k], load.left + rollers
+            applied[0], applied[1] = cos * forward - sin * left_force, sin * forward + cos * left_force
+            applied[3], applied[4] = load.roll, load.pitch
+            applied[5] = load.yaw + twist[k] + NOMINAL_WHEELBASE * rollers
             applied[left_v], applied[right_v] = load.wheel
             applied[el] += left
             applied[er] += right
