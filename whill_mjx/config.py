@@ -13,12 +13,17 @@ class VehicleConfig:
     """Control period [s]; the paper's 10 Hz."""
     physics_dt: float = 0.005
     """Physics step [s]; divides control_dt."""
+    dynamics: str = "fused"
+    """How a physics step is computed: "fused" takes the rigid bodies in closed form and everything on single numbers,
+    so that it compiles into few kernels; "mjx" calls `mjx.step`. Both give the same motion to rounding."""
 
     def __post_init__(self) -> None:
         if self.physics_dt <= 0 or abs(self.substeps * self.physics_dt - self.control_dt) > 1e-9:
             raise ValueError(
                 f"physics_dt {self.physics_dt} does not divide control_dt {self.control_dt}; choose e.g. 0.005 and 0.1."
             )
+        if self.dynamics not in ("fused", "mjx"):
+            raise ValueError(f"dynamics is {self.dynamics!r}; it must be 'fused' or 'mjx'. Leave it out for 'fused'.")
 
     @property
     def substeps(self) -> int:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
@@ -18,6 +19,22 @@ ASSET = Path(__file__).parent / "assets" / "whill_cr.xml"
 CHASSIS = 1  # body ids, in the order of the asset
 
 
+@dataclass(frozen=True)
+class WheelBodies:
+    """Either driven wheel as a rigid body, the same inertia about every axis, on a hinge along y."""
+
+    x: float
+    """Place of the axle in the chassis frame [m]; its height is that of the chassis origin."""
+    y: float
+    """Distance of either wheel from the middle [m]."""
+    mass: float
+    """[kg]"""
+    inertia: float
+    """Of the body [kg m^2]; next to nothing, the spin inertia is the armature."""
+    armature: float
+    """Spin inertia on the hinge [kg m^2]."""
+
+
 @dataclass(frozen=True, eq=False)
 class VehicleModel:
     """Static part of a vehicle: spec, time steps and the MuJoCo model. Closed over by compiled functions."""
@@ -26,10 +43,24 @@ class VehicleModel:
     config: VehicleConfig
     mujoco: mujoco.MjModel
     """The model for C MuJoCo, with nominal mass."""
-    mjx: Any
-    """The same for MJX (mjx.Model)."""
-    data: Any
-    """An mjx.Data of the right shapes; only qpos, qvel and qfrc_applied of it are ever set."""
+    wheels: WheelBodies
+    """The two driven wheels as bodies of that model."""
+
+    @cached_property
+    def mjx(self) -> Any:
+        """The same for MJX (mjx.Model); made when first asked for, by dynamics "mjx"."""
+        from mujoco import mjx  # prints to stdout when imported, so only on demand
+
+        with jax.ensure_compile_time_eval():  # it may be asked for while tracing, and is kept
+            return mjx.put_model(self.mujoco)
+
+    @cached_property
+    def data(self) -> Any:
+        """An mjx.Data of the right shapes; only qpos, qvel and qfrc_applied of it are ever set."""
+        from mujoco import mjx
+
+        with jax.ensure_compile_time_eval():
+            return mjx.make_data(self.mjx)
 
 
 def mujoco_model(
@@ -70,9 +101,14 @@ def box_inertia(spec: VehicleSpec) -> tuple[float, float, float]:
 @lru_cache(maxsize=16)
 def build_model(spec: VehicleSpec, config: VehicleConfig | None = None) -> VehicleModel:
     """The static model of `spec`; built once per (spec, config)."""
-    from mujoco import mjx  # prints to stdout when imported, so only on demand
-
     config = config or VehicleConfig()
     host = mujoco_model(spec, config)
-    device = mjx.put_model(host)
-    return VehicleModel(spec, config, host, device, mjx.make_data(device))
+    return VehicleModel(spec, config, host, wheel_bodies(host))
+
+
+def wheel_bodies(host: mujoco.MjModel) -> WheelBodies:
+    """The driven wheels of a model from `mujoco_model`."""
+    left = host.body("left_wheel")
+    x, y, _ = (float(value) for value in left.pos)
+    armature = host.dof_armature[host.joint("left_wheel").dofadr[0]]
+    return WheelBodies(x, y, float(left.mass[0]), float(left.inertia[1]), float(armature))

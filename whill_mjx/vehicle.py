@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
+from whill_mjx import rigid
 from whill_mjx.effects.base import (
     apply_chain,
     contact_wrench,
@@ -15,6 +17,7 @@ from whill_mjx.effects.base import (
 )
 from whill_mjx.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.model import VehicleModel, box_inertia
+from whill_mjx.scalars import apart, scan_apart
 from whill_mjx.types import Drive, Geometry, Motion, Odometry, Payload, VehicleParams, VehicleState, World, Wrench
 
 STATIC_SAG = 0.005  # [m] suspension and tyre compression under the static load
@@ -35,6 +38,12 @@ def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, com
     Returns:
         The next state. A non-finite result is replaced by the previous state and flagged `diverged`.
     """
+    if model.config.dynamics == "fused":
+        return apart(partial(_substep, model))(params, state, command)
+    return _substep(model, params, state, command)
+
+
+def _substep(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
     memory, force, motion = forces(model, params, state, command)
     qpos, qvel = integrate(model, params, motion.world, state, force)
     healthy = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
@@ -44,13 +53,20 @@ def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, com
     return VehicleState(qpos, qvel, memory, encoder, reading, state.diverged | ~healthy)
 
 
+def substeps(model: VehicleModel, params: VehicleParams, state: VehicleState, commands: jax.Array) -> VehicleState:
+    """Advance one instance by K physics steps, each with its own command of commands (K, 2)."""
+
+    def body(state: VehicleState, command: jax.Array) -> VehicleState:
+        return _substep(model, params, state, command)
+
+    if model.config.dynamics == "fused":
+        return scan_apart(body, state, commands)
+    return jax.lax.scan(lambda state, command: (body(state, command), None), state, commands)[0]
+
+
 def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
     """Advance one instance by one control period with one command (2,) held."""
-
-    def body(state: VehicleState, _: None) -> tuple[VehicleState, None]:
-        return substep(model, params, state, command), None
-
-    return jax.lax.scan(body, state, None, length=model.config.substeps)[0]
+    return substeps(model, params, state, jnp.broadcast_to(command, (model.config.substeps, 2)))
 
 
 def forces(
@@ -76,7 +92,11 @@ def forces(
 def integrate(
     model: VehicleModel, params: VehicleParams, world: World, state: VehicleState, force: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """qpos (9,) and qvel (8,) after one `mjx.step` under the generalised force (8,)."""
+    """qpos (9,) and qvel (8,) one physics step on, under the generalised force (8,)."""
+    if model.config.dynamics == "fused":
+        return rigid.step(
+            model, *mass_distribution(model, params, world), world.gravity, state.qpos, state.qvel, force
+        )
     from mujoco import mjx
 
     data = model.data.replace(qpos=state.qpos, qvel=state.qvel, qfrc_applied=force)
@@ -84,16 +104,23 @@ def integrate(
     return data.qpos, data.qvel
 
 
-def instance_model(model: VehicleModel, params: VehicleParams, world: World):
-    """The mjx.Model with this instance's mass distribution and gravity."""
+def mass_distribution(
+    model: VehicleModel, params: VehicleParams, world: World
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mass (), inertia (3,) about the centre of mass and centre of mass (3,) of this instance's chassis body."""
     body = params.body
-    mass = body.mass
     roll, pitch, _ = box_inertia(model.spec)
-    scale = mass / model.spec.mass
+    scale = body.mass / model.spec.mass
     inertia = jnp.stack([roll * scale, pitch * scale, body.yaw_inertia])
     com = jnp.stack([body.com_x, body.com_y, body.com_z])
-    if world.payload is not None:
-        mass, inertia, com = add_payload(mass, inertia, com, world.payload)
+    if world.payload is None:
+        return body.mass, inertia, com
+    return add_payload(body.mass, inertia, com, world.payload)
+
+
+def instance_model(model: VehicleModel, params: VehicleParams, world: World):
+    """The mjx.Model with this instance's mass distribution and gravity."""
+    mass, inertia, com = mass_distribution(model, params, world)
     nominal = model.mjx
     return nominal.replace(
         body_mass=jnp.concatenate([nominal.body_mass[:1], mass[None], nominal.body_mass[2:]]),
@@ -169,7 +196,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         angular_velocity=rate,
         contact_vx=along(forward),
         contact_vy=along(left),
-        normal_force=smooth * jax.nn.softplus(load / smooth),
+        normal_force=smooth * softplus(load / smooth),
         spin=state.qvel[6:8],
         drive_torque=jnp.zeros(2),
         wheel_inertia=jnp.asarray(spec.wheel_inertia),
@@ -177,6 +204,11 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         track=spec.track,
         dt=model.config.physics_dt,
     )
+
+
+def softplus(value: jax.Array) -> jax.Array:
+    """log(1 + exp(value)), as `jax.nn.softplus` but of plain operations, which scalars.py can take apart."""
+    return jnp.maximum(value, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(value)))
 
 
 def suspension(mass: jax.Array) -> tuple[jax.Array, jax.Array]:
