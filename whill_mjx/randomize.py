@@ -70,4 +70,5 @@ def randomize_looks(key: jax.Array, scene: Scene) -> Scene:
         grain=jax.random.uniform(next(keys), maxval=0.10),
         seed=jax.random.bits(next(keys), dtype=jnp.uint32),
     )
-    return Scene(dataclasses.replace(boxes, colour=paint), dataclasses.replace(marker, colour=blue), looks)
+    solid, goal = dataclasses.replace(boxes, colour=paint), dataclasses.replace(marker, colour=blue)
+    return dataclasses.replace(scene, boxes=solid, marker=goal, looks=looks)

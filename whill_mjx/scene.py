@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from whill_mjx.finish import Finish
+from whill_mjx.solids import Solids
+
 
 @struct.dataclass
 class Boxes:
@@ -55,6 +58,8 @@ class Scene:
     boxes: Boxes
     marker: Marker
     looks: Looks
+    solids: Solids | None = None  # seen, but nothing collides with them
+    finish: Finish | None = None  # textures, lamps and fog
 
 
 def default_looks() -> Looks:

@@ -1,6 +1,6 @@
 """Images of the tasks stay what recorded policies were trained on.
 
-`PYTHONPATH=. python tests/whill_mjx/test_images_stay.py` writes the stored images anew; do so only together with new policies.
+`PYTHONPATH=. python tests/whill_mjx/test_images_stay.py` writes the stored images anew: only together with new policies.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from whill_mjx.env import make_env, observe, reset_state
 
 STORED = Path(__file__).parent / "images_stay.npz"
-WORLDS = [("obstacle_course", "fixed", False), ("obstacle_course", "randomised", True), ("corridor", "randomised", True)]
+COURSE = "obstacle_course"
+WORLDS = [(COURSE, "fixed", False), (COURSE, "randomised", True), ("corridor", "randomised", True)]
 
 
 def present_images() -> dict[str, np.ndarray]:

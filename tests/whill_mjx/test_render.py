@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.render import FIRST_BOX, GROUND, MARKER, SKY, _reciprocal, pinhole, render, render_frame
+from whill_mjx.render import FIRST_BOX, GROUND, MARKER, SKY, pinhole, render, render_frame
+from whill_mjx.render.visibility import reciprocal
 from whill_mjx.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 
 EYE = jnp.array([0.0, 0.0, 1.0])
@@ -138,11 +139,11 @@ def test_images_of_other_sizes_keep_the_view():
 
 
 def test_more_boxes_than_labels_are_refused():
-    with pytest.raises(ValueError, match="300 boxes"):
-        render(EYE, LEVEL, LENS, dataclasses.replace(scene_of(), boxes=no_boxes(300)))
+    with pytest.raises(ValueError, match="3000 boxes"):
+        render(EYE, LEVEL, LENS, dataclasses.replace(scene_of(), boxes=no_boxes(3000)))
 
 
 @pytest.mark.quick
 def test_reciprocal_without_division_is_right_to_single_precision():
     x = jnp.concatenate([jnp.logspace(-14, 6, 2000), -jnp.logspace(-14, 6, 2000)])
-    np.testing.assert_allclose(_reciprocal(x) * x, 1.0, rtol=5e-7)
+    np.testing.assert_allclose(reciprocal(x) * x, 1.0, rtol=5e-7)
