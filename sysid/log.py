@@ -22,6 +22,7 @@ from whill_mjx.specs import SPECS, WHILL_CR, VehicleSpec
 SCHEMA = 1
 STANDSTILL = 1.0
 """Longest part of a trial's start that is used to find its start pose [s]."""
+START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
 MAX_SPEED = 20.0  # m/s; more is km/h or mm/s
 MAX_YAW_RATE = 20.0  # rad/s; more is deg/s
 MAX_TIME = 1e7  # s; more is a Unix time stamp or milliseconds
@@ -177,15 +178,20 @@ def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
     held_out: bool = False, group: str = "",
 ) -> Trial:
-    """A trial that starts at rest: its start pose is the mean over the standstill before the first command, at most
-    one second; the odometry is counted from there."""
+    """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
+    the odometry is counted from there.
+
+    A trial whose first command already moves starts in motion, at the speeds that the odometry then reports, or at
+    those commanded where there is no odometry. Such a start is known from its first sample alone.
+    """
     still = standstill_end(command)
-    start = Start()
+    v, omega = _start_speeds(command, odometry)
+    start = Start(v=v, omega=omega)
     if ground_truth is not None:
         rest = _rest(ground_truth.t, still)
         x, y, yaw = ground_truth.x[rest], ground_truth.y[rest], ground_truth.yaw[rest]
         spread = np.sqrt((_variance(x) + _variance(y)) / 2)
-        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()),
+        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()), v, omega,
                       position_sigma=float(spread / np.sqrt(len(x))),
                       yaw_sigma=float(np.sqrt(_variance(yaw) / len(x))))
     if odometry is not None and odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
@@ -338,6 +344,15 @@ def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Comma
         if values is not None and np.ptp(values) > limit:
             raise ValueError(f"{path}: {name} spans {np.ptp(values):g}, though the commands allow {limit:.3g} at most. "
                              f"Convert it to {hint}, or correct the commands.")
+
+
+def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[float, float]:
+    """Speed [m/s] and yaw rate [rad/s] at the start; exactly 0 at rest, whatever the sensors' noise."""
+    told = float(command.v[0]), float(command.omega[0])
+    if command.t[0] > 0 or max(abs(told[0]), abs(told[1])) < 1e-6:
+        return 0.0, 0.0
+    speeds = told if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
+    return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
 
 
 def _rest(t: np.ndarray, still: float) -> np.ndarray:

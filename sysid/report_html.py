@@ -19,6 +19,7 @@ COLUMNS = {"ground_truth": ("along [m]", "left [m]", "yaw [rad]"),
 MAX_TRIALS = 12  # drawn one by one
 MAX_ROWS = 60  # of a table of trials
 MAX_LAG = 3.0  # s of the autocorrelation
+WORSE = 1.001  # times as much counts as worse
 SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
 
 
@@ -306,7 +307,7 @@ def _label(trial: TrialSeries) -> str:
 
 
 def _is_more(value: float | None, reference: float | None) -> bool:
-    return value is not None and reference is not None and value > reference
+    return value is not None and reference is not None and value > WORSE * reference
 
 
 def _float(value: float | None) -> float:

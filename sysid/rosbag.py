@@ -1,0 +1,221 @@
+"""Reads the three streams of a driving log out of a ROS bag (rosbag2 .db3 or .mcap, ROS 1 .bag), without ROS.
+
+Known are the paper's topics, the maker's, and those of `bridge.ros`; others are named by the caller or found by their
+type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
+PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TOPICS = {
+    "command": ("/whill/controller/cmd_vel", "/cmd_vel", "/whill/cmd_vel"),
+    "odometry": ("/whill/odom", "/odom", "/whill/odometry"),
+    "ground_truth": ("/ground_truth/odom", "/ground_truth/pose"),
+}
+"""Names that are looked for, the first found is taken. Odometry topics are never guessed to be ground truth."""
+TYPES = {
+    "command": ("Twist", "TwistStamped"),
+    "odometry": ("Odometry",),
+    "ground_truth": ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"),
+}
+COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"), "ground_truth": ("x", "y", "yaw")}
+OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic"}
+SUFFIXES = (".db3", ".mcap", ".bag")
+MAX_SET_BACK = 0.5  # s that a stamp may run back by before the clock counts as set
+
+
+@dataclass(frozen=True)
+class BagStream:
+    """One topic of a bag."""
+
+    topic: str
+    kind: str
+    """Message type, like "nav_msgs/msg/Odometry"."""
+    received: np.ndarray  # (T,) s, Unix time at which the recorder got the message
+    stamped: np.ndarray  # (T,) s, of the header; nan where the type has none
+    values: np.ndarray  # (T, C) columns of COLUMNS
+
+
+@dataclass(frozen=True)
+class Bag:
+    """The streams of one recording, and what was noteworthy in reading them."""
+
+    path: Path
+    streams: dict[str, BagStream]
+    notes: list[str] = field(default_factory=list)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is one recording: a folder with metadata.yaml, or a file of a known kind."""
+    return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in SUFFIXES)
+
+
+def find_bags(source: Path) -> list[Path]:
+    """The recordings at a path or directly under it, in order of their names; empty where there is none."""
+    if is_bag(source):
+        return [source]
+    return sorted(path for path in source.iterdir() if is_bag(path)) if source.is_dir() else []
+
+
+def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
+    """Streams of a recording.
+
+    Args:
+        path: folder of a rosbag2, or a .db3, .mcap or .bag file.
+        topics: "command", "odometry", "ground_truth" -> topic; those left out are looked for, "" leaves one out.
+
+    Raises:
+        ValueError: naming the file, the topic, the rule and the remedy.
+    """
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ValueError(f"{path}: reading ROS bags needs the package rosbags ({error}). "
+                         "Run `pip install rosbags`.") from None
+    notes: list[str] = []
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
+            chosen = choose_topics(path, known, topics or {}, notes)
+            rows: dict[str, list[tuple[float, float, tuple[float, ...]]]] = {stream: [] for stream in chosen}
+            names = {topic: stream for stream, topic in chosen.items()}
+            connections = [one for one in reader.connections if one.topic in names]
+            for connection, received, raw in reader.messages(connections=connections):
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                stream = names[connection.topic]
+                rows[stream].append((received * 1e-9, header_time(message), read_message(
+                    path, connection.topic, stream, short_type(connection.msgtype), message)))
+    except (AnyReaderError, OSError, KeyError, AssertionError) as error:
+        raise ValueError(f"{path}: cannot be read as a ROS bag ({error}). Give the folder with metadata.yaml, or a "
+                         ".db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` repairs one.") from None
+    streams = {}
+    for stream, topic in chosen.items():
+        table = np.array([values for _, _, values in rows[stream]], float).reshape(len(rows[stream]), -1)
+        finite = np.isfinite(table).all(axis=1)
+        if not finite.all():
+            notes.append(f"{topic}: {(~finite).sum()} messages with numbers that are not finite are left out")
+        received, stamped = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
+        if len(received) < 2:
+            raise ValueError(f"{path}: topic {topic} has {len(received)} usable messages; at least 2 are needed. Name "
+                             f"another topic with {OPTIONS[stream]}, or '' to go without.")
+        streams[stream] = BagStream(topic, known[topic], received, stamped, table[finite])
+    return Bag(path, streams, notes)
+
+
+def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], notes: list[str]) -> dict[str, str]:
+    """Topic of each stream, from what the bag has, what was asked for, and the names that are usual."""
+    listing = ", ".join(f"{name} ({short_type(kind)})" for name, kind in sorted(known.items())) or "none"
+    chosen: dict[str, str] = {}
+    for stream in TOPICS:
+        if stream in asked:
+            topic = asked[stream]
+            if not topic:
+                continue
+            if topic not in known:
+                raise ValueError(f"{path}: no topic {topic!r} (topics with messages: {listing}). Correct "
+                                 f"{OPTIONS[stream]}.")
+            if short_type(known[topic]) not in TYPES[stream]:
+                raise ValueError(f"{path}: topic {topic} is {known[topic]}; {stream} must be one of "
+                                 f"{', '.join(TYPES[stream])}. Name another topic with {OPTIONS[stream]}.")
+            chosen[stream] = topic
+            continue
+        usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
+        fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
+                   and name not in (*chosen.values(), *asked.values())]
+        if usual:
+            chosen[stream] = usual[0]
+        elif stream != "ground_truth" and len(fitting) == 1 and fitting[0] not in TOPICS["ground_truth"]:
+            chosen[stream] = fitting[0]
+            notes.append(f"{stream} is taken from {fitting[0]}, the only topic of a fitting type")
+    if "command" not in chosen and "command" not in asked:
+        raise ValueError(f"{path}: no command topic found (topics with messages: {listing}). Name the Twist or "
+                         "TwistStamped that was sent to the vehicle with --command-topic.")
+    if "command" not in chosen:
+        raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
+    if not {"odometry", "ground_truth"} & set(chosen):
+        raise ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {listing}). Name one "
+                         "with --odometry-topic or --truth-topic.")
+    return chosen
+
+
+def read_message(path: Path, topic: str, stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw."""
+    if stream == "command":
+        twist = message.twist if kind == "TwistStamped" else message
+        return float(twist.linear.x), float(twist.angular.z)
+    pose = _POSE[kind](message)
+    position = getattr(pose, "position", None) or pose.translation
+    q = getattr(pose, "orientation", None) or pose.rotation
+    if abs(q.w) + abs(q.x) + abs(q.y) + abs(q.z) < 1e-6:
+        raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a topic "
+                         "with an orientation, or leave this one out.")
+    planar = float(position.x), float(position.y), yaw_of(q.w, q.x, q.y, q.z)
+    if stream == "ground_truth":
+        return planar
+    speed = message.twist.twist
+    return *planar, float(speed.linear.x), float(speed.angular.z)
+
+
+_POSE: dict[str, Callable[[Any], Any]] = {
+    "Odometry": lambda message: message.pose.pose, "PoseStamped": lambda message: message.pose,
+    "PoseWithCovarianceStamped": lambda message: message.pose.pose,
+    "TransformStamped": lambda message: message.transform,
+}
+
+
+def yaw_of(w: float, x: float, y: float, z: float) -> float:
+    """Heading [rad] of a quaternion of any length."""
+    return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+
+
+def header_time(message: Any) -> float:
+    """Header stamp [s]; nan where the message has none."""
+    header = getattr(message, "header", None)
+    return float("nan") if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
+
+
+def short_type(kind: str) -> str:
+    """Odometry of nav_msgs/msg/Odometry."""
+    return kind.rsplit("/", 1)[-1]
+
+
+def stream_times(bag: Bag, stamp: str) -> dict[str, np.ndarray]:
+    """Times [s] of each stream's messages.
+
+    Args:
+        stamp: "receive" (all on the recorder's clock) or "header" (when measured; commands, which have no header, keep
+            the time of receipt, so both clocks must agree).
+
+    Raises:
+        ValueError: a stream has no stamps, or they run back.
+    """
+    times = {}
+    for name, stream in bag.streams.items():
+        has_header = bool(np.isfinite(stream.stamped).all())
+        if stamp == "header" and has_header and (stream.stamped <= 0).all():
+            raise ValueError(f"{bag.path}: topic {stream.topic}: all header stamps are zero. Use --stamp receive.")
+        if stamp == "header" and not has_header and name != "command":
+            raise ValueError(f"{bag.path}: topic {stream.topic} is {stream.kind}, without a header. Use --stamp "
+                             "receive.")
+        t = stream.stamped if stamp == "header" and has_header else stream.received
+        back = np.diff(t)
+        if (back < -MAX_SET_BACK).any():
+            k = int(np.argmin(back))
+            raise ValueError(f"{bag.path}: topic {stream.topic}: its time goes back by {-back[k]:.3g} s after message "
+                             f"{k + 1}; it must increase. Split the bag there, or use the other --stamp.")
+        times[name] = t
+    if stamp == "header":
+        late = {name: float(np.median(bag.streams[name].received - t)) for name, t in times.items()}
+        for name, seconds in late.items():
+            if abs(seconds) > 5.0:
+                raise ValueError(f"{bag.path}: topic {bag.streams[name].topic}: header stamps are {seconds:.3g} s from "
+                                 "the time of receipt: another clock. Use --stamp receive.")
+    return times

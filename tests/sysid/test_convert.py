@@ -1,0 +1,321 @@
+"""ROS bags and measured sets into a dataset: written with rosbags itself, read back through the loader."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import shared_folder
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+import sysid.convert as convert_module
+from sysid.convert import ConvertConfig, convert
+from sysid.log import Command, OdometryStream, PoseStream, load_log, make_trial
+from sysid.measured import load_drive
+from sysid.rosbag import yaw_of
+
+pytestmark = pytest.mark.quick
+STORE = get_typestore(Stores.ROS2_JAZZY)
+T0 = 1_700_000_000.0  # s, Unix time of the recordings
+COMMAND, ODOMETRY, TRUTH = "/whill/controller/cmd_vel", "/whill/odom", "/ground_truth/odom"
+
+
+def message(kind, **fields):
+    return STORE.types[kind](**fields)
+
+
+def vector(x=0.0, y=0.0, z=0.0):
+    return message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def header(t):
+    stamp = message("builtin_interfaces/msg/Time", sec=int(t), nanosec=int(round((t % 1) * 1e9)) % 1_000_000_000)
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id="odom")
+
+
+def twist(v, omega):
+    return message("geometry_msgs/msg/Twist", linear=vector(v), angular=vector(z=omega))
+
+
+def pose(x, y, yaw, scale=1.0):
+    return message("geometry_msgs/msg/Pose", position=message("geometry_msgs/msg/Point", x=x, y=y, z=0.3),
+                   orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=scale * np.sin(yaw / 2),
+                                       w=scale * np.cos(yaw / 2)))
+
+
+def odometry(t, x, y, yaw, v, omega, scale=1.0):
+    blank = np.zeros(36)
+    return message(
+        "nav_msgs/msg/Odometry", header=header(t), child_frame_id="base_link",
+        pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose(x, y, yaw, scale), covariance=blank),
+        twist=message("geometry_msgs/msg/TwistWithCovariance", twist=twist(v, omega), covariance=blank))
+
+
+def motion(t):
+    """A drive from 2 to 8 s at 0.5 m/s and 1 rad/s, another from 14 to 18 s backwards: v, omega, x, y, yaw."""
+    forward, back = np.clip(t - 2, 0, 6), np.clip(t - 14, 0, 4)
+    going, backing = (t >= 2) & (t < 8), (t >= 14) & (t < 18)
+    v, omega = 0.5 * going - 0.4 * backing, 1.0 * going + 0.0 * t
+    yaw = forward
+    x = 0.5 * np.sin(yaw) - 0.4 * back * np.cos(6.0)
+    y = 0.5 * (1 - np.cos(yaw)) - 0.4 * back * np.sin(6.0)
+    return v, omega, x, y, yaw
+
+
+def write_bag(folder, storage=StoragePlugin.SQLITE3, topics=(COMMAND, ODOMETRY, TRUTH), stamped=False, late=0.03,
+              edit=None, truth_kind="nav_msgs/msg/Odometry", end=21.0):
+    """A recording of `motion`: commands at 10 Hz, odometry at 20 Hz from (3, 1, 2 rad), outside pose at 10 Hz.
+
+    `late` is how much later than its header a message is received.
+    """
+    command_topic, odometry_topic, truth_topic = topics
+    kind = "geometry_msgs/msg/TwistStamped" if stamped else "geometry_msgs/msg/Twist"
+    rows = []
+    for t in np.arange(0.0, end, 0.1):
+        v, omega, *_ = (float(value) for value in motion(t))
+        command = twist(v, omega)
+        rows.append((t, command_topic, kind, message(kind, header=header(T0 + t), twist=command) if stamped
+                     else command))
+    cos, sin = np.cos(2.0), np.sin(2.0)
+    for t in np.arange(0.01, end, 0.05):
+        v, omega, x, y, yaw = (float(value) for value in motion(t))
+        rows.append((t + late, odometry_topic, "nav_msgs/msg/Odometry", odometry(
+            T0 + t, 3 + cos * x - sin * y, 1 + sin * x + cos * y, yaw + 2.0, v, omega, scale=3.0)))
+    for t in np.arange(0.02, end, 0.1):
+        v, omega, x, y, yaw = (float(value) for value in motion(t))
+        if truth_kind == "geometry_msgs/msg/PoseStamped":
+            seen = message(truth_kind, header=header(T0 + t), pose=pose(x, y, yaw))
+        else:
+            seen = odometry(T0 + t, x, y, yaw, v, omega)
+        rows.append((t + late, truth_topic, truth_kind, seen))
+    rows = [row for row in sorted(rows, key=lambda row: row[0]) if row[1]]
+    if edit:
+        rows = edit(rows)
+    with Writer(folder, version=9, storage_plugin=storage) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=STORE)
+                       for topic, kind in {(row[1], row[2]) for row in rows}}
+        for t, topic, kind, content in rows:
+            writer.write(connections[topic], int(round((T0 + t) * 1e9)), STORE.serialize_cdr(content, kind))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp("bags") / "figure_1")
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
+    write_bag(tmp_path / "circle_1", storage)
+    log, notes = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "log"))
+    (trial,) = log.trials
+    assert (trial.name, trial.manoeuvre) == ("circle_1", "circle")
+    assert any(COMMAND in note for note in notes)
+    t = trial.odometry.t
+    assert np.median(np.diff(t)) == pytest.approx(0.05, abs=1e-3)
+    origin = 0.05  # s into the recording: the later of the first odometry and outside pose received, both 30 ms late
+    v, omega, x, y, yaw = motion(t + origin - 0.03)
+    for found, expected in ((trial.odometry.v, v), (trial.odometry.omega, omega), (trial.odometry.x, x),
+                            (trial.odometry.y, y), (trial.odometry.yaw, yaw)):
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(trial.ground_truth.yaw, motion(trial.ground_truth.t + origin - 0.03)[4], atol=1e-4)
+    assert trial.command.t[0] == 0.0 and trial.command.v[0] == 0.0
+    start = trial.command.t[np.flatnonzero(trial.command.v)[0]]
+    assert start == pytest.approx(2.0 - origin, abs=1e-3)
+    assert log.spec.wheel_radius == 0.1325
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_bag_file_without_its_folder_is_read_too(tmp_path, suffix):
+    storage = StoragePlugin.MCAP if suffix == ".mcap" else StoragePlugin.SQLITE3
+    (source,) = write_bag(tmp_path / "bag", storage).glob(f"*{suffix}")
+    shutil.copy(source, tmp_path / f"drive{suffix}")
+    log, _ = convert(ConvertConfig(tmp_path / f"drive{suffix}", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["drive"]
+
+
+def test_header_stamps_undo_the_delay_of_receipt(bag, tmp_path):
+    log, notes = convert(ConvertConfig(bag, tmp_path / "log", stamp="header"))
+    t = log.trials[0].odometry.t
+    np.testing.assert_allclose(log.trials[0].odometry.v, motion(t + 0.02)[0], atol=1e-4)
+    assert any("commands have no header" in note for note in notes)
+
+
+def test_drives_are_split_at_standstill(bag, tmp_path):
+    log, notes = convert(ConvertConfig(bag, tmp_path / "log", split="standstill", held_out=("figure_1-02",)))
+    assert [trial.name for trial in log.trials] == ["figure_1-01", "figure_1-02"]
+    assert [trial.name for trial in log.held_out] == ["figure_1-02"]
+    first, second = log.trials
+    for trial, moving in ((first, 6.0), (second, 4.0)):
+        told = np.flatnonzero((np.abs(trial.command.v) > 0) | (np.abs(trial.command.omega) > 0))
+        assert trial.command.t[told[0]] == pytest.approx(2.0, abs=0.15)
+        assert trial.command.t[told[-1] + 1] - trial.command.t[told[0]] == pytest.approx(moving, abs=0.11)
+        assert trial.duration == pytest.approx(moving + 4.0, abs=0.3)
+    assert np.ptp(second.odometry.x) == pytest.approx(1.6, abs=0.01) and second.odometry.x[-1] < 0
+    assert np.abs(second.odometry.yaw).max() < 1e-3
+
+
+def test_stamped_commands_poses_and_other_names_are_read(tmp_path):
+    write_bag(tmp_path / "bag", topics=("/teleop/twist", "/base/odometry", "/vrpn/chair/pose"), stamped=True,
+              truth_kind="geometry_msgs/msg/PoseStamped")
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", truth_topic="/vrpn/chair/pose",
+                                       truth_ahead=0.2, stamp="header"))
+    assert "command is taken from /teleop/twist" in " ".join(notes)
+    truth = log.trials[0].ground_truth
+    v, omega, x, y, yaw = motion(truth.t + 0.02)
+    np.testing.assert_allclose(truth.x, x - 0.2 * np.cos(yaw), atol=1e-4)
+    np.testing.assert_allclose(truth.y, y - 0.2 * np.sin(yaw), atol=1e-4)
+
+
+def test_outside_pose_is_never_guessed_and_can_be_left_out(bag, tmp_path):
+    write_bag(tmp_path / "bag", topics=(COMMAND, ODOMETRY, "/second/odom"))
+    log, _ = convert(ConvertConfig(tmp_path / "bag", tmp_path / "a"))
+    assert log.trials[0].ground_truth is None
+    log, _ = convert(ConvertConfig(bag, tmp_path / "b", truth_topic=""))
+    assert log.trials[0].ground_truth is None and log.trials[0].odometry is not None
+
+
+def test_bags_of_one_folder_are_trials_and_can_be_added_later(bag, tmp_path):
+    source = tmp_path / "bags"
+    for name in ("figure_2", "figure_3"):
+        shutil.copytree(bag, source / name)
+    convert(ConvertConfig(bag, tmp_path / "log"))
+    log, _ = convert(ConvertConfig(source, tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["figure_1", "figure_2", "figure_3"]
+    with pytest.raises(ValueError, match="figure_2: exists already"):
+        convert(ConvertConfig(source, tmp_path / "log"))
+    assert not list(tmp_path.glob(".*partial*"))
+
+
+def test_messages_out_of_order_or_not_finite_are_left_out_and_counted(tmp_path):
+    def edit(rows):
+        rows = [list(row) for row in rows]
+        at = [k for k, row in enumerate(rows) if row[1] == ODOMETRY]
+        rows[at[100]][3] = odometry(T0 + 5.0, np.nan, 0.0, 0.0, 0.0, 0.0)
+        rows[at[50]][3] = odometry(T0 + 2.4, 0.0, 0.0, 0.0, 0.0, 0.0)  # stamped before its forerunner
+        return rows
+
+    write_bag(tmp_path / "bag", edit=edit)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp="header"))
+    text = " ".join(notes)
+    assert "1 messages with numbers that are not finite" in text and "odometry: 1 messages out of order" in text
+    assert len(log.trials[0].odometry.t) >= 415
+
+
+def drop(topic, keep=0):
+    def edit(rows):
+        mine = [row for row in rows if row[1] == topic]
+        return [row for row in rows if row[1] != topic or any(row is one for one in mine[:keep])]
+    return edit
+
+
+def set_clock_back(rows):
+    return [(t, topic, kind, odometry(T0 + t - 9.0 * (t > 10), 0.0, 0.0, 0.0, 0.0, 0.0) if topic == ODOMETRY else one)
+            for t, topic, kind, one in rows]
+
+
+def zero_quaternion(rows):
+    return [(t, topic, kind, odometry(T0 + t, 0, 0, 0, 0, 0, scale=0.0) if topic == ODOMETRY else one)
+            for t, topic, kind, one in rows]
+
+
+def zero_stamps(rows):
+    return [(t, topic, kind, odometry(0.0, 0, 0, 0, 0, 0) if topic == ODOMETRY else one)
+            for t, topic, kind, one in rows]
+
+
+@pytest.mark.parametrize(("edit", "options", "rule"), [
+    (drop(COMMAND), {}, r"no command topic found \(topics with messages: .*--command-topic"),
+    (drop(ODOMETRY, 1), {}, "topic /whill/odom has 1 usable messages.*--odometry-topic"),
+    (None, {"odometry_topic": "/nowhere"}, "no topic '/nowhere'.*Correct --odometry-topic"),
+    (None, {"command_topic": ODOMETRY}, "/whill/odom is nav_msgs/msg/Odometry; command must be"),
+    (None, {"odometry_topic": "", "truth_topic": ""}, "neither odometry nor outside pose"),
+    (set_clock_back, {"stamp": "header"}, "topic /whill/odom: its time goes back by .* use the other --stamp"),
+    (zero_quaternion, {}, "topic /whill/odom: the orientation is all zero"),
+    (zero_stamps, {"stamp": "header"}, "topic /whill/odom: all header stamps are zero. Use --stamp receive"),
+    (None, {"held_out": ("eight_1",)}, "--held-out eight_1: no such trial"),
+    (None, {"vehicle": "my chair"}, "--vehicle my chair: not built in .*--wheel-radius"),
+])
+def test_errors_name_file_topic_rule_and_remedy(tmp_path, edit, options, rule):
+    write_bag(tmp_path / "bag", edit=edit, end=12.0)
+    with pytest.raises(ValueError, match=rule):
+        convert(replace(ConvertConfig(tmp_path / "bag", tmp_path / "log"), **options))
+    assert not (tmp_path / "log" / "trials").exists()
+
+
+def test_a_damaged_bag_is_refused_by_its_name(bag, tmp_path):
+    shutil.copytree(bag, tmp_path / "bag")
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    file.write_bytes(file.read_bytes()[:3000])
+    with pytest.raises(ValueError, match="bag: cannot be read as a ROS bag"):
+        convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+
+
+def test_heading_of_a_quaternion_of_any_length_and_tilt():
+    assert yaw_of(2 * np.cos(0.6), 0.0, 0.0, 2 * np.sin(0.6)) == pytest.approx(1.2)
+    assert yaw_of(-np.cos(0.6), 0.0, 0.0, -np.sin(0.6)) == pytest.approx(1.2)
+    half = np.sqrt(0.5)  # tilted a little about the vehicle's own axis after turning by 90 degrees
+    tilt = (half * np.cos(0.05), half * np.sin(0.05), half * np.sin(0.05), half * np.cos(0.05))
+    assert yaw_of(*tilt) == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.parametrize(("told", "reported", "start"), [(0.0, 0.4, 0.0), (0.5, 0.4, 0.4), (0.5, 0.01, 0.0),
+                                                         (0.5, None, 0.5)])
+def test_a_trial_whose_first_command_moves_starts_in_motion(told, reported, start):
+    t = np.arange(5) * 0.1
+    stream = None if reported is None else OdometryStream(t, 0 * t, 0 * t, 0 * t, np.full(5, reported), 0 * t)
+    trial = make_trial("x", Command(t, np.full(5, told), 0 * t), stream, PoseStream(t, 0 * t, 0 * t, 0 * t))
+    assert trial.start.v == start and trial.start.omega == 0.0
+
+
+def test_a_measured_run_converts_with_its_moving_starts(tmp_path):
+    run = "warthog_grass_2024_07_18_continuous"
+    source = shared_folder("drive_norlab")
+    log, notes = convert(ConvertConfig(source, tmp_path / "log", select=(run,)))
+    original = load_drive(source, (run,), chained=True).trials
+    assert len(log.trials) == len(original) and "dead reckoned" in " ".join(notes)
+    assert log.spec.drive == "skid" and log.spec.track == original[0].command.v.dtype.type(1.08)
+    moving = [(mine, theirs) for mine, theirs in zip(log.trials, original, strict=True)
+              if abs(theirs.start.v) > 0.05 and abs(theirs.command.v[0]) > 1e-6]
+    assert moving
+    for mine, theirs in moving:
+        assert mine.start.v == pytest.approx(theirs.start.v, abs=1e-5)
+        np.testing.assert_allclose(mine.ground_truth.x[-len(theirs.ground_truth.x):], theirs.ground_truth.x, atol=1e-5)
+
+
+def test_a_source_that_does_not_exist_ends_with_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["convert", str(tmp_path / "x.mcap"), "--out", str(tmp_path / "log")])
+    with pytest.raises(SystemExit, match="error: .*x.mcap: does not exist"):
+        convert_module.cli()
+
+
+def test_a_folder_without_any_recording_is_refused(tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="empty: no dataset.toml"):
+        convert(ConvertConfig(tmp_path / "empty", tmp_path / "log"))
+
+
+def test_a_converted_dataset_is_itself_convertible(bag, tmp_path):
+    first, _ = convert(ConvertConfig(bag, tmp_path / "a"))
+    again, _ = convert(ConvertConfig(tmp_path / "a", tmp_path / "b"))
+    np.testing.assert_allclose(again.trials[0].odometry.x, first.trials[0].odometry.x, atol=2e-6)
+    assert load_log(tmp_path / "b").spec.track == first.spec.track
+
+
+def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
+    from bridge.record import TrialWriter, parse_arguments, write_dataset_file
+
+    folder = tmp_path / "log"
+    writer = TrialWriter(folder, "straight_1")
+    write_dataset_file(folder, parse_arguments([str(folder), "straight_1"]))
+    for t in np.arange(0.0, 4.0, 0.05):
+        writer.command(t, 0.5 * (t > 1), 0.0)
+        writer.odometry(t, 0.5 * max(t - 1, 0), 0.0, 0.0, 0.5 * (t > 1), 0.0)
+    writer.close()
+    log, _ = convert(ConvertConfig(bag, folder))
+    assert [trial.name for trial in log.trials] == ["figure_1", "straight_1"]
+    assert log.spec.name == "WHILL Model CR"
