@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from dreamer.config import preset as learner_preset
 from dreamer.types import FunctionalEnv, Params, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import END_METRICS, make_env
+from whill_mjx.intervals import wilson_interval
 from whill_mjx.task import Task, make_task
 from whill_mjx.types import TimeStep
 
@@ -157,17 +157,6 @@ def record_drives(batch: BatchEnv, carry: Any, act: Driver, key: jax.Array, vide
     path = np.concatenate([start[:, None], poses.swapaxes(0, 1)], axis=1)
     frames = np.concatenate([first[:, None], frames.swapaxes(0, 1)], axis=1)
     return Drives(path, alive.sum(0), metrics, frames, scenes)
-
-
-def wilson_interval(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson score interval of a share; 95 % for the default z."""
-    if trials < 1:
-        raise ValueError(f"{trials} trials give no interval; run at least one.")
-    share = successes / trials
-    centre = share + z * z / (2 * trials)
-    half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    scale = 1 + z * z / trials
-    return (centre - half) / scale, (centre + half) / scale
 
 
 def summarise(drives: Drives) -> dict[str, Any]:

@@ -1,0 +1,262 @@
+"""Evaluation: a hand-made policy with sight, blinded; figures of made-up traces; sweeps; what the command leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import marker_seeker  # noqa: E402
+
+from whill_mjx.conditions import nominal, seen_under  # noqa: E402
+from whill_mjx.effects import EFFECTS  # noqa: E402
+from whill_mjx.env import make_env, reset_state  # noqa: E402
+from whill_mjx.evaluate import EvaluateOptions, choose_task, main  # noqa: E402
+from whill_mjx.evaluation import Episodes, episode_figures, summarise  # noqa: E402
+from whill_mjx.intervals import bootstrap_interval, wilson_interval  # noqa: E402
+from whill_mjx.kinematics import camera_pose, rotation_from_quaternion  # noqa: E402
+from whill_mjx.network import Network  # noqa: E402
+from whill_mjx.policy_file import load_policy  # noqa: E402
+from whill_mjx.presets import preset  # noqa: E402
+from whill_mjx.report import episode_video  # noqa: E402
+from whill_mjx.rollouts import CHANNELS  # noqa: E402
+from whill_mjx.sweeps import parse_sweep, with_parameter  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def seeker(tmp_path_factory):
+    """A policy that drives towards the blue marker."""
+    return marker_seeker.write(tmp_path_factory.mktemp("seeker") / "policy")
+
+
+@pytest.fixture(scope="module")
+def evaluated(seeker, tmp_path_factory):
+    """One command with everything: the start is turned so far that only who sees the marker gets to it."""
+    out = tmp_path_factory.mktemp("evaluation")
+    options = EvaluateOptions(
+        str(seeker), episodes=6, out=out, set=("gates=0", "max_steps=110"), blind=("freeze", "replay"),
+        sweep=("start_yaw_deg=-18,18 latency_s=0,0.2",), sweep_episodes=3, html=True,
+    )  # fmt: skip
+    return out, main(options)
+
+
+def test_a_seeing_policy_arrives_and_its_figures_have_intervals(evaluated):
+    out, result = evaluated
+    policy = result["drivers"]["policy"]
+    assert policy["success"] == 1.0 and policy["episodes"] == 6
+    assert 4.2 < policy["path_length_m"] < 5.0 and 7.0 < policy["time_to_goal_s"] < 8.5
+    for name in ("success", "return", "time_to_goal_s", "min_clearance_m"):
+        low, high = policy[f"{name}_interval_95"]
+        assert low <= policy[name] + 1e-9 and policy[name] - 1e-9 <= high
+    assert json.loads((out / "evaluation.json").read_text())["drivers"]["policy"] == policy
+
+
+def test_a_turned_start_is_corrected_by_who_sees(evaluated):
+    sweep = evaluated[1]["sweeps"][0]
+    assert [axis["name"] for axis in sweep["axes"]] == ["start_yaw_deg", "latency_s"]
+    np.testing.assert_array_equal(np.array(sweep["success"]), 1.0)
+    assert np.array(sweep["success_interval_95"]).shape == (2, 2, 2)
+
+
+def test_blinded_episodes_are_reported_beside_the_sighted_ones(evaluated):
+    drivers = evaluated[1]["drivers"]
+    assert set(drivers) == {"policy", "policy freeze", "policy replay"}
+    # A frozen first image keeps turning to one side; actions of another episode lead somewhere else.
+    assert drivers["policy freeze"]["return"] < drivers["policy"]["return"] - 5
+    assert drivers["policy replay"]["return"] < drivers["policy"]["return"]
+
+
+def test_pictures_and_page_are_written_and_the_video_where_something_failed(evaluated):
+    out, result = evaluated
+    left = {path.name for path in out.iterdir()}
+    assert left >= {"evaluation.json", "report.html", "paths.png", "paths_policy_freeze.png",
+                    "sweep_start_yaw_deg_latency_s.png"}
+    assert "failures.mp4" not in left  # the policy itself never failed
+    assert (out / "report.html").read_text().count("<img") == len([name for name in left if name.endswith(".png")])
+
+
+def test_the_compiled_network_acts_like_the_vehicles_runtime(seeker):
+    compiled, on_host = load_policy(seeker), load_policy(seeker, "onnxruntime")
+    images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    carry = jax.tree.map(lambda leaf: jnp.zeros((3, *leaf.shape)), compiled.start())
+    for policy in (compiled, on_host):
+        assert policy.action_repeat == 2 and policy.low == (0.0, -1.0)
+    ours, theirs = (jax.jit(jax.vmap(policy.step))(carry, images) for policy in (compiled, on_host))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, theirs)
+
+
+@pytest.mark.quick
+def test_network_operators_agree_with_onnxruntime_on_a_graph_of_many():
+    """Convolution, padding, slicing, splitting, reductions, argmax and constant shapes in one graph."""
+    import onnxruntime
+    from onnx import TensorProto, helper, numpy_helper
+
+    def constant(name, values, kind=np.int64):
+        return numpy_helper.from_array(np.asarray(values, kind), name)
+
+    rng, node = np.random.default_rng(0), helper.make_node
+    nodes = [
+        node("Transpose", ["x"], ["t"], perm=[2, 0, 1]), node("Unsqueeze", ["t", "zero"], ["u"]),
+        node("Pad", ["u", "pads"], ["p"]), node("Conv", ["p", "kernel", "bias"], ["c"], strides=[2, 2], group=1),
+        node("Slice", ["c", "starts", "ends", "axes", "steps"], ["s"]), node("Shape", ["s"], ["shape"]),
+        node("Gather", ["shape", "zero"], ["first"]), node("Concat", ["first", "minus"], ["wanted"], axis=0),
+        node("Reshape", ["s", "wanted"], ["r"]), node("Gemm", ["r", "w", "b"], ["g"], transB=1, alpha=0.5),
+        node("Split", ["g", "sizes"], ["l", "m"], axis=1), node("Softmax", ["l"], ["soft"], axis=1),
+        node("ArgMax", ["soft"], ["best"], axis=1, keepdims=1), node("Cast", ["best"], ["b32"], to=TensorProto.FLOAT),
+        node("ReduceMax", ["m", "one"], ["top"], keepdims=1), node("Softplus", ["top"], ["plus"]),
+        node("Max", ["plus", "b32"], ["larger"]), node("Greater", ["larger", "half"], ["flag"]),
+        node("Where", ["flag", "larger", "half"], ["y"]),
+    ]  # fmt: skip
+    initializers = [
+        constant("zero", [0]), constant("one", [1]), constant("minus", [-1]), constant("sizes", [3, 2]),
+        constant("pads", [0, 0, 1, 1, 0, 0, 1, 1]), constant("starts", [-1, 0]), constant("ends", [-(2**31), 3]),
+        constant("axes", [2, 3]), constant("steps", [-2, 1]), constant("half", [0.5], np.float32),
+        constant("kernel", rng.normal(size=(4, 3, 3, 3)), np.float32), constant("bias", np.ones(4), np.float32),
+        constant("w", rng.normal(size=(5, 24)), np.float32), constant("b", np.arange(5), np.float32),
+    ]  # fmt: skip
+    graph = helper.make_graph(
+        nodes, "many", [helper.make_tensor_value_info("x", TensorProto.FLOAT, [8, 6, 3])],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("y", "g")], initializers,
+    )  # fmt: skip
+    data = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
+    x = rng.normal(size=(8, 6, 3)).astype(np.float32)
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    for ours, theirs in zip(jax.jit(Network(data))(x), session.run(None, {"x": x}), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.quick
+def test_damaged_and_foreign_policy_files_are_refused(seeker, tmp_path):
+    import shutil
+
+    with pytest.raises(ValueError, match="does not exist"):
+        load_policy(tmp_path / "nothing")
+    broken = tmp_path / "broken"
+    shutil.copytree(seeker, broken)
+    (broken / "policy.onnx").write_bytes(b"x")
+    with pytest.raises(ValueError, match="SHA-256"):
+        load_policy(broken)
+
+
+def made_up(clearances, ends, dt=0.1):
+    """Episodes that drive along x at 1 m/s with these clearances."""
+    count, rows = len(clearances), len(clearances[0])
+    trace = np.zeros((count, rows, len(CHANNELS)), np.float32)
+    trace[..., CHANNELS.index("x")] = np.arange(rows) * dt
+    trace[..., CHANNELS.index("clearance")] = clearances
+    trace[..., CHANNELS.index("omega_command")] = np.arange(rows) % 2
+    names = ("success", "collision", "timeout", "diverged")
+    table = {name: np.array([float(end == name) for end, _ in ends]) for name in names}
+    table |= {"time_s": np.array([seconds for _, seconds in ends]), "episode_return": np.arange(count, dtype=float)}
+    return Episodes(trace, table, None, jax.random.split(jax.random.key(0), count), dt)
+
+
+@pytest.mark.quick
+def test_figures_of_made_up_traces():
+    """Two near misses; a collision, which is none; and what lies after the end does not count."""
+    episodes = made_up(
+        [[1, 0.05, 1, 0.05, 0.05, 1], [1, 1, 1, 0.05, 0.0, 0.0], [1, 1, 1, 0.05, 0.05, 0.0]],
+        [("success", 0.5), ("collision", 0.4), ("timeout", 0.2)],
+    )
+    figures = episode_figures(episodes)
+    np.testing.assert_array_equal(figures["near_misses"], [2, 0, 0])
+    np.testing.assert_allclose(figures["near_s"], [0.3, 0.2, 0.0], atol=1e-6)
+    np.testing.assert_allclose(figures["min_clearance_m"], [0.05, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(figures["path_length_m"], [0.5, 0.4, 0.2], atol=1e-6)
+    np.testing.assert_allclose(figures["command_change_rad_s2"], 10.0, rtol=1e-5)
+    np.testing.assert_allclose(figures["acceleration_rms_m_s2"], 0.0)
+    summary = summarise(episodes)
+    assert summary["time_to_goal_s"] == 0.5 and summary["collision"] == pytest.approx(1 / 3)
+    assert summary["episodes_with_near_miss"] == pytest.approx(1 / 3)
+
+
+@pytest.mark.quick
+def test_bootstrap_interval_of_normal_numbers_is_that_of_the_t_distribution():
+    values = np.random.default_rng(1).normal(3.0, 2.0, 400)
+    half = 1.96 * values.std(ddof=1) / 20
+    np.testing.assert_allclose(bootstrap_interval(values), (values.mean() - half, values.mean() + half), atol=0.03)
+    assert wilson_interval(10, 10)[0] > 0.7
+    with pytest.raises(ValueError, match="at least one"):
+        bootstrap_interval(np.zeros(0))
+
+
+@pytest.mark.quick
+def test_the_video_shows_each_episode_until_its_end(tmp_path):
+    import imageio.v2 as imageio
+
+    episodes = made_up([[1.0] * 6] * 2, [("collision", 0.2), ("timeout", 0.5)])
+    frames = np.zeros((2, 6, 16, 16, 3), np.uint8)
+    frames[:] = (40 * np.arange(6))[None, :, None, None, None]
+    above = np.zeros((2, 6, 32, 16, 3), np.uint8)
+    path = episode_video(episodes, frames, above, tmp_path / "two.mp4", 10.0, scale=2)
+    shown = np.array(imageio.mimread(path), float)
+    assert shown.shape == (15, 96, 64, 3)
+    np.testing.assert_allclose(shown[[0, 2, 5, 14], 16, 16].mean(-1), [0, 80, 80, 80], atol=12)
+    np.testing.assert_allclose(shown[[0, 2, 5, 14], 16, 48].mean(-1), [0, 80, 200, 200], atol=12)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.quick
+def test_sweeps_are_read_and_bad_ones_refused():
+    first, second = parse_sweep("obstacle_x=2,3 start_y=-0.5:0.5:3")
+    assert first.values == (2.0, 3.0) and second.values == (-0.5, 0.0, 0.5)
+    (mass,) = parse_sweep("body.mass=0.5x:1.5x:3")
+    assert mass.relative and mass.values == (0.5, 1.0, 1.5) and mass.labels == ["0.5x", "1x", "1.5x"]
+    for text, message in (
+        ("wind=1", "unknown axis"), ("wing.span=1", "no effect"), ("body.colour=1", "no parameter"),
+        ("light=", "no axis"),
+        ("light=-1", "not negative"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"), ("light=a", "could not"),
+        ("light=1 light=2", "twice"), ("light=1 start_y=1 start_x=1", "one or two"), ("", "0 axes"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            parse_sweep(text)
+
+
+@pytest.mark.quick
+def test_a_swept_parameter_changes_its_effect_or_adds_it():
+    _, params = preset("whill_cr_ramp")
+    heavier = with_parameter(params, "body.mass", jnp.asarray(2.0), relative=True)
+    assert float(heavier.body.mass) == pytest.approx(2 * float(params.body.mass))
+    late = with_parameter(params, "command_delay.delay", jnp.asarray(0.2), relative=False)
+    assert len(late.effects) == len(params.effects) + 1
+    assert isinstance(late.effects[-1], EFFECTS["command_delay"])
+    assert float(late.effects[-1].delay) == pytest.approx(0.2)
+    again = with_parameter(late, "command_delay.delay", jnp.asarray(0.1), relative=False)
+    assert len(again.effects) == len(late.effects)
+
+
+@pytest.mark.quick
+def test_a_displaced_camera_is_where_the_condition_puts_it():
+    env, params = make_env("corridor", layout="fixed", photometric=False, random_looks=False)
+    state = reset_state(env, params, jax.random.key(0))
+    change = dataclasses.replace(
+        nominal(), camera_x=jnp.array(0.1), camera_y=jnp.array(0.2), camera_z=jnp.array(-0.05),
+        camera_pitch_deg=jnp.array(10.0), camera_yaw_deg=jnp.array(90.0),
+    )  # fmt: skip
+    chassis = rotation_from_quaternion(state.vehicle.qpos[3:7])
+    before, _ = camera_pose(env.model, state.vehicle.qpos)
+    after, turned = camera_pose(env.model, seen_under(change, env, state).vehicle.qpos)
+    np.testing.assert_allclose(chassis.T @ (after - before), [0.1, 0.2, -0.05], atol=1e-5)
+    down = env.model.spec.camera.pitch + np.deg2rad(10.0)
+    np.testing.assert_allclose(chassis.T @ turned[:, 2], [0.0, np.cos(down), -np.sin(down)], atol=1e-5)
+
+
+@pytest.mark.quick
+def test_task_fields_come_from_the_run_the_policy_and_the_command(seeker):
+    config = seeker.parent / "config.json"
+    config.write_text(json.dumps({"preset": {"task": {"gates": 1, "gate_x": [2.0, 3.5], "v_min": -1.0}}}))
+    policy = load_policy(seeker)
+    task = choose_task(EvaluateOptions(str(seeker), set=("goal_x=5.0",)), policy)
+    assert (task.gates, task.gate_x, task.goal_x, task.v_min, task.action_repeat) == (1, (2.0, 3.5), 5.0, 0.0, 2)
+    config.unlink()
+    with pytest.raises(ValueError, match="no field 'gate'"):
+        choose_task(EvaluateOptions(str(seeker), set=("gate=1",)), policy)
+    with pytest.raises(ValueError, match="is no int"):
+        choose_task(EvaluateOptions(str(seeker), set=("gates=two",)), policy)
