@@ -1,0 +1,140 @@
+"""The model-free baseline: advantages by hand, a tiny problem it must learn from pixels, and its exported step."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from whill_mjx.ppo import (
+    Network,
+    PpoConfig,
+    ReturnScale,
+    Rollout,
+    advantages,
+    init_state,
+    iterate,
+    policy_carry,
+    policy_step,
+    push,
+    track,
+)
+
+TINY = PpoConfig(stack=2, width=32, channels=(8, 8, 8), rollout=16, epochs=4, minibatches=4, lr=3e-3)
+
+
+@struct.dataclass
+class Step:
+    obs: jax.Array
+    reward: jax.Array
+    is_first: jax.Array
+    is_last: jax.Array
+    is_terminal: jax.Array
+    metrics: dict
+
+
+def half_lit_env(count, length=4):
+    """One half of the image is lit; the first action component should point there: reward 1 - |a - side| / 2.
+
+    Episodes last `length` steps, and the step after the end resets and ignores its action.
+    """
+
+    def emit(key, age, reward, first):
+        side = jnp.where(jax.vmap(jax.random.bernoulli)(jax.vmap(jax.random.fold_in)(key, age)), 1.0, -1.0)
+        columns = jnp.arange(8) >= 4
+        lit = jnp.where((side > 0)[:, None], columns, ~columns)
+        obs = jnp.broadcast_to((255 * lit)[:, None, :, None], (count, 8, 8, 3)).astype(jnp.uint8)
+        last = age >= length
+        return side, Step(obs, reward, first, last, last, {"success": reward})
+
+    def reset(key):
+        keys, age = jax.random.split(key, count), jnp.zeros(count, jnp.int32)
+        side, step = emit(keys, age, jnp.zeros(count), jnp.ones(count, bool))
+        return (keys, age, side, step.is_last), step
+
+    def step(state, action):
+        keys, age, side, ended = state
+        keys = jnp.where(ended, jax.vmap(lambda key: jax.random.fold_in(key, 99))(keys), keys)
+        age = jnp.where(ended, 0, age + 1)
+        reward = jnp.where(ended, 0.0, 1.0 - jnp.abs(action[:, 0] - side) / 2)
+        side, step = emit(keys, age, reward, ended)
+        return (keys, age, side, step.is_last), step
+
+    return SimpleNamespace(num_envs=count, obs_shape=(8, 8, 3), action_dim=2, reset=reset, step=step)
+
+
+def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
+    env, iterations = half_lit_env(16), 40
+    state = jax.jit(lambda: init_state(env, TINY, iterations, 0))()
+    run = jax.jit(lambda state: iterate(env, TINY, iterations, state), donate_argnums=0)
+    rewards = []
+    for _ in range(iterations):
+        state, metrics = run(state)
+        rewards.append(float(metrics["reward"]))
+    # Four of five steps earn a reward (the fifth resets): 0.4 by chance, 0.8 at best.
+    assert rewards[0] < 0.5 and np.mean(rewards[-5:]) > 0.68
+    step = jax.jit(lambda carry, image: policy_step(TINY, state.params, carry, image))
+    for side, columns in ((-1.0, slice(0, 4)), (1.0, slice(4, 8))):
+        image = np.zeros((8, 8, 3), np.uint8)
+        image[:, columns] = 255
+        _, action = step(policy_carry(TINY, 8, 8), image)
+        assert float(action[0]) * side > 0.5
+
+
+@pytest.mark.quick
+def test_advantages_by_hand():
+    """A truncated end bootstraps from its own frame, a terminal one does not, and neither looks into the next one."""
+    config = PpoConfig(discount=0.5, gae_lambda=1.0)
+    column = lambda *values: jnp.array(values, jnp.float32)[:, None]  # noqa: E731
+    rollout = Rollout(
+        None, None, None, value=column(1.0, 2.0, 4.0), reward=column(1.0, 0.0, 8.0),
+        terminal=column(0.0, 0.0, 1.0), last=column(0.0, 1.0, 1.0), used=None,
+    )  # fmt: skip
+    advantage, target = advantages(config, rollout, jnp.array([100.0]))
+    # Back to front: 8 - 4 = 4; then 0 + 0.5 * 4 - 2 = 0, cut off; then 1 + 0.5 * 2 - 1 + 0.5 * 0 = 1.
+    np.testing.assert_allclose(advantage[:, 0], [1.0, 0.0, 4.0])
+    np.testing.assert_allclose(target[:, 0], [2.0, 2.0, 8.0])
+
+
+@pytest.mark.quick
+def test_rewards_are_scaled_by_the_spread_of_the_return():
+    config = PpoConfig(discount=0.0)
+    zero = jnp.zeros(())
+    scale, rng, seen = ReturnScale(jnp.zeros(50), zero, zero, zero), np.random.default_rng(0), []
+    assert float(scale.std()) == 1.0
+    for _ in range(20):
+        rewards = rng.normal(2.0, 3.0, 50)
+        seen.append(rewards)
+        scale = track(config, scale, jnp.asarray(rewards, jnp.float32), jnp.zeros(50, bool))
+    np.testing.assert_allclose(float(scale.std()), np.std(seen, ddof=1), rtol=1e-3)
+
+
+@pytest.mark.quick
+def test_frames_are_stacked_and_an_episode_begins_with_black_ones():
+    frames = jnp.full((2, 1, 1, 6), 7, jnp.uint8)
+    obs = jnp.full((2, 1, 1, 3), 9, jnp.uint8)
+    stacked = push(frames, obs, jnp.array([True, False]))
+    np.testing.assert_array_equal(stacked[:, 0, 0], [[0, 0, 0, 9, 9, 9], [7, 7, 7, 9, 9, 9]])
+
+
+@pytest.mark.quick
+def test_the_exported_step_sees_what_the_network_was_trained_on():
+    params = Network(TINY, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 6), jnp.uint8))
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8)
+    carry, frames = policy_carry(TINY, 8, 8), jnp.zeros((1, 8, 8, 6), jnp.uint8)
+    for count, image in enumerate(images):
+        carry, action = policy_step(TINY, params, carry, image)
+        frames = push(frames, image[None], jnp.array([count == 0]))
+        np.testing.assert_allclose(action, Network(TINY, 2).apply(params, frames)[0][0], atol=1e-6)
+
+
+@pytest.mark.quick
+def test_minibatches_that_do_not_divide_a_rollout_are_refused():
+    with pytest.raises(ValueError, match="minibatches"):
+        init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 1, 0)
+    with pytest.raises(ValueError, match="epochs"):
+        PpoConfig(epochs=0)

@@ -1,0 +1,301 @@
+"""Proximal policy optimisation from pixels: the model-free baseline, one compiled iteration.
+
+Schulman et al. 2017 (arXiv 1707.06347) with generalised advantages; the network is that of Mnih et al. 2015 on the last
+few frames. An environment that resets in the step after the end (see batch.py) ignores one action per episode: that
+step is left out of the loss, and a truncated episode bootstraps from its own last frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+
+@dataclass(frozen=True)
+class PpoConfig:
+    """All numbers of the learner."""
+
+    stack: int = 3
+    """Frames that the network sees, the newest last."""
+    width: int = 256
+    """Units of the layer after the convolutions."""
+    channels: tuple[int, int, int] = (32, 64, 64)
+    """Channels of the three convolutions (8x8 by 4, 4x4 by 2, 3x3 by 1)."""
+    rollout: int = 64
+    """Steps of each instance between two updates."""
+    epochs: int = 4
+    """Passes over each rollout."""
+    minibatches: int = 8
+    """Parts of a pass; they must divide rollout times instances."""
+    lr: float = 3e-4
+    """Learning rate at the start; it falls linearly to zero over the run."""
+    discount: float = 0.99
+    """Per decision."""
+    gae_lambda: float = 0.95
+    """Lambda of the advantages."""
+    clip: float = 0.2
+    """Largest change of an action's probability that still earns."""
+    value_scale: float = 0.5
+    """Weight of the critic's loss."""
+    entropy_scale: float = 1e-3
+    """Weight of the entropy."""
+    max_grad_norm: float = 0.5
+    """Gradients are clipped by their global norm to this."""
+    log_std: float = -0.5
+    """Logarithm of the actions' standard deviation at the start."""
+
+    def __post_init__(self) -> None:
+        for name in ("stack", "width", "rollout", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must be at least 1. Change {name}.")
+
+
+class Network(nn.Module):
+    """Mean of the action, and value, of stacked frames (..., H, W, 3 * stack) uint8."""
+
+    config: PpoConfig
+    actions: int
+
+    @nn.compact
+    def __call__(self, frames: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        orthogonal = nn.initializers.orthogonal
+        x = frames.astype(jnp.float32) / 255.0 - 0.5
+        for channels, kernel, stride in zip(self.config.channels, (8, 4, 3), (4, 2, 1), strict=True):
+            convolution = nn.Conv(channels, (kernel, kernel), (stride, stride), kernel_init=orthogonal(2**0.5))
+            x = nn.relu(convolution(x))
+        x = x.reshape((*x.shape[:-3], -1))
+        x = nn.relu(nn.Dense(self.config.width, kernel_init=orthogonal(2**0.5))(x))
+        mean = nn.Dense(self.actions, kernel_init=orthogonal(0.01))(x)
+        value = nn.Dense(1, kernel_init=orthogonal(1.0))(x)[..., 0]
+        log_std = self.param("log_std", nn.initializers.constant(self.config.log_std), (self.actions,))
+        return mean, log_std, value
+
+
+@struct.dataclass
+class ReturnScale:
+    """Running variance of the discounted return, by which rewards are divided."""
+
+    running: jax.Array  # (N,) discounted sum of the running episodes
+    count: jax.Array  # ()
+    mean: jax.Array  # ()
+    squares: jax.Array  # () sum of squared deviations
+
+    def std(self) -> jax.Array:
+        """() standard deviation, 1 at the beginning."""
+        return jnp.where(self.count > 1, jnp.sqrt(self.squares / jnp.maximum(self.count - 1, 1)) + 1e-6, 1.0)
+
+
+@struct.dataclass
+class PpoState:
+    """Everything a run needs to go on."""
+
+    params: Any
+    opt: Any
+    env_state: Any
+    step: Any  # frames waiting for an action, as the environment gave them
+    frames: jax.Array  # (N, H, W, 3 * stack) uint8
+    scale: ReturnScale
+    key: jax.Array
+    updates: jax.Array  # () iterations done
+
+
+@struct.dataclass
+class Rollout:
+    """T steps of N instances."""
+
+    frames: jax.Array  # (T, N, H, W, 3 * stack) uint8
+    action: jax.Array  # (T, N, A)
+    log_prob: jax.Array  # (T, N)
+    value: jax.Array  # (T, N)
+    reward: jax.Array  # (T, N) earned by the action
+    terminal: jax.Array  # (T, N) bool, of the step after it
+    last: jax.Array  # (T, N) bool, alike
+    used: jax.Array  # (T, N) bool: the action was not ignored by a reset
+
+
+def push(frames: jax.Array, obs: jax.Array, first: jax.Array) -> jax.Array:
+    """Stacked frames (N, H, W, 3 * stack) with `obs` (N, H, W, 3) as the newest; before a first frame all is black."""
+    kept = jnp.where(first[:, None, None, None], jnp.uint8(0), frames[..., 3:])
+    return jnp.concatenate([kept, obs], axis=-1)
+
+
+def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) -> PpoState:
+    """State before the first step; `env` is a vector environment (`num_envs`, `obs_shape`, `action_dim`, reset, step).
+
+    Raises:
+        ValueError: the minibatches do not divide a rollout.
+    """
+    if env.num_envs * config.rollout % config.minibatches:
+        raise ValueError(
+            f"{env.num_envs} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
+            "change PpoConfig.rollout or minibatches."
+        )
+    env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
+    env_state, step = env.reset(env_key)
+    height, width, channels = env.obs_shape
+    empty = jnp.zeros((env.num_envs, height, width, channels * config.stack), jnp.uint8)
+    params = Network(config, env.action_dim).init(net_key, empty)
+    zero = jnp.zeros(())
+    scale = ReturnScale(jnp.zeros(env.num_envs), zero, zero, zero)
+    return PpoState(
+        params, optimiser(config, total_iterations).init(params), env_state, step, push(empty, step.obs, step.is_first),
+        scale, key, jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+
+
+def optimiser(config: PpoConfig, total_iterations: int) -> optax.GradientTransformation:
+    """Adam with a clipped gradient and a rate that falls to zero over the run."""
+    steps = total_iterations * config.epochs * config.minibatches
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adam(optax.linear_schedule(config.lr, 0.0, max(steps, 1)), eps=1e-5),
+    )
+
+
+def iterate(
+    env: Any, config: PpoConfig, total_iterations: int, state: PpoState
+) -> tuple[PpoState, dict[str, jax.Array]]:
+    """One rollout and its updates. Compile it once with the state donated.
+
+    Returns:
+        New state; sums over the rollout (`episodes`, `episode/...` to be divided by it) and means of the losses.
+    """
+    state, rollout, last_value, metrics = collect(env, config, state)
+    advantage, target = advantages(config, rollout, last_value)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (rollout, advantage, target))
+    network, transform = Network(config, env.action_dim), optimiser(config, total_iterations)
+    size = advantage.size
+
+    def minibatch(carry: tuple, index: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+        params, opt = carry
+        chosen = jax.tree.map(lambda leaf: leaf[index], flat)
+        gradients, figures = jax.grad(lambda p: loss(config, network, p, *chosen), has_aux=True)(params)
+        updates, opt = transform.update(gradients, opt, params)
+        return (optax.apply_updates(params, updates), opt), figures
+
+    def epoch(carry: tuple, key: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+        order = jax.random.permutation(key, size).reshape(config.minibatches, -1)
+        return jax.lax.scan(minibatch, carry, order)
+
+    key, update_key = jax.random.split(state.key)
+    epochs = jax.random.split(update_key, config.epochs)
+    (params, opt), figures = jax.lax.scan(epoch, (state.params, state.opt), epochs)
+    metrics |= {name: value.mean() for name, value in figures.items()}
+    return dataclasses.replace(state, params=params, opt=opt, key=key, updates=state.updates + 1), metrics
+
+
+def collect(
+    env: Any, config: PpoConfig, state: PpoState
+) -> tuple[PpoState, Rollout, jax.Array, dict[str, jax.Array]]:
+    """T steps of all instances with sampled actions, the value (N,) after them, and sums over ended episodes."""
+    network = Network(config, env.action_dim)
+
+    def one(carry: tuple, key: jax.Array) -> tuple[tuple, tuple[Rollout, dict[str, jax.Array]]]:
+        env_state, step, frames, scale = carry
+        mean, log_std, value = network.apply(state.params, frames)
+        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        env_state, after = env.step(env_state, jnp.clip(action, -1.0, 1.0))
+        scale = track(config, scale, after.reward, step.is_last)
+        row = Rollout(
+            frames, action, log_probability(action, mean, log_std), value, after.reward / scale.std(),
+            after.is_terminal, after.is_last, ~step.is_last,
+        )  # fmt: skip
+        done = after.is_last.astype(jnp.float32)
+        watched = {f"episode/{name}": jnp.sum(done * value) for name, value in after.metrics.items()}
+        watched |= {"episodes": done.sum(), "reward": after.reward.mean() / config.rollout}
+        return (env_state, after, push(frames, after.obs, after.is_first), scale), (row, watched)
+
+    key, *step_keys = jax.random.split(state.key, config.rollout + 1)
+    carry = (state.env_state, state.step, state.frames, state.scale)
+    carry, (rollout, watched) = jax.lax.scan(one, carry, jnp.stack(step_keys))
+    env_state, step, frames, scale = carry
+    _, _, last_value = network.apply(state.params, frames)
+    state = dataclasses.replace(state, env_state=env_state, step=step, frames=frames, scale=scale, key=key)
+    return state, rollout, last_value, {name: value.sum(0) for name, value in watched.items()}
+
+
+def track(config: PpoConfig, scale: ReturnScale, reward: jax.Array, begins: jax.Array) -> ReturnScale:
+    """The return scale after one step of rewards (N,); `begins` (N,) marks instances that were just reset."""
+    running = jnp.where(begins, 0.0, config.discount * scale.running) + reward
+    count = scale.count + running.size
+    delta = running.mean() - scale.mean
+    mean = scale.mean + delta * running.size / count
+    within = jnp.sum((running - running.mean()) ** 2)
+    squares = scale.squares + within + delta**2 * scale.count * running.size / count
+    return ReturnScale(running, count, mean, squares)
+
+
+def advantages(config: PpoConfig, rollout: Rollout, last_value: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Generalised advantages (T, N) and value targets (T, N).
+
+    delta_t = r_t + discount V_{t+1} (1 - terminal_t) - V_t;  A_t = delta_t + discount lambda (1 - last_t) A_{t+1}
+    """
+    following = jnp.concatenate([rollout.value[1:], last_value[None]])
+    delta = rollout.reward + config.discount * following * (1.0 - rollout.terminal) - rollout.value
+
+    def back(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        here = now[0] + config.discount * config.gae_lambda * (1.0 - now[1]) * later
+        return here, here
+
+    _, advantage = jax.lax.scan(back, jnp.zeros_like(last_value), (delta, rollout.last), reverse=True)
+    return advantage, advantage + rollout.value
+
+
+def loss(
+    config: PpoConfig, network: Network, params: Any, rollout: Rollout, advantage: jax.Array, target: jax.Array
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Clipped policy loss, value loss and entropy of a minibatch (M, ...); ignored actions do not count."""
+    used = rollout.used.astype(jnp.float32)
+
+    def mean_used(values: jax.Array) -> jax.Array:
+        return jnp.sum(used * values) / jnp.maximum(used.sum(), 1.0)
+
+    mean, log_std, value = network.apply(params, rollout.frames)
+    centred = advantage - mean_used(advantage)
+    normalised = centred / (jnp.sqrt(mean_used(centred**2)) + 1e-8)
+    ratio = jnp.exp(log_probability(rollout.action, mean, log_std) - rollout.log_prob)
+    clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+    policy = -mean_used(jnp.minimum(ratio * normalised, clipped * normalised))
+    critic = 0.5 * mean_used((value - target) ** 2)
+    entropy = jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))
+    total = policy + config.value_scale * critic - config.entropy_scale * entropy
+    figures = {"loss_policy": policy, "loss_value": critic, "entropy": entropy,
+               "clipped": mean_used(jnp.abs(ratio - 1.0) > config.clip)}
+    return total, figures
+
+
+def log_probability(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """(...,) log density of actions (..., A) under independent normal distributions."""
+    return jnp.sum(-0.5 * ((action - mean) / jnp.exp(log_std)) ** 2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+
+
+def policy_step(
+    config: PpoConfig, params: Any, carry: dict[str, jax.Array], image: jax.Array
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """One control step of ONE instance, deterministic: the function that is exported.
+
+    Args:
+        config: sizes.
+        params: of the network.
+        carry: frames (H, W, 3 * (stack - 1)) uint8, the newest last; zeros start an episode.
+        image: (H, W, 3) uint8.
+
+    Returns:
+        The new carry and the action (A,) in [-1, 1].
+    """
+    actions = params["params"]["log_std"].shape[0]
+    frames = jnp.concatenate([carry["frames"], image], axis=-1)
+    mean, _, _ = Network(config, actions).apply(params, frames[None])
+    return {"frames": frames[..., 3:]}, jnp.clip(mean[0], -1.0, 1.0)
+
+
+def policy_carry(config: PpoConfig, height: int, width: int) -> dict[str, jax.Array]:
+    """Zero carry of `policy_step`."""
+    return {"frames": jnp.zeros((height, width, 3 * (config.stack - 1)), jnp.uint8)}
