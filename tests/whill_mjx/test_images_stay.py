@@ -1,6 +1,6 @@
 """Images of the tasks stay what recorded policies were trained on.
 
-`PYTHONPATH=. python tests/whill_mjx/test_images_stay.py` writes the stored images anew: only together with new policies.
+`PYTHONPATH=. python tests/whill_mjx/test_images_stay.py` writes the stored images anew: only with new policies.
 """
 
 from __future__ import annotations

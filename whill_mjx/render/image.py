@@ -175,7 +175,7 @@ class Arrays:
 
             key = _least(key, block_key, tables.block)
         if tables.round is not None:
-            square = rays.u * rays.u + rays.v * rays.v + 1.0
+            square = visibility.ray_square(rays)
 
             def round_key(numbers, index):
                 return visibility.round_key(rays, square, numbers, 4 * (parts.first_round + index), bits)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from whill_mjx.finish import Finish
@@ -91,7 +92,7 @@ def cast(view: View, stage: Stage, rays: Rays) -> Hit:
     mask = (1 << stage.bits) - 1
     ground = -view.position[2] * rays.inverse_z
     key = stage.nearest(rays)
-    ground_key = jnp.where(ground > 0, key_of(ground, 4 * GROUND, stage.bits), jnp.int32(FAR))
+    ground_key = jnp.where(ground > 0, key_of(ground, 4 * GROUND, stage.bits), np.int32(FAR))
     solid = key < ground_key
     depth = jnp.where(solid, bits_to_float(key & ~mask), jnp.where(ground > 0, ground, jnp.inf))
     return Hit(jnp.minimum(key, ground_key), key & mask, depth, solid, solid | (ground > 0))
@@ -234,7 +235,7 @@ def _fog(finish: Finish, rays: Rays, seen, depth, height, channels) -> list:
 
 def pack_channels(channels) -> jax.Array:
     """Words uint32 of three arrays in [0, 1]: blue << 16 | green << 8 | red."""
-    word = jnp.uint32(0)
+    word = np.uint32(0)
     for channel, value in enumerate(channels):
         level = (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32).astype(jnp.uint32)
         word = word | (level << (8 * channel))

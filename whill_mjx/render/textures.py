@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from whill_mjx.finish import ATLAS, TEXTURES
 
@@ -80,7 +81,7 @@ def _between(low, high, share):
 def random_cell(x, y, z, seed):
     """Random number in [0, 1) of the unit cell around a point; `seed` is uint32."""
     a, b, c = (jnp.floor(jnp.asarray(value)).astype(jnp.int32).astype(jnp.uint32) for value in (x, y, z))
-    mixed = (a * jnp.uint32(73856093)) ^ (b * jnp.uint32(19349663)) ^ (c * jnp.uint32(83492791)) ^ seed
-    mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0x9E3779B1)
-    mixed = (mixed ^ (mixed >> 13)) * jnp.uint32(0x85EBCA6B)
+    mixed = (a * np.uint32(73856093)) ^ (b * np.uint32(19349663)) ^ (c * np.uint32(83492791)) ^ seed
+    mixed = (mixed ^ (mixed >> 15)) * np.uint32(0x9E3779B1)
+    mixed = (mixed ^ (mixed >> 13)) * np.uint32(0x85EBCA6B)
     return (mixed >> 8).astype(jnp.int32).astype(jnp.float32) * (1.0 / (1 << 24))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from whill_mjx.scene import Boxes
 from whill_mjx.solids import Blocks, Rounds
@@ -70,7 +71,7 @@ def reciprocal(x: jax.Array) -> jax.Array:
 
     A guess from the bits (within 7 %), a quadratic step (3e-5; minimax coefficients) and a Newton step.
     """
-    guess = bits_to_float(jnp.int32(0x7EF00000) - jax.lax.bitcast_convert_type(x, jnp.int32))
+    guess = bits_to_float(np.int32(0x7EF00000) - jax.lax.bitcast_convert_type(x, jnp.int32))
     product = x * guess
     guess = guess * (3.0481951 + product * (-3.09533517 + product * 1.04711702))
     return guess + guess * (1.0 - x * guess)
@@ -135,7 +136,7 @@ def _slabs(inverse_x, inverse_y, inverse_z, reach_z, numbers, code, bits):
     far = jnp.minimum(jnp.minimum(middle_x + reach_x, middle_y + reach_y), middle_z + reach_z)
     near = jnp.maximum(jnp.maximum(near_x, near_y), jnp.maximum(near_z, 0.0))
     face = jnp.where(near_x > jnp.maximum(near_y, near_z), 0, jnp.where(near_y > near_z, 1, 2))
-    return jnp.where(near < far, key_of(near, code + face, bits), jnp.int32(FAR))
+    return jnp.where(near < far, key_of(near, code + face, bits), np.int32(FAR))
 
 
 # Rounds: 12 numbers each.
@@ -156,23 +157,31 @@ def round_table(position: jax.Array, rotation: jax.Array, rounds: Rounds) -> jax
     return jnp.concatenate([axis, centre, rest], 1)
 
 
+def ray_square(rays: Rays) -> tuple[jax.Array, jax.Array]:
+    """u^2 + v^2 + 1 of rays, and its inverse."""
+    square = rays.u * rays.u + rays.v * rays.v + 1.0
+    return square, reciprocal(square)
+
+
 def round_key(rays: Rays, square, numbers, code, bits: int = 10, invert: Callable = reciprocal) -> jax.Array:
-    """Key of one cylinder or capsule, FAR where the ray misses it. `square` is u^2 + v^2 + 1."""
+    """Key of one cylinder or capsule, FAR where the ray misses it. `square`: u^2 + v^2 + 1 and its inverse."""
     ray_axis = numbers[0] * rays.u + numbers[1] * rays.v + numbers[2]
     ray_centre = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
     along, centre2, radius2, half, capsule = (numbers[i] for i in range(6, 11))
-    distance, flat = round_distance(square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert)
+    distance, flat = round_distance(*square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert)
     distance = jnp.where(numbers[11] > 0, 0.0, distance)
     hit = (distance < 1e9) & (distance >= 0)
-    return jnp.where(hit, key_of(distance, code + jnp.where(flat, FLAT_END, CURVED), bits), jnp.int32(FAR))
+    return jnp.where(hit, key_of(distance, code + jnp.where(flat, FLAT_END, CURVED), bits), np.int32(FAR))
 
 
-def round_distance(square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert: Callable = reciprocal):
+def round_distance(
+    square, inverse_square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert: Callable = reciprocal
+):
     """Where rays enter a round, and whether through a flat end; 1e9 where they miss it, negative behind the origin.
 
     Args:
-        square, ray_axis, ray_centre: products of the ray direction with itself, the axis, and the centre as seen from
-            the ray's origin.
+        square, inverse_square: product of the ray direction with itself, and its inverse.
+        ray_axis, ray_centre: its products with the axis, and with the centre as seen from the ray's origin.
         along, centre2: product of that centre with the axis, and its square.
         radius2, half: squared radius [m2], half length [m].
         capsule: positive for round ends.
@@ -188,7 +197,7 @@ def round_distance(square, ray_axis, ray_centre, along, centre2, radius2, half, 
     ball_b = ray_centre + end * ray_axis
     ball_c = centre2 + end * (2.0 * along + end) - radius2
     ball_root = ball_b * ball_b - square * ball_c
-    ball = (ball_b - jnp.sqrt(jnp.maximum(ball_root, 0.0))) * invert(square)
+    ball = (ball_b - jnp.sqrt(jnp.maximum(ball_root, 0.0))) * inverse_square
     disc = (along + end) * invert(jnp.where(jnp.abs(ray_axis) < 1e-7, 1e-7, ray_axis))
     off_axis = disc * (disc * square - 2.0 * ray_centre) + centre2 - end * end  # squared distance from the axis
     cap = jnp.where(capsule > 0, ball, disc)
@@ -258,5 +267,5 @@ def round_shadow(x, y, z, numbers) -> jax.Array:
     along = dx * numbers[3] + dy * numbers[4] + dz * numbers[5]
     ray_centre = dx * numbers[10] + dy * numbers[11] + dz * numbers[12]
     centre2 = dx * dx + dy * dy + dz * dz
-    distance, _ = round_distance(1.0, numbers[9], ray_centre, along, centre2, numbers[6], numbers[7], numbers[8])
+    distance, _ = round_distance(1.0, 1.0, numbers[9], ray_centre, along, centre2, numbers[6], numbers[7], numbers[8])
     return (distance > SHADOW_GAP) & (distance < 1e8)
