@@ -47,7 +47,7 @@ HEADINGS = {
     "command": "Command: what the vehicle makes of (v, omega)",
     "actuation": "Actuation: from wheel-speed targets to force or torque",
     "force": "Force: wrenches on the chassis and torques on the wheels",
-    "world": "World: true geometry, gravity, load",
+    "world": "World: true geometry, ground, gravity, load",
     "sensing": "Sensing: what is reported",
 }
 CLOSING = """## Which look alike
@@ -56,9 +56,10 @@ row, or needs what the last column says.
 
 | alike | why | what separates them |
 |---|---|---|
+| `slope`, `incline` | the same motion in other coordinates | height and attitude |
 | `slope`, `wind` | both a force fixed in the room | a known load on board: only the slope's pull grows |
 | `track_width`, `turn_efficiency` | the same on a skid drive | nothing |
-| `command_delay`, `sensor_delay`, `clock_offset` | shifts in time | outside pose: it sees the first alone |
+| `command_delay`, `sensor_delay`, `clock_offset`, `state_rate` | shifts in time | outside pose sees the first alone |
 | `odometry_scale`, `command_scale`, `wheel_radius_difference` (common) | scales of distance | outside pose |
 | `air_drag`, `quadratic_drag` | one law | wind |
 | `rolling_resistance_speed`, `rolling_resistance` | hidden behind the speed control | coasting |
@@ -67,14 +68,13 @@ row, or needs what the last column says.
 | `torque_saturation`, `traction_limit` | a cap on each side's force | another floor |
 
 ## Left out
-- Command expiry (200 ms in the maker's specification): an effect sees the command in force at each physics step and
-  cannot tell one that is sent again from one that is held.
-- Encoder quantisation (about 1 mm/s): noise, not bias. Add it to the measurement noise.
+- What the chair does when a command lapses (brake, ramp) is not documented; `command_expiry` takes a command of zero.
+- A wheel touches the ground at one point: surfaces are smooth and longer than a wheel, no kerb or step can be climbed.
 - The cap of `traction_limit` knows nothing of cornering, and its wheels never break away; `slip_traction` of the
   physical base model does both.
 - `payload_shift` leaves out products of inertia: a load that is both ahead of and above the centre of mass couples roll
   and yaw, here it does not.
-- Logs have no gyro column: `gyro_bias` acts on the simulated gyro alone.
+- Fits read no gyro: `gyro_bias` and `gyro_range` show in the simulated gyro alone, and in `imu.csv` of a drive.
 """
 CHANNELS = {
     "body v": ("m/s", 0.01), "body omega": ("rad/s", 0.02), "odometry v": ("m/s", 0.01),

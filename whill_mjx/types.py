@@ -59,6 +59,7 @@ class World:
     gravity: jax.Array  # (3,) world frame [m/s^2]
     wind: jax.Array  # (3,) world frame [m/s]
     payload: Payload | None = None
+    ground: tuple = ()  # surfaces on the plane z = 0, see ground.py; none costs nothing
 
 
 @struct.dataclass
@@ -69,6 +70,8 @@ class Motion:
     mass: jax.Array  # () kg, without payload
     heading: jax.Array  # () rad
     ground_axes: jax.Array  # (3, 3) rows: forward along the ground, left along the ground, ground normal; chassis frame
+    contact_axes: jax.Array  # the same at each contact, (3, 3, 4); (3, 3) where the ground has no surfaces
+    contact_points: tuple  # x (4,), y (4,), z (4,) or () of the contact patches, chassis frame [m]
     rotation: jax.Array  # (3, 3) chassis to world
     velocity: jax.Array  # (3,) of the chassis origin, chassis frame [m/s]
     angular_velocity: jax.Array  # (3,) chassis frame [rad/s]

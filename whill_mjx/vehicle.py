@@ -15,6 +15,7 @@ from whill_mjx.effects.base import (
     side_forces,
     sum_forces,
 )
+from whill_mjx.ground import footing, plane_under
 from whill_mjx.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.model import VehicleModel, box_inertia
 from whill_mjx.scalars import apart, scan_apart
@@ -161,18 +162,13 @@ def nominal_world(model: VehicleModel) -> World:
 
 
 def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
-    """The present motion in the chassis frame, with the suspension's forces. The ground is the plane z = 0."""
+    """The present motion in the chassis frame, with the suspension's forces on the ground of `world`."""
     spec = model.spec
-    geometry = world.geometry
     rotation = rotation_from_quaternion(state.qpos[3:7])
     velocity = rotation.T @ state.qvel[:3]
     rate = state.qvel[3:6]
-    normal = rotation[2]  # world z in the chassis frame
-    forward = jnp.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    forward = forward / jnp.sqrt((forward * forward).sum())
-    left = jnp.cross(normal, forward)
-
-    x, y, z = geometry.contact_x, geometry.contact_y, -spec.wheel_radius
+    under = footing(world, rotation, state.qpos[:3], spec.wheel_radius)
+    x, y, z = under.contact_points
     point_velocity = (
         velocity[0] + rate[1] * z - rate[2] * y,
         velocity[1] + rate[2] * x - rate[0] * z,
@@ -182,15 +178,17 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
     def along(axis: jax.Array) -> jax.Array:
         return axis[0] * point_velocity[0] + axis[1] * point_velocity[1] + axis[2] * point_velocity[2]
 
-    height = state.qpos[2] + normal[0] * x + normal[1] * y  # of the wheel centres [m]
+    forward, left, normal = under.contact_axes
     stiffness, damping = suspension(params.body.mass)
     smooth = SMOOTH_LOAD * params.body.mass * GRAVITY / 4  # [N]
-    load = stiffness * (spec.wheel_radius - height) - damping * along(normal)
+    load = stiffness * (spec.wheel_radius - under.height) - damping * along(normal)
     return Motion(
         world=world,
         mass=params.body.mass,
         heading=heading(rotation),
-        ground_axes=jnp.stack([forward, left, normal]),
+        ground_axes=under.axes,
+        contact_axes=under.contact_axes,
+        contact_points=under.contact_points,
         rotation=rotation,
         velocity=velocity,
         angular_velocity=rate,
@@ -250,7 +248,8 @@ def place(
 ) -> VehicleState:
     """State with the reference point at (x, y) [m], heading yaw [rad] and twist (v [m/s], omega [rad/s]).
 
-    The chassis rests on its suspension: it tilts towards its centre of mass (small angles), and the wheels roll.
+    The chassis rests on its suspension: it tilts towards its centre of mass (small angles), and the wheels roll. On a
+    ground with surfaces it stands on the plane through its contacts, and v is horizontal.
     """
     spec, body = model.spec, params.body
     middle = (spec.rear_x + spec.front_x) / 2  # of the four contacts
@@ -263,12 +262,19 @@ def place(
     origin = jnp.stack([x, y]) - forward * spec.reference_x
     sideways = -omega * spec.reference_x  # speed of the origin to the left
     velocity = v * forward + sideways * jnp.stack([-forward[1], forward[0]])
+    zero = jnp.zeros_like(v)
+    climb = zero
+    memory = tuple(effect.init() for effect in params.effects)
+    _, world = apply_chain(params.effects, memory, "world", nominal_world(model))
+    if world.ground:
+        level, ahead, aside = plane_under(world, origin[0], origin[1], yaw)
+        height = level + height * jnp.sqrt(1 + ahead**2 + aside**2)
+        pitch, roll = pitch - jnp.arctan(ahead), roll + jnp.arctan(aside / jnp.sqrt(1 + ahead**2))
+        climb = v * ahead + sideways * aside
     qpos = jnp.concatenate([origin, height * jnp.ones(1), quaternion_from_angles(roll, pitch, yaw), jnp.zeros(2)])
     spin = wheel_speeds(jnp.stack([v, omega]), spec.track) / spec.wheel_radius
-    zero = jnp.zeros_like(v)
-    qvel = jnp.concatenate([velocity, jnp.stack([zero, zero, zero, omega]), spin])
+    qvel = jnp.concatenate([velocity, jnp.stack([climb, zero, zero, omega]), spin])
     odometry = Odometry(zero, zero, zero, v, omega, omega)
-    memory = tuple(effect.init() for effect in params.effects)
     return VehicleState(qpos, qvel, memory, odometry, odometry, jnp.zeros((), bool))
 
 

@@ -10,15 +10,20 @@ from whill_mjx.effects.actuator_lag import ActuatorLag
 from whill_mjx.effects.air_drag import AirDrag
 from whill_mjx.effects.backlash import Backlash
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.bump import Bump
 from whill_mjx.effects.caster_kick import CasterKick
 from whill_mjx.effects.clock_offset import ClockOffset
 from whill_mjx.effects.command_dead_zone import CommandDeadZone
 from whill_mjx.effects.command_delay import CommandDelay
+from whill_mjx.effects.command_expiry import CommandExpiry
 from whill_mjx.effects.command_quantisation import CommandQuantisation
 from whill_mjx.effects.command_scale import CommandScale
 from whill_mjx.effects.drive_gain_difference import DriveGainDifference
 from whill_mjx.effects.dry_friction import DryFriction
+from whill_mjx.effects.encoder_resolution import EncoderResolution
 from whill_mjx.effects.gyro_bias import GyroBias
+from whill_mjx.effects.gyro_range import GyroRange
+from whill_mjx.effects.incline import Incline
 from whill_mjx.effects.jerk_limit import JerkLimit
 from whill_mjx.effects.lateral_damping import LateralDamping
 from whill_mjx.effects.odometry_lag import OdometryLag
@@ -27,12 +32,14 @@ from whill_mjx.effects.omni_roller_friction import OmniRollerFriction
 from whill_mjx.effects.payload_shift import PayloadShift
 from whill_mjx.effects.pid_drive import ForwardSlip, PidDrive, RollingContact
 from whill_mjx.effects.quadratic_drag import QuadraticDrag
+from whill_mjx.effects.ramp import Ramp
 from whill_mjx.effects.rolling_resistance import RollingResistance
 from whill_mjx.effects.rolling_resistance_speed import RollingResistanceSpeed
 from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.effects.side_force import SideForce
 from whill_mjx.effects.slip_traction import SlipTraction
 from whill_mjx.effects.slope import Slope
+from whill_mjx.effects.state_rate import StateRate
 from whill_mjx.effects.supply_sag import SupplySag
 from whill_mjx.effects.torque_drive import TorqueDrive
 from whill_mjx.effects.torque_saturation import TorqueSaturation
@@ -51,16 +58,21 @@ EFFECTS: dict[str, type[Effect]] = {
         ActuatorLag,
         AirDrag,
         Backlash,
+        Bump,
         CasterKick,
         ClockOffset,
         CommandDeadZone,
         CommandDelay,
+        CommandExpiry,
         CommandQuantisation,
         CommandScale,
         DriveGainDifference,
         DryFriction,
+        EncoderResolution,
         ForwardSlip,
         GyroBias,
+        GyroRange,
+        Incline,
         JerkLimit,
         LateralDamping,
         OdometryLag,
@@ -69,6 +81,7 @@ EFFECTS: dict[str, type[Effect]] = {
         PayloadShift,
         PidDrive,
         QuadraticDrag,
+        Ramp,
         RollingContact,
         RollingResistance,
         RollingResistanceSpeed,
@@ -76,6 +89,7 @@ EFFECTS: dict[str, type[Effect]] = {
         SideForce,
         SlipTraction,
         Slope,
+        StateRate,
         SupplySag,
         TorqueDrive,
         TorqueSaturation,

@@ -5,7 +5,7 @@ An effect is a frozen pytree whose leaves are its own parameters. It acts at one
     command(memory, command (2,), motion)   -> memory, command     delay, dead zone, limiter
     actuation(memory, Drive, motion)        -> memory, Drive       controller, lag, saturation
     force(memory, motion)                   -> memory, Wrench      friction, slip, drag
-    world(memory, World)                    -> memory, World       slope, wind, true geometry
+    world(memory, World)                    -> memory, World       slope, ground, true geometry
     sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
 
 Effects of one place act in the order of the tuple; forces add up. At its neutral values an effect vanishes exactly.
@@ -68,11 +68,10 @@ def sum_forces(effects: tuple, memory: tuple, motion: Motion) -> tuple[tuple, Wr
 
 def contact_wrench(motion: Motion, forward: jax.Array, left: jax.Array, normal: jax.Array | float = 0.0) -> Wrench:
     """Wrench of forces (4,) [N] at the contact patches, along the ground axes forward, left and normal."""
-    geometry = motion.world.geometry
-    axes = motion.ground_axes
+    axes = motion.contact_axes
     normal = jnp.broadcast_to(normal, (4,))
     fx, fy, fz = (forward * axes[0, i] + left * axes[1, i] + normal * axes[2, i] for i in range(3))  # each (4,)
-    x, y, z = geometry.contact_x, geometry.contact_y, -motion.wheel_radius
+    x, y, z = motion.contact_points
     return Wrench(
         fx.sum(), fy.sum(), fz.sum(),
         (y * fz - z * fy).sum(), (z * fx - x * fz).sum(), (x * fy - y * fx).sum(),
