@@ -80,6 +80,11 @@ CHANNELS = {
     "body v": ("m/s", 0.01), "body omega": ("rad/s", 0.02), "odometry v": ("m/s", 0.01),
     "odometry omega": ("rad/s", 0.02), "gyro": ("rad/s", 0.02),
 }  # fmt: skip
+SHOWN = {
+    "command_expiry": {"validity": 0.2, "resend": 0.3}, "ramp": {"rise": 0.1, "length": 1.0, "distance": 0.8},
+    "bump": {"rise": 0.03, "width": 0.3, "x": 1.0, "y": 0.25},
+}  # fmt: skip
+"""Values for the figure where the ends of the usual ones do not show in this drive."""
 COLOURS = {"command": "C0", "actuation": "C1", "force": "C2", "world": "C3", "sensing": "C4"}
 DRIVE = (
     (0.5, 0.0, 0.0), (2.0, 0.6, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.6), (0.5, 0.0, 0.0), (2.0, 0.5, -0.6),
@@ -117,7 +122,9 @@ def row(kind: type[Effect]) -> str:
 
 
 def shown_values(name: str) -> dict[str, float]:
-    """The end of each parameter's usual values that is further from neutral."""
+    """The end of each parameter's usual values that is further from neutral, or what SHOWN says."""
+    if name in SHOWN:
+        return SHOWN[name]
     about, values = parameters_of(EFFECTS[name]), {}
     for field, (low, high) in EFFECTS[name].typical.items():
         neutral = about[field].neutral

@@ -5,28 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from whill_mjx.sensors import SensorNoise, encoder_table, wrapped
 from whill_mjx.specs import VehicleSpec
 
 COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER = "t,v,omega", "t,x,y,yaw,v,omega", "t,x,y,yaw"
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations of white noise on every sample."""
-
-    position: float = 0.003
-    """Outside pose [m]."""
-    yaw: float = 0.003
-    """Outside pose [rad]."""
-    odometry_position: float = 0.001
-    odometry_yaw: float = 0.001
-    v: float = 0.005
-    omega: float = 0.01
+IMU_HEADER, ENCODER_HEADER = "t,gyro", "t,left,right,counter"
 
 
 def write_trial(
@@ -43,16 +30,53 @@ def write_trial(
         odometry: (M, 5) x, y, yaw, v, omega.
         noise, random: white noise to add to both measurements; none leaves them exact.
     """
-    pose, odometry = np.array(pose, float), np.array(odometry, float)
+    random = random or np.random.default_rng(0)
+    write_csv(folder / "command.csv", COMMAND_HEADER, command)
+    write_ground_truth(folder, t, pose, noise, random)
+    write_odometry(folder, t, odometry, noise, random)
+
+
+def write_ground_truth(
+    folder: Path, t: np.ndarray, pose: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
+) -> None:
+    """Write the outside pose (M, 3), with noise unless it is None."""
+    pose = np.array(pose, float)
     if noise is not None:
-        random = random or np.random.default_rng(0)
         pose += random.normal(size=pose.shape) * [noise.position, noise.position, noise.yaw]
+    pose[:, 2] = wrapped(pose[:, 2])
+    write_csv(folder / "ground_truth.csv", POSE_HEADER, np.column_stack([t, pose]))
+
+
+def write_odometry(
+    folder: Path, t: np.ndarray, odometry: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
+) -> None:
+    """Write the odometry (M, 5), with noise unless it is None."""
+    odometry = np.array(odometry, float)
+    if noise is not None:
         scales = [noise.odometry_position, noise.odometry_position, noise.odometry_yaw, noise.v, noise.omega]
         odometry += random.normal(size=odometry.shape) * scales
-    pose[:, 2] = np.pi - np.mod(np.pi - pose[:, 2], 2 * np.pi)
-    write_csv(folder / "command.csv", COMMAND_HEADER, command)
-    write_csv(folder / "ground_truth.csv", POSE_HEADER, np.column_stack([t, pose]))
     write_csv(folder / "odometry.csv", ODOMETRY_HEADER, np.column_stack([t, odometry]))
+
+
+def write_imu(
+    folder: Path, t: np.ndarray, gyro: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
+) -> None:
+    """Write the gyro's yaw rate (M, 1), with noise unless it is None."""
+    gyro = np.array(gyro, float)
+    if noise is not None:
+        gyro += random.normal(size=gyro.shape) * noise.gyro
+    write_csv(folder / "imu.csv", IMU_HEADER, np.column_stack([t, gyro]))
+
+
+def write_encoder(
+    folder: Path, t: np.ndarray, latency: float, angles: np.ndarray, noise: SensorNoise | None,
+    random: np.random.Generator,
+) -> None:  # fmt: skip
+    """Write the wheel angles (M, 2) and the vehicle's counter, with noise unless it is None."""
+    angles = np.array(angles, float)
+    if noise is not None:
+        angles += random.normal(size=angles.shape) * noise.encoder
+    write_csv(folder / "encoder.csv", ENCODER_HEADER, encoder_table(t, latency, angles))
 
 
 def write_fields(folder: Path, spec: VehicleSpec, held_out: Iterable[str] = ()) -> None:

@@ -5,7 +5,9 @@
 
 An effect is NAME, or NAME:PARAMETER=VALUE,...: a vehicle that has the effect gets the values given; any other gets the
 effect added, with those values and the rest neutral, or, where no value is given, the upper usual value of each.
-docs/effects.md lists them. DATASET/vehicle.toml is the vehicle that was driven: the planted truth.
+docs/effects.md lists them. The measurements have rates, latencies and noise; --sensors.imu-rate 104 and
+--sensors.encoder-rate 50 add the chair's gyro and wheel encoders. DATASET/vehicle.toml is the vehicle that was driven:
+the planted truth.
 """
 
 from __future__ import annotations
@@ -23,12 +25,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.config import VehicleConfig
-from whill_mjx.dataset import SensorNoise, write_fields, write_trial
+from whill_mjx.dataset import (
+    COMMAND_HEADER,
+    write_csv,
+    write_encoder,
+    write_fields,
+    write_ground_truth,
+    write_imu,
+    write_odometry,
+)
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.kinematics import reference_pose
 from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
 from whill_mjx.model import build_model
 from whill_mjx.presets import preset
+from whill_mjx.sensors import SensorNoise, Sensors, seen, times
 from whill_mjx.specs import VehicleSpec
 from whill_mjx.types import VehicleParams, VehicleState, parameters_of
 from whill_mjx.vehicle import place, substep
@@ -53,6 +64,10 @@ class DriveOptions:
     """Drives of each manoeuvre: the same commands from another pose, with other noise."""
     noise: bool = False
     """Add white noise to the measurements."""
+    noise_levels: SensorNoise = field(default_factory=SensorNoise)
+    """How much, with --noise."""
+    sensors: Sensors = field(default_factory=Sensors)
+    """Rates and latencies of the measurements."""
     held_out: tuple[str, ...] = ()
     """Manoeuvres that the dataset declares as never to be fitted."""
     seed: int = 0
@@ -78,7 +93,7 @@ def main(options: DriveOptions) -> Path:
         for name, command in zip(names, commands, strict=True)
         for replicate in range(1, options.replicates + 1)
     ]
-    poses, odometries, diverged = record(spec, params, [trial[1] for trial in trials], [trial[2] for trial in trials])
+    motions, diverged = record_motion(spec, params, [trial[1] for trial in trials], [trial[2] for trial in trials])
     if diverged.any():
         lost = ", ".join(name for (name, _, _), bad in zip(trials, diverged, strict=True) if bad)
         raise ValueError(
@@ -87,11 +102,10 @@ def main(options: DriveOptions) -> Path:
         )
     partial = options.out.with_name(f".{options.out.name}.partial-{os.getpid()}")
     try:
-        for (name, command, _), pose, odometry in zip(trials, poses, odometries, strict=True):
-            count = math.floor(command[-1, 0] / MEASUREMENT_DT + 1e-6) + 1
-            t = np.arange(count) * MEASUREMENT_DT
-            noise = SensorNoise() if options.noise else None
-            write_trial(partial / "trials" / name, t, command, pose[:count], odometry[:count], noise, random)
+        noise = options.noise_levels if options.noise else None
+        for index, (name, command, _) in enumerate(trials):
+            motion = {sensor: motions[sensor][index] for sensor in motions}
+            write_streams(partial / "trials" / name, command, motion, options.sensors, noise, random)
         write_fields(partial, spec, [name for name, _, _ in trials if name.rsplit("_", 1)[0] in options.held_out])
         truth = {"vehicle": options.vehicle, "effects": " ".join(options.effects), "seed": options.seed}
         save_vehicle(partial / "vehicle.toml", spec, params, provenance=truth)
@@ -151,6 +165,29 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
     return name, values
 
 
+def write_streams(
+    folder: Path, command: np.ndarray, motion: dict[str, np.ndarray], sensors: Sensors, noise: SensorNoise | None,
+    random: np.random.Generator,
+) -> None:  # fmt: skip
+    """Write the streams of one trial: its commands, and what each sensor reports of the motion (T, C) it sees."""
+    write_csv(folder / "command.csv", COMMAND_HEADER, command)
+    duration, dt = float(command[-1, 0]), VehicleConfig().physics_dt
+
+    def sampled(sensor: str) -> tuple[np.ndarray, np.ndarray]:
+        t = times(duration, getattr(sensors, f"{sensor}_rate"))
+        return t, seen(t, getattr(sensors, f"{sensor}_latency"), dt, motion[sensor])
+
+    if sensors.ground_truth_rate:
+        write_ground_truth(folder, *sampled("ground_truth"), noise, random)
+    if sensors.odometry_rate:
+        write_odometry(folder, *sampled("odometry"), noise, random)
+    if sensors.imu_rate:
+        write_imu(folder, *sampled("imu"), noise, random)
+    if sensors.encoder_rate:
+        t, angles = sampled("encoder")
+        write_encoder(folder, t, sensors.encoder_latency, angles, noise, random)
+
+
 def record(
     spec: VehicleSpec, params: VehicleParams, commands: Sequence[np.ndarray], starts: Sequence[Sequence[float]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,35 +197,53 @@ def record(
         Every MEASUREMENT_DT from t = 0 on, to the end of the longest: poses (B, M, 3) of the reference point, odometry
         (B, M, 5); and (B,) bool where the motion became non-finite.
     """
+    motion, diverged = record_motion(spec, params, commands, starts)
+    stride = round(MEASUREMENT_DT / VehicleConfig().physics_dt)
+    return motion["ground_truth"][:, ::stride], motion["odometry"][:, ::stride], diverged
+
+
+def record_motion(
+    spec: VehicleSpec, params: VehicleParams, commands: Sequence[np.ndarray], starts: Sequence[Sequence[float]]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Drive B command tables (T, 3) from B starts (x [m], y [m], yaw [rad]) at rest, all in one compiled call.
+
+    Returns:
+        What each sensor sees at every physics step from t = 0 to the end of the longest: "ground_truth" (B, T, 3)
+        pose of the reference point, yaw unwrapped; "odometry" (B, T, 5); "imu" (B, T, 1) gyro [rad/s]; "encoder"
+        (B, T, 2) angles of the driven wheels [rad]; and (B,) bool where the motion became non-finite.
+    """
     config = VehicleConfig()
     model = build_model(spec, config)
     stride = round(MEASUREMENT_DT / config.physics_dt)
     duration = max(float(command[-1, 0]) for command in commands)
     t = (np.arange(math.ceil(duration / MEASUREMENT_DT) * stride) + 0.5) * config.physics_dt
     held = [command[np.searchsorted(command[:, 0], t, side="right") - 1, 1:] for command in commands]
-    table = np.stack(held).reshape(len(held), -1, stride, 2)  # (B, M - 1, stride, 2)
 
-    def physics(state: VehicleState, command: jax.Array) -> tuple[VehicleState, None]:
-        return substep(model, params, state, command), None
-
-    def observe(state: VehicleState) -> jax.Array:
+    def observe(state: VehicleState) -> dict[str, jax.Array]:
         odometry = state.odometry
         reported = (odometry.x, odometry.y, odometry.yaw, odometry.v, odometry.omega)
-        return jnp.stack([*reference_pose(model, state.qpos), *reported])
+        return {
+            "ground_truth": jnp.stack(reference_pose(model, state.qpos)),
+            "odometry": jnp.stack(reported),
+            "imu": jnp.stack([jnp.asarray(odometry.gyro)]),
+            "encoder": state.qpos[7:9],
+        }
 
-    def one(command: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def measure(state: VehicleState, commands: jax.Array) -> tuple[VehicleState, jax.Array]:
-            state, _ = jax.lax.scan(physics, state, commands)
+    def one(command: jax.Array, start: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        def physics(state: VehicleState, command: jax.Array) -> tuple[VehicleState, dict[str, jax.Array]]:
+            state = substep(model, params, state, command)
             return state, observe(state)
 
         first = place(model, params, *start)
-        last, seen = jax.lax.scan(measure, first, command)
-        return jnp.concatenate([observe(first)[None], seen]), last.diverged
+        last, rest = jax.lax.scan(physics, first, command)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observe(first), rest), last.diverged
 
     dtype = jnp.result_type(float)
-    seen, diverged = jax.jit(jax.vmap(one))(jnp.asarray(table, dtype), jnp.asarray(np.asarray(starts), dtype))
-    seen = np.asarray(seen)
-    return seen[..., :3], seen[..., 3:], np.asarray(diverged)
+    driven, begun = jnp.asarray(np.stack(held), dtype), jnp.asarray(np.asarray(starts), dtype)
+    motion, diverged = jax.jit(jax.vmap(one))(driven, begun)
+    motion = {sensor: np.array(table, float) for sensor, table in motion.items()}
+    motion["ground_truth"][:, :, 2] = np.unwrap(motion["ground_truth"][:, :, 2], axis=1)
+    return motion, np.asarray(diverged)
 
 
 def _check(options: DriveOptions, names: tuple[str, ...]) -> None:

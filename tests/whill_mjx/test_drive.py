@@ -9,6 +9,7 @@ import pytest
 
 from whill_mjx.drive import DriveOptions, find_vehicle, main, parse_effect, with_effects
 from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
+from whill_mjx.sensors import Sensors
 from whill_mjx.vehicle_file import load_vehicle
 
 SHORT = Scenario(v=0.5, omega=0.6, length=2.0)
@@ -88,6 +89,50 @@ def test_the_dataset_is_read_by_the_fit(dataset):
     log = load_log(dataset)
     assert [trial.name for trial in log.held_out] == ["circle_1", "circle_2"]
     assert log.spec.name == "whill_cr"
+
+
+def test_sensors_report_at_their_rates_with_their_latencies(tmp_path):
+    """The form of the chair's own log: 50 Hz states with a counter, a gyro at 104 Hz, poses that come late.
+
+    A fit reads it, and leaves the streams aside that it does not know.
+    """
+    from sysid.log import load_log
+
+    sensors = Sensors(
+        odometry_rate=50.0, ground_truth_latency=0.1, imu_rate=104.0, encoder_rate=50.0, encoder_latency=0.01
+    )
+    turned = ("gyro_bias:bias=0.1",)
+    options = DriveOptions(tmp_path / "chair", ("turn",), effects=turned, scenario=SHORT, sensors=sensors)
+    folder = main(options) / "trials" / "turn_1"
+    odometry, truth, imu, encoder = (
+        table(folder / f"{name}.csv") for name in ("odometry", "ground_truth", "imu", "encoder")
+    )
+    for stream, rate in ((odometry, 50.0), (truth, 20.0), (imu, 104.0), (encoder, 50.0)):
+        np.testing.assert_allclose(np.diff(stream[:, 0]), 1 / rate, atol=2e-6)
+    steady = (odometry[:, 0] > 1.5) & (odometry[:, 0] < 1.9)
+    rate = np.interp(odometry[:, 0], imu[:, 0], imu[:, 1])
+    np.testing.assert_allclose(rate[steady], odometry[steady, 5] + 0.1, atol=0.03)
+    late = np.interp(truth[:, 0] - 0.1, odometry[:, 0], odometry[:, 3])
+    assert np.abs(np.unwrap(truth[:, 3]) - truth[0, 3] - late).max() < 0.02  # turning on the spot hardly slips
+    np.testing.assert_allclose(np.diff(encoder[:, 3]) % 201, 20.0, atol=1e-6)
+    np.testing.assert_allclose(encoder[:, 1:3], np.round(encoder[:, 1:3], 3), atol=1e-9)
+    turned_by = np.diff(np.unwrap(encoder[:, 1:3], axis=0)[[0, -1]], axis=0)[0] * 0.1325
+    np.testing.assert_allclose((turned_by[1] - turned_by[0]) / 0.496, odometry[-1, 3], atol=0.01)
+    assert [trial.name for trial in load_log(options.out).trials] == ["turn_1"]
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"imu_rate": -1.0}, "imu_rate is -1.0 Hz; it must lie within 0"),
+        ({"odometry_latency": 20.0}, "odometry_latency is 20.0 s.*Check the unit"),
+        ({"odometry_rate": 0.0, "ground_truth_rate": 0.0}, "both 0; a log needs one of them"),
+    ],
+)
+def test_sensors_that_cannot_be_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        Sensors(**change)
 
 
 @pytest.mark.quick
