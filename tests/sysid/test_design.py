@@ -1,0 +1,239 @@
+"""Designs with known answers: what is uncertain decides the manoeuvre, and rooms and speeds are kept."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import UNICYCLE_SPACE, unicycle_plant
+
+import sysid.design as design_module
+from sysid.candidates import Candidate, Limits, as_trial, library, make_command, placement
+from sysid.design import (
+    INFLATION,
+    DesignConfig,
+    best_splitting_manoeuvre,
+    candidate_objective,
+    identifiable_subspace,
+    information,
+    main,
+    prior_information,
+    propose,
+    rank,
+    separation,
+    splitting_scores,
+)
+from sysid.log import Command, read_csv
+from sysid.metrics import ideal_replay
+from sysid.rollout import Plant
+from sysid.space import Space
+from sysid.uncertainty import PRIOR_SD
+from whill_mjx.parameters import get_values
+from whill_mjx.specs import WHILL_CR
+
+quick = pytest.mark.quick
+SMALL = Limits(v_min=-0.5, v_max=0.6, omega_max=0.8, room=(4.0, 3.0), margin=0.5, seconds=12.0)
+
+
+def candidates(*names, seconds=6.0):
+    return [Candidate(name, make_command(name, 0.5, 0.8, seconds)) for name in names]
+
+
+@quick
+@pytest.mark.parametrize("limits", [SMALL, Limits(v_min=0.0, v_max=0.8, omega_max=0.5, room=(12.0, 2.0))])
+def test_candidates_keep_speed_and_room(limits):
+    found = library(limits)
+    assert len({one.name for one in found}) == len(found) > 6
+    for one in found:
+        assert one.command.v.min() >= limits.v_min - 1e-9 and one.command.v.max() <= limits.v_max + 1e-9
+        assert np.abs(one.command.omega).max() <= limits.omega_max + 1e-9
+        assert one.command.v[0] == one.command.v[-1] == 0.0
+        assert (one.command.v[one.command.t < 0.95] == 0).all() and one.command.t[-1] <= limits.seconds + 2
+        pose = ideal_replay(as_trial(one)).ground_truth
+        x0, y0, yaw = placement(np.column_stack([pose.x, pose.y]), limits)
+        x = x0 + np.cos(yaw) * pose.x - np.sin(yaw) * pose.y
+        y = y0 + np.sin(yaw) * pose.x + np.cos(yaw) * pose.y
+        for values, side in ((x, limits.room[0]), (y, limits.room[1])):
+            assert values.min() >= limits.margin - 1e-9 and values.max() <= side - limits.margin + 1e-9
+
+
+@quick
+def test_a_vehicle_that_must_not_reverse_gets_no_reversing_manoeuvre():
+    assert not any((one.command.v < 0).any() for one in library(Limits(v_min=0.0)))
+
+
+@quick
+def test_the_square_visits_four_headings():
+    command = make_command("square", 0.5, 0.8, 30.0)
+    yaw = ideal_replay(as_trial(Candidate("square", command))).ground_truth.yaw
+    straight = np.abs(np.interp(np.arange(len(yaw)) * 0.05, command.t, command.omega)) < 1e-9
+    assert {int(round(one / (np.pi / 2))) % 4 for one in yaw[straight]} == {0, 1, 2, 3}
+
+
+@quick
+@pytest.mark.parametrize(("change", "rule"), [({"room": (1.0, 5.0)}, "leaves nothing within a margin"),
+                                              ({"v_max": 0.0}, "must be positive"), ({"v_min": 0.2}, "v_min not")])
+def test_impossible_limits_are_refused(change, rule):
+    with pytest.raises(ValueError, match=rule):
+        Limits(**change)
+
+
+@quick
+def test_a_long_path_is_placed_along_the_diagonal_and_a_longer_one_nowhere():
+    limits = Limits(room=(4.0, 4.0), margin=0.5)
+    line = np.column_stack([np.linspace(0, 4.0, 50), np.zeros(50)])
+    x, y, yaw = placement(line, limits)
+    assert np.deg2rad(30) < yaw < np.deg2rad(60) and x < 1.0 and y < 1.0
+    assert placement(1.2 * line, limits) is None
+
+
+def by_hand(prior, *found, criterion="a"):
+    blank = [np.zeros((2, 2))] * len(found)
+    return rank(candidates("straight", "turn")[: len(found)], np.array(found), np.array(prior), blank,
+                [(0.0, 0.0, 0.0)] * len(found), criterion)
+
+
+@quick
+def test_a_optimality_goes_for_the_largest_uncertainty_and_d_for_the_volume():
+    known, unknown = np.diag([1e4, 20.0]), np.diag([20.0, 20.0])
+    first, second = np.diag([1e5, 0.0]), np.diag([0.0, 100.0])
+    assert by_hand(known, first, second)[0].candidate.name == "turn"
+    plans = by_hand(unknown, first, second)
+    assert plans[0].candidate.name == "straight"
+    assert plans[0].trace == pytest.approx((1 / 100020 + 1 / 20) / (2 / 20), rel=1e-6)
+    assert plans[0].volume == pytest.approx(-np.log(100020 / 20) / 2)
+    # much of the known against a little of the unknown: the volume prefers the first, the largest variance the second
+    assert by_hand(known, first, np.diag([0.0, 40.0]), criterion="d")[0].candidate.name == "straight"
+    assert by_hand(known, first, np.diag([0.0, 40.0]), criterion="a")[0].candidate.name == "turn"
+
+
+@quick
+def test_a_direction_that_nothing_tells_does_not_count():
+    bounds = np.eye(2) * PRIOR_SD**-2
+    subspace = identifiable_subspace(bounds + np.diag([1e4, 0.0]))
+    np.testing.assert_allclose(np.abs(subspace), [[1.0], [0.0]])
+    plans = by_hand(bounds, np.diag([1e4, 0.0]), np.diag([1e3, 0.0]))
+    assert plans[0].trace < 0.01 and plans[0].deviation[1] == pytest.approx(PRIOR_SD)
+
+
+@quick
+def test_intervals_become_information_in_unit_coordinates():
+    space = Space(("a", "b"), np.array([0.0, 1.0]), np.array([10.0, 1000.0]), np.array([5.0, 10.0]),
+                  np.array([False, True]))
+    prior = prior_information(space, {"a": (4.0, 6.0), "c": (0.0, 1.0)})
+    assert np.sqrt(1 / (prior[0, 0] - PRIOR_SD**-2)) == pytest.approx(0.1 / 1.645)
+    assert prior[1, 1] == pytest.approx(PRIOR_SD**-2)
+
+
+@quick
+def test_separation_is_what_neither_base_nor_rival_explains():
+    e = np.eye(5) * np.sqrt(INFLATION)
+    nothing = np.zeros((5, 0))
+    assert separation(e[0], e[1], nothing) == pytest.approx(1.0)
+    assert separation(e[0], e[0] + e[1], nothing) == pytest.approx(1 / np.sqrt(2))
+    assert separation(e[0], -3 * e[0], nothing) == pytest.approx(0.0, abs=1e-9)
+    assert separation(e[0] + e[2], e[1], e[:, [0]]) == pytest.approx(1.0)
+    assert separation(e[0], np.zeros(5), np.zeros((5, 2))) == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def unicycle_information():
+    names = ("straight", "turn", "circle")
+    objective = candidate_objective(unicycle_plant(), lambda values: values, UNICYCLE_SPACE, candidates(*names))
+    return dict(zip(names, information(objective, UNICYCLE_SPACE.initial), strict=True))
+
+
+@quick
+def test_information_lies_where_the_manoeuvre_moves(unicycle_information):
+    straight, turn, circle = (unicycle_information[name] for name in ("straight", "turn", "circle"))
+    assert straight[1, 1] == pytest.approx(0.0, abs=1e-3) and straight[0, 0] > 1  # tau_omega from a straight drive
+    assert turn[0, 0] == pytest.approx(0.0, abs=1e-3) and turn[1, 1] > 1
+    assert turn[2, 2] > 100 and circle[2, 2] > 100  # turn: what the body turns beside what the odometry sees
+
+
+@quick
+def test_what_only_an_outside_pose_tells_is_blind_to_odometry():
+    objective = candidate_objective(unicycle_plant(), lambda values: values, UNICYCLE_SPACE,
+                                    candidates("circle", seconds=3.0), channels="odometry")
+    (found,) = information(objective, UNICYCLE_SPACE.initial)
+    assert found[2, 2] == pytest.approx(0.0, abs=1e-3) and found[0, 0] > 1
+
+
+def dead_zone_plant():
+    """The kinematic vehicle with a gain on its commands and a dead zone of them: parameters (gain, width, lag)."""
+    base = unicycle_plant()
+
+    def substep(params, state, command):
+        gain, width, lag = params
+        told = gain * jnp.sign(command) * jnp.maximum(jnp.abs(command) - width, 0.0)
+        return base.substep(jnp.stack([lag, lag, jnp.ones_like(lag)]), state, told)
+
+    return Plant(base.place, substep, base.observe, base.dt, base.move)
+
+
+@quick
+def test_a_dead_zone_is_split_from_a_gain_by_the_manoeuvre_that_changes_its_size():
+    ladder = make_command("step_ladder", 0.5, 0.8, 12.0)
+    constant = Command(ladder.t, np.where((ladder.t > 1) & (ladder.t < 10), 0.5, 0.0), 0 * ladder.t)
+    found = [Candidate("constant", constant), Candidate("ladder", ladder)]
+    lag = Space(("lag",), np.array([0.05]), np.array([1.0]), np.array([0.2]), np.array([True]))
+
+    def apply(values):
+        return jnp.array([1.0, 0.0, values[0]])
+
+    arguments = (WHILL_CR, None, lag, jnp.array([1.0, 0.03, 0.2]), jnp.array([0.94, 0.0, 0.2]), found)
+    scores = splitting_scores(*arguments, plant=dead_zone_plant(), apply=apply)
+    name, command, score = best_splitting_manoeuvre(*arguments, plant=dead_zone_plant(), apply=apply)
+    assert name == "ladder" and command is ladder and score == pytest.approx(scores[1])
+    assert scores[0] < 0.1 * scores[1] and scores[1] > 3
+
+
+def stand_in(spec, config):
+    """The kinematic vehicle behind the parameters of the WHILL: kp is its bandwidth, eta its gain in turning."""
+    base = unicycle_plant()
+
+    def substep(params, state, command):
+        kp, eta = get_values(params, ("pid_drive.kp", "forward_slip.eta"))
+        return base.substep(jnp.stack([1 / kp, 1 / kp, eta]), state, command)
+
+    return Plant(base.place, substep, base.observe, base.dt, base.move)
+
+
+@pytest.fixture(scope="module")
+def whill(tmp_path_factory):
+    """The command for the WHILL's parameters, on the kinematic vehicle."""
+    folder = tmp_path_factory.mktemp("design")
+    config = DesignConfig("whill_cr", folder / "next.csv", space=(5.0, 5.0), v_max=0.6, omega_max=0.8, seconds=3.0,
+                          parameters=("pid_drive.kp", "forward_slip.eta"), count=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(design_module, "vehicle_plant", stand_in)
+        return folder, config, main(config)
+
+
+
+@quick
+def test_the_command_file_is_a_log_and_stays_in_the_room(whill):
+    folder, config, paths = whill
+    assert [path.name for path in paths] == ["next.csv", "next_2.csv", "next.html"]
+    for path in paths[:2]:
+        columns = read_csv(path, ("t", "v", "omega"))
+        assert np.allclose(np.diff(columns["t"]), 0.1) and np.abs(columns["v"]).max() <= 0.6
+        assert np.abs(columns["omega"]).max() <= 0.8 and columns["v"][:10].max() == 0.0
+    page = (folder / "next.html").read_text()
+    assert "forward_slip.eta" in page and "path in the room" in page and 'href="http' not in page
+
+
+@quick
+def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["design", "tricycle"])
+    with pytest.raises(SystemExit, match="error: .*tricycle"):
+        design_module.cli()
+
+
+@quick
+def test_a_room_that_every_drive_leaves_is_refused(monkeypatch):
+    monkeypatch.setattr(design_module, "driven_paths", lambda objective: [np.array([[0, 0], [99, 99.0]])] * 2)
+    monkeypatch.setattr(design_module, "make_space", lambda *a: UNICYCLE_SPACE)
+    monkeypatch.setattr(design_module, "set_values", lambda params, names, values: values)
+    with pytest.raises(ValueError, match="leaves 8 x 8 m in every manoeuvre"):
+        propose(WHILL_CR, None, candidates=candidates("straight", "turn", seconds=2.0), plant=unicycle_plant())
