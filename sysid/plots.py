@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, ideal_replay
+from sysid.series import TrialSeries
 
 MAX_PANELS = 12
 SMALLEST_PANEL = 0.2  # m; a turn on the spot would fill the panel with its noise
@@ -62,6 +64,49 @@ def write_plots(
         pyplot.close(figure)
     paths.append(folder / "errors.png")
     _error_bars(pyplot, paths[-1], rows, {trials[index].name for index in chosen})
+    return paths
+
+
+def write_paper_figures(
+    folder: Path, series: Sequence[TrialSeries], trajectories: Sequence[str], yaws: Sequence[str]
+) -> list[Path]:
+    """Write the paper's two figures, paper_trajectories.png and paper_yaw.png: one panel per manoeuvre, first drive.
+
+    Args:
+        series: measured and replayed motion (`sysid.series`).
+        trajectories, yaws: manoeuvres shown in each.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    paths = []
+    for kind, manoeuvres in (("trajectories", trajectories), ("yaw", yaws)):
+        figure, axes = pyplot.subplots(1, len(manoeuvres), figsize=(3.6 * len(manoeuvres), 3.0), squeeze=False,
+                                       layout="constrained")
+        for axis, manoeuvre in zip(axes.flat, manoeuvres, strict=True):
+            trial = next((one for one in series if one.name.startswith(f"{manoeuvre}_")), None)
+            if trial is None:
+                axis.set_visible(False)
+                continue
+            channel = trial.channels.get("odometry") or trial.channels["ground_truth"]
+            for label, name in (("measured", "measured"), ("initial", "initial"), ("optimised", "fitted")):
+                table = channel.values[name]
+                across, up = (table[:, 0], table[:, 1]) if kind == "trajectories" else (channel.t, table[:, 2])
+                axis.plot(across, up, STYLES[name], color=COLOURS[name], label=label,
+                          linewidth=2.2 if name == "measured" else 1.3)
+            axis.set_title(manoeuvre.replace("_", " ") + (" (held out)" if trial.held_out else ""), fontsize=9)
+            axis.set_xlabel("x [m]" if kind == "trajectories" else "t [s]", fontsize=8)
+            axis.set_ylabel("y [m]" if kind == "trajectories" else "yaw [rad]", fontsize=8)
+            axis.tick_params(labelsize=7)
+            axis.grid(alpha=0.3)
+            if kind == "trajectories":
+                axis.axis("equal")
+        axes.flat[0].legend(fontsize=7)
+        paths.append(folder / f"paper_{kind}.png")
+        figure.savefig(paths[-1], dpi=150)
+        pyplot.close(figure)
     return paths
 
 
