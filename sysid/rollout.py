@@ -47,13 +47,15 @@ class Plant:
     """Physics step [s]."""
     move: Callable[[Any, jax.Array], Any]
     """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
+    substeps: Callable[[Any, Any, jax.Array], Any] | None = None
+    """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
     """The simulator's vehicle as a `Plant`; its parameters are `VehicleParams`."""
     from whill_mjx.kinematics import quaternion_from_angles, reference_pose
     from whill_mjx.model import build_model
-    from whill_mjx.vehicle import place, substep
+    from whill_mjx.vehicle import place, substep, substeps
 
     config = config or VehicleConfig()
     model = build_model(spec, config)
@@ -81,7 +83,8 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
 
     return Plant(lambda params, start: place(model, params, *start),
                  lambda params, state, command: substep(model, params, state, command), observe,
-                 config.physics_dt, move)
+                 config.physics_dt, move,
+                 lambda params, state, commands: substeps(model, params, state, commands))
 
 
 def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -217,7 +220,10 @@ def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
         return plant.substep(params, state, command), None
 
     def record(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
-        state, _ = jax.lax.scan(physics, state, commands)
+        if plant.substeps is None:
+            state, _ = jax.lax.scan(physics, state, commands)
+        else:
+            state = plant.substeps(params, state, commands)
         return state, plant.observe(state)
 
     state = plant.place(params, one.start)
