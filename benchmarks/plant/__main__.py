@@ -32,7 +32,12 @@ def main(arguments: list[str] | None = None) -> Path:
     parser.add_argument("--answers", type=Path, help="file, outside the dataset, that tells what was driven")
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args(arguments)
-    effects = json.loads(given.effects)
+    try:
+        effects = {str(name): float(size) for name, size in json.loads(given.effects).items()}
+    except (ValueError, TypeError, AttributeError):
+        raise ValueError(
+            f"--effects {given.effects!r}: not JSON of sizes by name. Write '{{\"slope\": 0.02}}'."
+        ) from None
     return make_log(
         given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
         given.replicates, given.answers, given.processes,

@@ -103,10 +103,6 @@ class Effect:
     def load(self, moment: Moment, load: Load) -> None:
         """Add forces and torques."""
 
-    def encoder(self, turned: np.ndarray) -> np.ndarray:
-        """Ticks (F, 2) that the wheels have turned at the odometry's frames, with fractions, as the encoders count."""
-        return turned
-
     def scale(self) -> float:
         """Radius that the odometry assumes, over the nominal one."""
         return 1.0

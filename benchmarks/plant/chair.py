@@ -28,23 +28,23 @@ class Chair:
     """True distance between the drive wheels' contacts [m]."""
     mass: float = NOMINAL_MASS
     """All of it, wheels included [kg]."""
-    com: tuple[float, float, float] = (0.157, 0.0, 0.17)
+    com: tuple[float, float, float] = (0.156, 0.0, 0.167)
     """Centre of mass of the frame from the drive axle [m]."""
-    gyration: tuple[float, float, float] = (0.24, 0.27, 0.29)
+    gyration: tuple[float, float, float] = (0.24, 0.27, 0.293)
     """Radii of gyration of the frame about its centre of mass [m]."""
     wheel_mass: float = 2.0
     """One drive wheel with its hub motor [kg]."""
-    armature: float = 0.021
+    armature: float = 0.027
     """Rotor inertia of one drive, seen at the wheel [kg m^2]."""
     damping: float = 0.16
     """Viscous friction of one wheel's bearing [N m s/rad]."""
     friction: float = 0.82
     """Tyre on floor [-]."""
-    patch: float = 0.0015
+    patch: float = 0.002
     """Torsional friction of one tyre per load: the radius of its friction patch [m]."""
     roller: float = 0.002
     """Sliding friction of the front wheels [-]."""
-    roller_drag: float = 5.0
+    roller_drag: float = 4.4
     """Viscous friction of one front wheel's rollers against sideways motion [N s/m]."""
     kp: float = 9.0
     """Of the wheel-speed controller [N m s/rad]."""
@@ -92,10 +92,13 @@ def build(chair: Chair) -> mujoco.MjModel:
     )  # fmt: skip
     drive_pair = f'condim="4" friction="{_numbers([chair.friction] * 2 + [chair.patch, 1e-4, 1e-4])}"'
     front_pair = f'condim="3" friction="{_numbers([chair.roller] * 2 + [0, 0, 0])}"'
-    contact = 'solref="0.01 1" solimp="0.95 0.99 0.001"'
+    # A slow friction reference keeps skidding wheels on the floor: with a stiff one the cone lifts them, and they hop.
+    contact = 'solref="0.01 1" solreffriction="0.05 1" solimp="0.95 0.99 0.001"'
     xml = f"""
 <mujoco>
-  <option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="30" gravity="{_numbers(gravity)}"/>
+  <option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="100" gravity="{_numbers(gravity)}">
+    <flag autoreset="disable"/>
+  </option>
   <default><geom contype="0" conaffinity="0" mass="0"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1"/>

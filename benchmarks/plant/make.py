@@ -116,7 +116,7 @@ def plan(
         chair = EFFECTS[name].make.change(chair, size)
     tables: Mapping[str, np.ndarray] = nine(seed)
     if isinstance(manoeuvres, Mapping):
-        tables = manoeuvres
+        tables = {name: _checked(name, table) for name, table in manoeuvres.items()}
     elif manoeuvres is not None:
         missing = sorted(set(manoeuvres) - set(tables))
         if missing:
@@ -126,9 +126,16 @@ def plan(
     session = 0.0
     for replicate in range(1, replicates + 1):
         for name, messages in tables.items():
-            jobs.append(Job(f"{name}_{replicate}", len(jobs), np.asarray(messages, float), session))
+            jobs.append(Job(f"{name}_{replicate}", len(jobs), messages, session))
             session += float(messages[-1, 0]) + 5.0
     return Setting(active, seed, noise, chair), jobs
+
+
+def _checked(name: str, table: np.ndarray) -> np.ndarray:
+    table = np.asarray(table, float)
+    if table.ndim != 2 or table.shape[1] != 3 or len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
+        raise ValueError(f"manoeuvre {name!r}: shape {table.shape}, must be (T, 3) t, v, omega, t rising. Correct it.")
+    return table
 
 
 Result = tuple[str, np.ndarray, np.ndarray]

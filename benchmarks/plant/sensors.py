@@ -21,7 +21,6 @@ def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.rando
     turned = drive.encoder[::every] / ENCODER + random.uniform(size=2)
     radius = NOMINAL_RADIUS
     for effect in effects:
-        turned = effect.encoder(turned)
         radius *= effect.scale()
     step, turn = arcs(radius * ENCODER * np.floor(turned))
     yaw = np.cumsum(turn)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.plant.commands import nine
-from benchmarks.plant.compare import CHANNELS, channels, drive_like, groups, read, spread
+from benchmarks.plant.compare import CHANNELS, drive_like, groups, read, spread
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import drive_all, plan
 
@@ -28,7 +28,8 @@ def table_of(
     setting, jobs = plan(effects, seed, noise, False, manoeuvres or nine(seed), replicates)
     trials = {}
     for name, odometry, pose in drive_all(setting, jobs):
-        at = np.column_stack([pose[:, 0], *(np.interp(pose[:, 0], odometry[:, 0], column) for column in odometry.T[1:])])
+        t = pose[:, 0]
+        at = np.column_stack([t, *(np.interp(t, odometry[:, 0], column) for column in odometry.T[1:])])
         trials[name] = {"odometry": at, "ground_truth": pose}
     return groups(trials)
 
@@ -65,7 +66,8 @@ def main(arguments: list[str] | None = None) -> None:
         worst = np.unravel_index(ratio.argmax(), ratio.shape)
         cells = " | ".join(f"{value:.1f}" for value in np.sqrt((ratio**2).mean(axis=0)))
         strongest = f"{CHANNELS[worst[1]]} of {names[worst[0]]}: {ratio.max():.0f}"
-        print(f"| {name} | {given.factor * entry.base:g} {entry.unit} | {entry.form} | {cells} | {strongest} |", flush=True)
+        size = f"{given.factor * entry.base:g} {entry.unit}"
+        print(f"| {name} | {size} | {entry.form.replace('|', chr(92) + '|')} | {cells} | {strongest} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELB
 
 SUBSTEPS = round(TICK / TIMESTEP)
 REPORT = 0.05  # s between rows of odometry and outside pose
+ROLLING = 0.4  # rad/s, both wheels' speeds together: a slower chair feels less of the road, one at rest nothing
 ENCODER = 2 * math.pi / 4096  # rad per tick
 
 
@@ -34,7 +35,7 @@ class Noise:
     v: float = 0.0039
     omega: float = 0.0043
     """White, of the reported speeds [m/s, rad/s]."""
-    low_pass: float = 0.045
+    low_pass: float = 0.042
     """Time constant of the reported speeds [s]."""
 
     def scaled(self, noise: float) -> Noise:
@@ -54,7 +55,7 @@ class Drive:
     speed: np.ndarray
     """(K, 3) forward, to the left, yaw rate."""
     encoder: np.ndarray
-    """(K, 2) angles that the encoders see [rad]."""
+    """(K, 2) angles of the wheels, where the encoders sit [rad]."""
     torque: np.ndarray
     """(K, 2) drive torques [N m]."""
 
@@ -66,13 +67,12 @@ class Plant:
         self.chair, self.model = chair, build(chair)
         self.data = mujoco.MjData(self.model)
         joint = {name: self.model.joint(name) for name in ("wheel_left", "wheel_right")}
-        encoder = [f"rotor_{side}" if chair.play else f"wheel_{side}" for side in ("left", "right")]
+        motor = [f"rotor_{side}" if chair.play else f"wheel_{side}" for side in ("left", "right")]
         self.wheel_q = [int(joint[name].qposadr[0]) for name in joint]
         self.wheel_v = [int(joint[name].dofadr[0]) for name in joint]
-        self.encoder_q = [int(self.model.joint(name).qposadr[0]) for name in encoder]
-        self.encoder_v = [int(self.model.joint(name).dofadr[0]) for name in encoder]
+        self.motor_v = [int(self.model.joint(name).dofadr[0]) for name in motor]
         for _ in range(round(1.0 / TIMESTEP)):
-            self.data.qfrc_applied[self.encoder_v] = -20.0 * self.data.qvel[self.encoder_v]  # brakes on
+            self.data.qfrc_applied[self.wheel_v] = -20.0 * self.data.qvel[self.wheel_v]  # brakes on
             mujoco.mj_step(self.model, self.data)
         self.rest = self.data.qpos.copy()
 
@@ -99,7 +99,7 @@ class Plant:
         self._place(start)
         makers = [effect for effect in effects if type(effect).torque is not Effect.torque]
         loaders = [effect for effect in effects if type(effect).load is not Effect.load]
-        (left_q, right_q), (left_v, right_v), (el, er) = self.wheel_q, self.wheel_v, self.encoder_v
+        (left_q, right_q), (left_v, right_v), (left_m, right_m) = self.wheel_q, self.wheel_v, self.motor_v
         applied, kp, ki, limit = data.qfrc_applied, chair.kp, chair.ki, chair.torque_limit
         qpos, qvel = np.empty((count, model.nq)), np.empty((count, model.nv))
         torques = np.empty((count, 2))
@@ -111,12 +111,13 @@ class Plant:
             qpos[k], qvel[k] = q, w
             yaw = math.atan2(2 * (q[3] * q[6] + q[4] * q[5]), 1 - 2 * (q[5] ** 2 + q[6] ** 2))
             cos, sin = math.cos(yaw), math.sin(yaw)
-            errors = target[k, 0] - w[el], target[k, 1] - w[er]
+            errors = target[k, 0] - w[left_v], target[k, 1] - w[right_v]
             integral[0] += errors[0] * TICK
             integral[1] += errors[1] * TICK
             left = min(limit, max(-limit, kp * errors[0] + ki * integral[0]))
             right = min(limit, max(-limit, kp * errors[1] + ki * integral[1]))
             load = Load()
+            rough = min(1.0, (abs(w[left_v]) + abs(w[right_v])) / ROLLING)
             side, omega = cos * w[1] - sin * w[0], w[5]
             rollers = -2 * chair.roller_drag * (side + NOMINAL_WHEELBASE * omega)
             if makers or loaders:
@@ -129,16 +130,17 @@ class Plant:
                 moment.torque = left, right
                 for effect in loaders:
                     effect.load(moment, load)
-            forward, left_force = load.forward + force[k], load.left + rollers
+            forward, left_force = load.forward + rough * force[k], load.left + rollers
             applied[0], applied[1] = cos * forward - sin * left_force, sin * forward + cos * left_force
             applied[3], applied[4] = load.roll, load.pitch
-            applied[5] = load.yaw + twist[k] + NOMINAL_WHEELBASE * rollers
+            applied[5] = load.yaw + rough * twist[k] + NOMINAL_WHEELBASE * rollers
+            applied[left_m] = applied[right_m] = 0.0
             applied[left_v], applied[right_v] = load.wheel
-            applied[el] += left
-            applied[er] += right
+            applied[left_m] += left
+            applied[right_m] += right
             torques[k] = left, right
             mujoco.mj_step(model, data, SUBSTEPS)
-        return _record(t, qpos, qvel, torques, self.encoder_q)
+        return _record(t, qpos, qvel, torques, self.wheel_q)
 
     def _place(self, start: tuple[float, float, float]) -> None:
         """At rest, settled, at x, y, yaw: the settled attitude is turned with the heading."""
@@ -184,12 +186,12 @@ def autoregressive(count: int, correlation: float, random: np.random.Generator) 
     return lfilter([math.sqrt(1 - rho**2)], [1.0, -rho], white)
 
 
-def _record(t: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray, encoder_q: list[int]) -> Drive:
+def _record(t: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray, wheel_q: list[int]) -> Drive:
     w, x, y, z = qpos[:, 3:7].T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward, left = cos * qvel[:, 0] + sin * qvel[:, 1], cos * qvel[:, 1] - sin * qvel[:, 0]
     return Drive(
         t=t, pose=np.column_stack([qpos[:, :2], yaw]), speed=np.column_stack([forward, left, qvel[:, 5]]),
-        encoder=qpos[:, encoder_q] - qpos[0, encoder_q], torque=torque,
+        encoder=qpos[:, wheel_q] - qpos[0, wheel_q], torque=torque,
     )  # fmt: skip

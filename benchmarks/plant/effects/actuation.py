@@ -52,7 +52,7 @@ class DriveGainDifference(Effect):
 
 
 class Backlash(Effect):
-    """Rotor and wheel are two bodies, free of each other within +-s; the encoders sit on the rotors."""
+    """Rotor and wheel are two bodies, free of each other within +-s; the encoders sit on the wheels."""
 
     @staticmethod
     def change(chair: Chair, size: float) -> Chair:

@@ -1,0 +1,174 @@
+"""The contact plant drives like a chair, its logs are blind and repeatable."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import plant
+from benchmarks.plant.__main__ import main
+from benchmarks.plant.chair import Chair
+from benchmarks.plant.commands import nine
+from benchmarks.plant.compare import channels, read
+from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.make import HELD_OUT, make_log, plan
+from benchmarks.plant.sensors import outside_pose
+from benchmarks.plant.trial import Noise, Plant
+
+SHORT = {"dash_1m": np.array([[0.0, 0, 0], [0.5, 0.5, 0.3], [2.0, 0, 0], [3.0, 0, 0]])}
+STILL = np.array([[0.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+
+
+def drive(messages, noise=0.0, effects=(), chair=None, start=(0.0, 0.0, 0.5), seed=0):
+    return Plant(chair or Chair()).drive(
+        messages, start, list(effects), Noise().scaled(noise), np.random.default_rng(seed)
+    )
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_constant_speed_is_free_of_chatter():
+    log = drive(nine(0)["straight"])
+    steady = log.speed[(log.t > 10) & (log.t < 18)]
+    acceleration = np.gradient(steady[:, 0], 0.004)
+    assert np.std(acceleration) < 0.05  # m/s^2
+    assert abs(steady[:, 1]).max() < 0.002 and abs(steady[:, 2]).max() < 0.002
+    assert np.mean(steady[:, 0]) == pytest.approx(nine(0)["straight"][50, 1], rel=0.005)
+
+
+def test_circle_turns_as_commanded_without_ripple():
+    messages = nine(0)["circle"]
+    log = drive(messages)
+    steady = log.speed[(log.t > 10) & (log.t < 19)]
+    assert np.std(steady[:, 2]) < 0.002
+    assert np.mean(steady[:, 2]) == pytest.approx(messages[50, 2], rel=0.01)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_standstill_stays_still(noise):
+    log = drive(STILL, noise)
+    assert np.abs(log.pose[:, :2]).max() < 0.0005 and np.ptp(log.pose[:, 2]) < 0.0005
+    assert np.abs(log.encoder).max() < 0.004
+
+
+def test_outside_pose_has_the_declared_noise():
+    seen = outside_pose(drive(STILL), Noise(), np.random.default_rng(3))
+    assert np.std(seen[:, 1]) == pytest.approx(0.003, rel=0.2) and np.std(seen[:, 3]) == pytest.approx(0.003, rel=0.2)
+
+
+def test_replicates_differ_at_the_declared_level_and_not_without_noise(tmp_path):
+    spreads = []
+    for noise in (1.0, 0.0):
+        make_log(tmp_path / f"n{noise}", seed=5, noise=noise, manoeuvres=["circle"])
+        rows = np.stack([channels(trial) for trial in read(tmp_path / f"n{noise}").values()])
+        spreads.append(np.sqrt(rows.var(axis=0, ddof=1).mean(axis=0)))
+    v, omega, yaw = spreads[0][:3]
+    assert 0.003 < v < 0.006 and 0.0045 < omega < 0.0095 and 0.001 < yaw < 0.008
+    assert spreads[1][0] < 0.002 and spreads[1][1] < 0.004 and spreads[1][6] < 0.005
+
+
+@pytest.mark.quick
+def test_days_differ_by_a_few_percent_and_the_nominal_chair_does_not():
+    days = [plan({}, seed, 1.0, True)[0].chair for seed in range(20)]
+    gains, masses = np.array([day.kp for day in days]), np.array([day.mass for day in days])
+    assert len(set(gains)) == 20 and 0.01 < np.std(gains) / 9.0 < 0.06 and np.abs(masses / 54.0 - 1).max() < 0.1
+    assert plan({}, 1, 1.0, False)[0].chair == plan({}, 2, 1.0, False)[0].chair == Chair()
+
+
+def test_the_same_arguments_give_the_same_files_in_any_number_of_processes(tmp_path):
+    first, second, third = (
+        make_log(tmp_path / name, {"wind": 8.0}, seed=4, manoeuvres=SHORT, replicates=2, processes=processes)
+        for name, processes in (("a", 1), ("b", 1), ("c", 2))
+    )
+    other = make_log(tmp_path / "d", {"wind": 8.0}, seed=6, manoeuvres=SHORT, replicates=2)
+    assert contents(first) == contents(second) == contents(third)
+    assert contents(first) != contents(other)
+
+
+def test_size_zero_is_the_plain_chair(tmp_path):
+    plain = make_log(tmp_path / "plain", seed=4, manoeuvres=SHORT, replicates=1)
+    zero = make_log(tmp_path / "zero", dict.fromkeys(EFFECTS, 0.0), seed=4, manoeuvres=SHORT, replicates=1)
+    assert contents(plain) == contents(zero)
+
+
+def test_the_dataset_is_blind_and_the_answers_lie_outside(tmp_path):
+    effects = {name: entry.base / 10 for name, entry in EFFECTS.items()}
+    out = make_log(tmp_path / "set", effects, seed=4, manoeuvres=SHORT, replicates=1, answers=tmp_path / "truth.json")
+    text = " ".join([*contents(out), *(data.decode() for data in contents(out).values())])
+    assert not [name for name in EFFECTS if name in text]
+    assert not any(word in text for word in ("seed", "effect", "kp"))
+    assert json.loads((tmp_path / "truth.json").read_text())["effects"] == pytest.approx(effects)
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_all_nine_manoeuvres_have_the_form_of_the_dataset(tmp_path):
+    out = make_log(tmp_path / "set", seed=1, replicates=1, ground_truth=False)
+    trials = read(out)
+    assert sorted(trials) == sorted(f"{name}_1" for name in nine(1)) and len(trials) == 9
+    for streams in trials.values():
+        assert sorted(streams) == ["command", "odometry"]
+        command, odometry = streams["command"], streams["odometry"]
+        assert 12 <= command[-1, 0] <= 31 and np.abs(command[:, 1:]).max() <= 1.0
+        assert odometry.shape[1] == 6 and (np.diff(odometry[:, 0]) > 0).all() and np.abs(odometry[0, 1:4]).max() < 1e-3
+    fields = (out / "dataset.toml").read_text()
+    assert "held_out" in fields and "ground_truth" not in fields and "figure_eight_1" in fields
+    assert set(HELD_OUT[1:]).isdisjoint(word.strip('",[] ') for word in fields.split())
+
+
+def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("benchmarks.plant.make.write_text", fail)
+    with pytest.raises(OSError, match="disk full"):
+        make_log(tmp_path / "set", manoeuvres=SHORT, replicates=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"effects": {"ghost": 1.0}}, "unknown effect 'ghost'"),
+        ({"effects": {"yaw_scrub": -0.01}}, "yaw_scrub=-0.01: must not be negative"),
+        ({"effects": {"slope": float("nan")}}, "slope=nan: must be finite"),
+        ({"manoeuvres": ["waltz"]}, "unknown manoeuvre 'waltz'"),
+        ({"manoeuvres": {"line": np.zeros((4, 2))}}, r"'line': shape \(4, 2\)"),
+        ({"answers": "IN/truth.json"}, "lies inside the dataset"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, arguments, message):
+    if "answers" in arguments:
+        arguments = {"answers": tmp_path / "set" / "truth.json"}
+    with pytest.raises(ValueError, match=message):
+        make_log(tmp_path / "set", **arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line_writes_a_dataset_and_never_replaces_one(tmp_path):
+    arguments = ["--out", str(tmp_path / "set"), "--effects", '{"slope": 0.02}', "--manoeuvres", "turn"]
+    assert main([*arguments, "--replicates", "1", "--seed", "3"]) == tmp_path / "set"
+    with pytest.raises(FileExistsError, match="exists"):
+        main(arguments)
+    with pytest.raises(ValueError, match="not JSON"):
+        main(["--out", str(tmp_path / "other"), "--effects", "slope=0.02"])
+
+
+@pytest.mark.quick
+def test_the_plant_shares_no_vehicle_code():
+    allowed = {"whill_mjx.dataset", "whill_mjx.manoeuvres"}
+    for path in Path(plant.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                names = {node.module or ""}
+            elif isinstance(node, ast.Import):
+                names = {alias.name for alias in node.names}
+            else:
+                continue
+            assert not {name for name in names if name.split(".")[0] in ("whill_mjx", "sysid", "jax")} - allowed, path
