@@ -85,6 +85,14 @@ def person(x, y, height=1.7, clothes=CLOTHES, trousers=TROUSERS, skin=SKIN) -> R
     ])
 
 
+def across(axis: jax.Array) -> jax.Array:
+    """(K, 3) unit vectors square to the unit vectors `axis` (K, 3)."""
+    x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
+    flat = jnp.abs(x) < 0.9
+    one = jnp.where(flat[:, None], jnp.stack([0.0 * x, z, -y], 1), jnp.stack([-z, 0.0 * y, x], 1))
+    return one * jax.lax.rsqrt(jnp.sum(one * one, 1, keepdims=True))
+
+
 def stack_rounds(rounds: list[Rounds]) -> Rounds:
     """The rounds of a list, one after the other."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rounds)

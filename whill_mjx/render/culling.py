@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from whill_mjx.render.camera import pixel_rays
 from whill_mjx.render.shading import View
 from whill_mjx.scene import Boxes
-from whill_mjx.solids import Blocks, Rounds
+from whill_mjx.solids import Blocks, Rounds, across
 
 NEAREST = 1e-3
 """Depth at which primitives that reach behind the camera are cut off [m]."""
@@ -40,29 +39,42 @@ class Bounds:
     near: jax.Array  # m: no point of it has less depth
 
 
-def upright_corners(boxes: Boxes) -> jax.Array:
-    """(P, 8, 3) corners of upright boxes in the world."""
-    c, s = jnp.cos(boxes.yaw)[:, None], jnp.sin(boxes.yaw)[:, None]
-    x, y, z = (boxes.half[:, axis, None] * SIGNS[:, axis] for axis in range(3))
-    return boxes.centre[:, None] + jnp.stack([c * x - s * y, s * x + c * y, z], -1)
+Corners = list[tuple[jax.Array, jax.Array, jax.Array]]
+"""World x, y and z, each (P,), of every corner: apart, so that XLA makes one elementwise kernel of all that follows."""
 
 
-def block_corners(blocks: Blocks) -> jax.Array:
-    """(K, 8, 3) corners of blocks in the world."""
-    own = blocks.half[:, None] * SIGNS
-    return blocks.centre[:, None] + jnp.einsum("kij,kcj->kci", blocks.rotation, own, precision="highest")
+def upright_corners(boxes: Boxes) -> Corners:
+    """Eight corners of upright boxes."""
+    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
+    zero = jnp.zeros_like(c)
+    ways = [(c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0)]
+    return _corners(boxes.centre, ways, [boxes.half[:, axis] for axis in range(3)])
 
 
-def round_corners(rounds: Rounds) -> jax.Array:
-    """(K, 8, 3) corners of the box around each round: square to the axis, as long as the round with its ends."""
-    axis = rounds.axis
-    helper = jnp.where(jnp.abs(axis[:, :1]) < 0.9, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
-    one = jnp.cross(axis, helper)
-    one = one / jnp.linalg.norm(one, axis=1, keepdims=True)
+def block_corners(blocks: Blocks) -> Corners:
+    """Eight corners of blocks."""
+    ways = [tuple(blocks.rotation[:, row, axis] for row in range(3)) for axis in range(3)]
+    return _corners(blocks.centre, ways, [blocks.half[:, axis] for axis in range(3)])
+
+
+def round_corners(rounds: Rounds) -> Corners:
+    """Eight corners of the box around each round: square to the axis, as long as the round with its ends."""
+    axis, one = rounds.axis, across(rounds.axis)
+    other = jnp.cross(axis, one)
     long = rounds.half + jnp.where(rounds.capsule, rounds.radius, 0.0)
-    ways = jnp.stack([one, jnp.cross(axis, one), axis], 2)  # (K, 3, way)
-    own = jnp.stack([rounds.radius, rounds.radius, long], 1)[:, None] * SIGNS
-    return rounds.centre[:, None] + jnp.einsum("kij,kcj->kci", ways, own, precision="highest")
+    ways = [tuple(way[:, row] for row in range(3)) for way in (one, other, axis)]
+    return _corners(rounds.centre, ways, [rounds.radius, rounds.radius, long])
+
+
+def _corners(centre, ways, half) -> Corners:
+    corners = []
+    for signs in SIGNS:
+        point = []
+        for row in range(3):
+            reach = sum(float(sign) * size * way[row] for sign, size, way in zip(signs, half, ways, strict=True))
+            point.append(centre[:, row] + reach)
+        corners.append(tuple(point))
+    return corners
 
 
 def upright_bounds(view: View, boxes: Boxes) -> Bounds:
@@ -70,45 +82,54 @@ def upright_bounds(view: View, boxes: Boxes) -> Bounds:
     return bounds(view, upright_corners(boxes), boxes.mask, EDGES)
 
 
-def shadow_corners(corners: jax.Array, sun: jax.Array) -> jax.Array:
-    """(P, 16, 3): the corners, and where the sun throws them on the ground; their hull holds the shadowed space."""
-    height = jnp.maximum(corners[..., 2:], 0.0)
-    fall = height / jnp.maximum(sun[2], LOWEST_SUN)
-    return jnp.concatenate([corners, corners - fall * sun], 1)
+def shadow_corners(corners: Corners, sun: jax.Array) -> Corners:
+    """The corners, and where the sun throws them on the ground; their hull holds the shadowed space."""
+    steep = 1.0 / jnp.maximum(sun[2], LOWEST_SUN)
+    thrown = []
+    for x, y, z in corners:
+        fall = jnp.maximum(z, 0.0) * steep
+        thrown.append((x - fall * sun[0], y - fall * sun[1], z - fall * sun[2]))
+    return [*corners, *thrown]
 
 
-def bounds(view: View, corners: jax.Array, mask: jax.Array, edges: np.ndarray) -> Bounds:
-    """Rectangles of convex bodies given by `corners` (P, n, 3) in the world and `edges` (m, 2) between them."""
-    camera = jnp.matmul(corners - view.position, view.rotation, precision="highest")
-    one, other = camera[:, edges[:, 0]], camera[:, edges[:, 1]]
-    rise = other[..., 2] - one[..., 2]
-    share = (NEAREST - one[..., 2]) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise)
-    crossing = (one[..., 2] - NEAREST) * (other[..., 2] - NEAREST) < 0
-    cut = one + jnp.clip(share, 0.0, 1.0)[..., None] * (other - one)
-    points = jnp.concatenate([camera, cut], 1)
-    used = jnp.concatenate([camera[..., 2] >= NEAREST, crossing], 1) & mask[:, None]
-    depth = jnp.maximum(points[..., 2], NEAREST)
-    margin = 1e-5  # rounding
-    low, high = [], []
-    for axis in range(2):
-        place = points[..., axis] / depth
-        slack = margin * (1.0 + jnp.abs(place))
-        low.append(jnp.min(jnp.where(used, place - slack, NOTHING), 1))
-        high.append(jnp.max(jnp.where(used, place + slack, -NOTHING), 1))
-    behind = jnp.any(camera[..., 2] < NEAREST, 1)
-    near = jnp.min(jnp.where(used, points[..., 2], NOTHING), 1)
-    near = jnp.where(behind & (near < NOTHING), 0.0, near * (1.0 - 1e-5))
-    return Bounds(low[0], high[0], low[1], high[1], near)
+def bounds(view: View, corners: Corners, mask: jax.Array, edges: np.ndarray) -> Bounds:
+    """Rectangles of convex bodies with these `corners` and `edges` (m, 2) between them; `mask` (P,)."""
+    position, rotation = view.position, view.rotation
+    camera = []
+    for corner in corners:
+        way = [corner[row] - position[row] for row in range(3)]
+        camera.append([sum(way[row] * rotation[row, axis] for row in range(3)) for axis in range(3)])
+    low_u = low_v = near = jnp.full_like(camera[0][2], NOTHING)
+    high_u = high_v = -low_u
+    for x, y, z in camera:
+        inverse = 1.0 / jnp.maximum(z, NEAREST)
+        before, u, v = z >= NEAREST, x * inverse, y * inverse
+        low_u, high_u = _widen(low_u, high_u, u, before)
+        low_v, high_v = _widen(low_v, high_v, v, before)
+        near = jnp.where(before, jnp.minimum(near, z), near)
+    cut_through = jnp.zeros_like(mask)
+    for one, other in edges:
+        (x, y, z), (x2, y2, z2) = camera[one], camera[other]
+        rise = z2 - z
+        share = jnp.clip((NEAREST - z) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise), 0.0, 1.0)
+        crosses = (z >= NEAREST) != (z2 >= NEAREST)
+        low_u, high_u = _widen(low_u, high_u, (x + share * (x2 - x)) * (1.0 / NEAREST), crosses)
+        low_v, high_v = _widen(low_v, high_v, (y + share * (y2 - y)) * (1.0 / NEAREST), crosses)
+        cut_through = cut_through | crosses
+    near = jnp.where(cut_through, 0.0, near * (1.0 - 1e-5))
+    shown = mask & (near < 0.5 * NOTHING)
+    empty = (NOTHING, -NOTHING, NOTHING, -NOTHING, NOTHING)
+    edges_of = (low_u, high_u, low_v, high_v, near)
+    return Bounds(*(jnp.where(shown, value, nothing) for value, nothing in zip(edges_of, empty, strict=True)))
 
 
-def field_of_view(view: View, height: int, width: int) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Smallest and largest u, then v, of an image, from the pixels of its border."""
-    rows, columns = jnp.arange(height, dtype=jnp.float32), jnp.arange(width, dtype=jnp.float32)
-    rim_row = jnp.concatenate([jnp.zeros(width), jnp.full(width, height - 1.0), rows, rows])
-    rim_column = jnp.concatenate([columns, columns, jnp.zeros(height), jnp.full(height, width - 1.0)])
-    points = [pixel_rays(view.intrinsics, rim_row, rim_column, shift) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    u, v = (jnp.concatenate(values) for values in zip(*points, strict=True))
-    return u.min(), u.max(), v.min(), v.max()
+def _widen(low, high, place, used) -> tuple[jax.Array, jax.Array]:
+    """An interval that also holds `place`, with some room for rounding."""
+    slack = 1e-5 * (1.0 + jnp.abs(place))
+    return (
+        jnp.where(used, jnp.minimum(low, place - slack), low),
+        jnp.where(used, jnp.maximum(high, place + slack), high),
+    )
 
 
 def strip_lists(boxes: Bounds, view: View, width: int, strips: int, keep: int) -> jax.Array:

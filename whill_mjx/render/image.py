@@ -19,6 +19,7 @@ from whill_mjx.render.camera import Intrinsics
 from whill_mjx.render.culling import strip_lists, upright_bounds
 from whill_mjx.render.shading import Quality, View, cast, face_normal, pack_channels, pixel_colours, pixel_view
 from whill_mjx.render.tables import Parts, Tables, lit_words, make_tables, parts_of
+from whill_mjx.render.textures import whole
 from whill_mjx.render.visibility import FAR, GROUND, MARKER, SKY, Rays
 from whill_mjx.scene import Scene
 
@@ -64,7 +65,7 @@ def render(
     """
     view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality)
     row, column = _grid(height, width)
-    word = pack_channels(pixel_colours(view, stage, quality, row, column))
+    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
     return unpack_colours(jnp.where(finite, word, jnp.uint32(0)))
 
 
@@ -85,8 +86,8 @@ def render_frame(
     """
     view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality, normals)
     row, column = _grid(height, width)
-    word = pack_channels(pixel_colours(view, stage, quality, row, column))
-    rays = pixel_view(view, row, column)
+    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
+    rays = pixel_view(view, stage, row, column)
     hit = cast(view, stage, rays)
     label = jnp.where(hit.solid, hit.code >> 2, jnp.where(hit.seen, GROUND, SKY))
     kind = jnp.uint8 if stage.labels <= 256 else jnp.uint16
@@ -182,6 +183,21 @@ class Arrays:
 
             key = _least(key, round_key, tables.round)
         return key
+
+    def invert(self, x) -> jax.Array:
+        return visibility.reciprocal(x)
+
+    def ratio(self, x, y) -> jax.Array:
+        return x / y
+
+    def whole(self, x) -> jax.Array:
+        return whole(x)
+
+    def small(self, integer) -> jax.Array:
+        return integer.astype(jnp.float32)
+
+    def level(self, value) -> jax.Array:
+        return (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32)
 
     def settle(self, values) -> Any:
         return jax.lax.optimization_barrier(values)

@@ -64,9 +64,18 @@ class Hit(NamedTuple):
 class Stage(Protocol):
     """Answers of one renderer."""
 
-    bits: int  # of the code in a key
-    lit_words: bool  # the words already hold the light of the faces
-    picture: Any  # function (number, s, t) -> colour of a picture of the atlas; None without one
+    @property
+    def bits(self) -> int:
+        """Bits of the code in a key."""
+
+    @property
+    def lit_words(self) -> bool:
+        """Whether the words already hold the light of the faces."""
+
+    @property
+    def picture(self) -> Any:
+        """Function (number, s, t) -> colour of a picture of the atlas; None without one."""
+
 
     def nearest(self, rays: Rays) -> Any:
         """Key of the nearest solid."""
@@ -76,6 +85,21 @@ class Stage(Protocol):
 
     def dark_word(self, code) -> Any:
         """The same in shadow."""
+
+    def invert(self, x) -> Any:
+        """1 / x for the depth along a ray."""
+
+    def ratio(self, x, y) -> Any:
+        """x / y."""
+
+    def whole(self, x) -> Any:
+        """Largest integer not above x, as int32."""
+
+    def small(self, integer) -> Any:
+        """A uint32 below 2^23 as float."""
+
+    def level(self, value) -> Any:
+        """Grey level 0 to 255, as int32, of a value that is cut to [0, 1]."""
 
     def settle(self, values) -> Any:
         """The same values, computed once for all that use them."""
@@ -101,11 +125,11 @@ def cast(view: View, stage: Stage, rays: Rays) -> Hit:
 def pixel_colours(view: View, stage: Stage, quality: Quality, row, column) -> list:
     """Three arrays in [0, 1]: colours of the pixels at `row` and `column`."""
     if not quality.antialias:
-        centre = pixel_view(view, row, column)
+        centre = pixel_view(view, stage, row, column)
         return shade(view, stage, quality, centre, cast(view, stage, centre))
     shape = (len(SAMPLES), *row.shape)
     sample = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
-    rays = pixel_view(view, row[None], column[None], _place(sample))
+    rays = pixel_view(view, stage, row[None], column[None], _place(sample))
     key = stage.settle(cast(view, stage, rays).key)
     mask = (1 << stage.bits) - 1
     front, back = jnp.min(key, 0), jnp.max(key, 0)
@@ -114,7 +138,7 @@ def pixel_colours(view: View, stage: Stage, quality: Quality, row, column) -> li
     colours = []
     for chosen in (front, back):
         first = jnp.min(jnp.where(key == chosen[None], sample, len(SAMPLES)), 0)
-        one = pixel_view(view, row, column, _place(first))
+        one = pixel_view(view, stage, row, column, _place(first))
         colours.append(shade(view, stage, quality, one, _hit_of(view, stage, one, chosen)))
     return [share * a + (1.0 - share) * b for a, b in zip(*colours, strict=True)]
 
@@ -136,9 +160,9 @@ def _hit_of(view: View, stage: Stage, rays: Rays, key) -> Hit:
     return Hit(key, key & mask, jnp.where(seen, depth, jnp.inf), solid, seen)
 
 
-def pixel_view(view: View, row, column, shift=(0.5, 0.5)) -> Rays:
+def pixel_view(view: View, stage: Stage, row, column, shift=(0.5, 0.5)) -> Rays:
     """Rays through the place `shift` of pixels."""
-    return rays_of(view.rotation, *pixel_rays(view.intrinsics, row, column, shift))
+    return rays_of(view.rotation, *pixel_rays(view.intrinsics, row, column, shift), stage.invert)
 
 
 def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> list:
@@ -150,14 +174,16 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
     depth = jnp.where(seen, hit.depth, 0.0)
     x, y, z = origin[0] + depth * rays.x, origin[1] + depth * rays.y, origin[2] + depth * rays.z
 
-    tile_x, tile_y = (x - looks.tile_offset[0]) / looks.tile, (y - looks.tile_offset[1]) / looks.tile
-    odd = (jnp.floor(tile_x).astype(jnp.int32) + jnp.floor(tile_y).astype(jnp.int32)) & 1
-    fine = 1.0 / (1.0 + 0.05 * depth * depth)  # texture finer than a pixel fades into its mean
+    ratio = stage.ratio
+    tile_x, tile_y = ratio(x - looks.tile_offset[0], looks.tile), ratio(y - looks.tile_offset[1], looks.tile)
+    odd = (stage.whole(tile_x) + stage.whole(tile_y)) & 1
+    fine = ratio(1.0, 1.0 + 0.05 * depth * depth)  # texture finer than a pixel fades into its mean
     cell = jnp.where(box, 10.0, 10.0 / looks.tile)
-    noise = random_cell(x * cell + 0.37, y * cell + 0.59, jnp.where(box, z * 10.0 + 0.41, 0.0), looks.seed) - 0.5
+    above = jnp.where(box, z * 10.0 + 0.41, 0.0)
+    noise = random_cell(x * cell + 0.37, y * cell + 0.59, above, looks.seed, stage.whole) - 0.5
     noise = 1.0 + 2.0 * jnp.where(box, looks.grain, looks.noise) * fine * noise
     foot = 0.72 + 0.28 * jnp.clip(z / SEAM, 0.0, 1.0)
-    mix = 0.5 + (odd.astype(jnp.float32) - 0.5) * (1.0 / (1.0 + 0.01 * depth * depth))
+    mix = 0.5 + (odd.astype(jnp.float32) - 0.5) * ratio(1.0, 1.0 + 0.01 * depth * depth)
     height = jnp.clip(rays.z * jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z), 0.0, 1.0)
 
     shadow = stage.settle(stage.shadow(x, y, z)) if quality.shadows else None
@@ -174,7 +200,7 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
 
     channels = []
     for channel in range(3):
-        paint = (word >> (8 * channel) & 255).astype(jnp.float32) * (foot / 255.0)
+        paint = stage.small((word >> (8 * channel)) & 255) * (foot / 255.0)
         tile = looks.ground[0, channel] + mix * (looks.ground[1, channel] - looks.ground[0, channel])
         sky = looks.sky_horizon[channel] + height * (looks.sky_zenith[channel] - looks.sky_horizon[channel])
         if stage.lit_words:
@@ -222,7 +248,7 @@ def _texture(view: View, stage: Stage, row, point, depth) -> list:
     s = row[8] * x + row[9] * y + row[10] * z + row[11]
     t = row[12] * x + row[13] * y + row[14] * z + row[15]
     pixel = depth * row[17] * (1.0 / view.intrinsics.fy)  # of a repeat
-    fine = 1.0 / (1.0 + 400.0 * pixel * pixel)
+    fine = stage.ratio(1.0, 1.0 + 400.0 * pixel * pixel)
     return texture(row[16], s, t, fine, view.looks.seed, stage.picture)
 
 
@@ -233,10 +259,7 @@ def _fog(finish: Finish, rays: Rays, seen, depth, height, channels) -> list:
     return [finish.fog_colour[i] + clear * (channels[i] - finish.fog_colour[i]) for i in range(3)]
 
 
-def pack_channels(channels) -> jax.Array:
-    """Words uint32 of three arrays in [0, 1]: blue << 16 | green << 8 | red."""
-    word = np.uint32(0)
-    for channel, value in enumerate(channels):
-        level = (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32).astype(jnp.uint32)
-        word = word | (level << (8 * channel))
-    return word
+def pack_channels(stage: Stage, channels) -> jax.Array:
+    """Words uint32 of three arrays: blue << 16 | green << 8 | red."""
+    red, green, blue = (stage.level(value).astype(jnp.uint32) for value in channels)
+    return red | (green << 8) | (blue << 16)

@@ -13,13 +13,14 @@ from whill_mjx.render.visibility import (
     block_shadow_table,
     block_table,
     code_bits,
+    into_frame,
     round_shadow_table,
     round_table,
     upright_shadow_table,
     upright_table,
 )
 from whill_mjx.scene import Boxes, Looks, Scene
-from whill_mjx.solids import Blocks, Rounds
+from whill_mjx.solids import Blocks, Rounds, across
 
 
 @struct.dataclass
@@ -132,8 +133,8 @@ def face_words(position: jax.Array, parts: Parts, looks: Looks, lit: bool) -> tu
     colour = boxes.colour
     if parts.blocks is not None:
         blocks = parts.blocks
-        own = jnp.einsum("kij,ki->kj", blocks.rotation, position - blocks.centre, precision="highest")
-        into_sun = jnp.einsum("kij,i->kj", blocks.rotation, looks.sun, precision="highest")
+        own = into_frame(blocks.rotation, position - blocks.centre)
+        into_sun = into_frame(blocks.rotation, looks.sun)
         cosine = jnp.concatenate([cosine, jnp.where(own > 0, into_sun, -into_sun)])
         colour = jnp.concatenate([colour, blocks.colour])
 
@@ -175,17 +176,17 @@ def face_rows(position: jax.Array, parts: Parts, scene: Scene) -> jax.Array:
 
 def _box_rows(position, centre, half, rotation, scale) -> jax.Array:
     """(K, 4, 16) rows of boxes; pictures stand upright and unmirrored on the sides of an upright one."""
-    own = jnp.einsum("kij,ki->kj", rotation, position - centre, precision="highest")
+    own = into_frame(rotation, position - centre)
     sign = jnp.where(own > 0, 1.0, -1.0)
-    local = jnp.einsum("kij,ki->kj", rotation, -centre, precision="highest")
+    local = into_frame(rotation, -centre)
     maps = jnp.concatenate([jnp.swapaxes(rotation, 1, 2), local[..., None]], 2)  # (K, axis, 4): world to own axes
     fitted = scale[:, None] <= 0
     factor = jnp.where(fitted, 0.5 / half, _inverse(scale)[:, None])[..., None]
     shift = jnp.where(fitted, 0.5, 0.0) * jnp.array([0, 0, 0, 1.0])
     x, y, z = (maps[:, axis] * factor[:, axis] for axis in range(3))
-    across, along = y * sign[:, :1], -x * sign[:, 1:2]
+    right, along = y * sign[:, :1], -x * sign[:, 1:2]
     faces = []
-    for axis, (s, t) in enumerate(((across, z), (along, z), (x, y))):
+    for axis, (s, t) in enumerate(((right, z), (along, z), (x, y))):
         normal = rotation[:, :, axis] * sign[:, axis : axis + 1]
         faces.append(jnp.concatenate([normal, jnp.zeros((normal.shape[0], 5)), s + shift, t + shift], 1))
     return jnp.stack([*faces, faces[2]], 1)
@@ -193,13 +194,10 @@ def _box_rows(position, centre, half, rotation, scale) -> jax.Array:
 
 def _round_rows(position, rounds: Rounds, scale) -> jax.Array:
     """(K, 4, 16) rows of rounds: faces 0 and 1 curved, 2 and 3 the flat end that is turned to the camera."""
-    axis = rounds.axis
-    helper = jnp.where(jnp.abs(axis[:, :1]) < 0.9, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
-    across = jnp.cross(axis, helper)
-    across = across / jnp.linalg.norm(across, axis=1, keepdims=True)
+    axis, aside = rounds.axis, across(rounds.axis)
     factor = jnp.where(scale > 0, _inverse(scale), 1.0)[:, None]
-    offsets = [-jnp.sum(way * rounds.centre, 1, keepdims=True) for way in (across, axis)]
-    maps = [jnp.concatenate(pair, 1) * factor for pair in zip((across, axis), offsets, strict=True)]
+    offsets = [-jnp.sum(way * rounds.centre, 1, keepdims=True) for way in (aside, axis)]
+    maps = [jnp.concatenate(pair, 1) * factor for pair in zip((aside, axis), offsets, strict=True)]
     bend = jnp.stack([rounds.half, 1.0 / jnp.maximum(rounds.radius, 1e-6)], 1)
     curved = jnp.concatenate([axis, rounds.centre, bend, *maps], 1)
     side = jnp.sum((position - rounds.centre) * axis, 1, keepdims=True)

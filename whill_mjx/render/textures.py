@@ -78,9 +78,14 @@ def _between(low, high, share):
     return low + share * (high - low)
 
 
-def random_cell(x, y, z, seed):
-    """Random number in [0, 1) of the unit cell around a point; `seed` is uint32."""
-    a, b, c = (jnp.floor(jnp.asarray(value)).astype(jnp.int32).astype(jnp.uint32) for value in (x, y, z))
+def whole(x):
+    """Largest integer not above x, as int32."""
+    return jnp.floor(jnp.asarray(x)).astype(jnp.int32)
+
+
+def random_cell(x, y, z, seed, whole=whole):
+    """Random number in [0, 1) of the unit cell around a point; `seed` is uint32, `whole` rounds down to int32."""
+    a, b, c = (whole(value).astype(jnp.uint32) for value in (x, y, z))
     mixed = (a * np.uint32(73856093)) ^ (b * np.uint32(19349663)) ^ (c * np.uint32(83492791)) ^ seed
     mixed = (mixed ^ (mixed >> 15)) * np.uint32(0x9E3779B1)
     mixed = (mixed ^ (mixed >> 13)) * np.uint32(0x85EBCA6B)

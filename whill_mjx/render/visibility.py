@@ -36,10 +36,10 @@ class Rays(NamedTuple):
     inverse_z: jax.Array
 
 
-def rays_of(rotation, u, v) -> Rays:
+def rays_of(rotation, u, v, invert: Callable | None = None) -> Rays:
     """Rays through points (u, v) of the image plane of a camera with `rotation` (3, 3) to the world."""
     x, y, z = (rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2] for axis in range(3))
-    return Rays(u, v, x, y, z, reciprocal(z + 1e-9))
+    return Rays(u, v, x, y, z, (invert or reciprocal)(z + 1e-9))
 
 
 def code_bits(labels: int) -> int:
@@ -77,6 +77,16 @@ def reciprocal(x: jax.Array) -> jax.Array:
     return guess + guess * (1.0 - x * guess)
 
 
+def into_frame(rotation: jax.Array, vector: jax.Array) -> jax.Array:
+    """(..., 3) vectors of the world in frames with axes `rotation` (..., 3, 3): no matrix product, so that it fuses."""
+    return sum(rotation[..., row, :] * vector[..., row, None] for row in range(3))  # type: ignore[return-value]
+
+
+def _product(one: jax.Array, other: jax.Array) -> jax.Array:
+    """(K, 3, 3) products of matrices (K, 3, 3) and (3, 3)."""
+    return sum(one[:, :, row, None] * other[row] for row in range(3))  # type: ignore[return-value]
+
+
 # Upright boxes: 12 numbers each.
 
 
@@ -112,9 +122,9 @@ def upright_key(rays: Rays, reach_z, numbers, code, bits: int = 10, invert: Call
 
 def block_table(position: jax.Array, rotation: jax.Array, blocks: Blocks) -> jax.Array:
     """(K, 15) numbers of each block: rows of camera-to-block rotation, minus the camera centre, half sizes."""
-    rows = jnp.einsum("kij,il->kjl", blocks.rotation, rotation, precision="highest")
+    rows = _product(jnp.swapaxes(blocks.rotation, 1, 2), rotation)
     rows = rows + jnp.array([0.0, 0.0, 1e-7])
-    middle = jnp.einsum("kij,ki->kj", blocks.rotation, blocks.centre - position, precision="highest")
+    middle = into_frame(blocks.rotation, blocks.centre - position)
     half = jnp.where(blocks.mask[:, None], blocks.half, -1.0)
     return jnp.concatenate([rows.reshape(-1, 9), middle, half], 1)
 
@@ -144,8 +154,8 @@ def _slabs(inverse_x, inverse_y, inverse_z, reach_z, numbers, code, bits):
 
 def round_table(position: jax.Array, rotation: jax.Array, rounds: Rounds) -> jax.Array:
     """(K, 12) numbers of each round, in camera axes: axis, centre, and what the quadratic needs."""
-    axis = jnp.matmul(rounds.axis, rotation, precision="highest")
-    centre = jnp.matmul(rounds.centre - position, rotation, precision="highest")
+    axis = into_frame(rotation, rounds.axis)
+    centre = into_frame(rotation, rounds.centre - position)
     along, square = jnp.sum(axis * centre, 1), jnp.sum(centre * centre, 1)
     side = square - along * along
     beyond = jnp.maximum(jnp.abs(along) - rounds.half, 0.0)
@@ -168,7 +178,10 @@ def round_key(rays: Rays, square, numbers, code, bits: int = 10, invert: Callabl
     ray_axis = numbers[0] * rays.u + numbers[1] * rays.v + numbers[2]
     ray_centre = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
     along, centre2, radius2, half, capsule = (numbers[i] for i in range(6, 11))
-    distance, flat = round_distance(*square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert)
+    length2, inverse = square
+    distance, flat = round_distance(
+        length2, inverse, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert
+    )
     distance = jnp.where(numbers[11] > 0, 0.0, distance)
     hit = (distance < 1e9) & (distance >= 0)
     return jnp.where(hit, key_of(distance, code + jnp.where(flat, FLAT_END, CURVED), bits), np.int32(FAR))
@@ -232,8 +245,8 @@ def upright_shadow(x, y, z, numbers) -> jax.Array:
 def block_shadow_table(sun: jax.Array, blocks: Blocks) -> jax.Array:
     """(K, 18) numbers of each block: world-to-block rows, minus the centre, inverse sun direction, half sizes."""
     into = jnp.swapaxes(blocks.rotation, 1, 2)
-    offset = -jnp.einsum("kij,kj->ki", into, blocks.centre, precision="highest")
-    direction = jnp.matmul(into, sun, precision="highest")
+    offset = -into_frame(blocks.rotation, blocks.centre)
+    direction = into_frame(blocks.rotation, sun)
     inverse = 1.0 / jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
     half = jnp.where(blocks.mask[:, None], blocks.half, -1.0)
     return jnp.concatenate([into.reshape(-1, 9), offset, inverse, half], 1)
@@ -256,7 +269,7 @@ def _slab_shadow(own, inverse, half) -> jax.Array:
 def round_shadow_table(sun: jax.Array, rounds: Rounds) -> jax.Array:
     """(K, 13) numbers of each round: centre, axis, squared radius, half length, kind, sun along axis, sun."""
     radius2 = jnp.where(rounds.mask, rounds.radius**2, -1e6)
-    along = rounds.axis @ sun
+    along = jnp.sum(rounds.axis * sun, 1)
     rest = jnp.stack([radius2, rounds.half, rounds.capsule, along], 1)
     return jnp.concatenate([rounds.centre, rounds.axis, rest, jnp.broadcast_to(sun, (along.shape[0], 3))], 1)
 
