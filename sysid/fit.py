@@ -1,7 +1,7 @@
 """Fit a vehicle to a driving log: `python -m sysid.fit DATASET --out RUN`.
 
 Only training trials are fitted; held-out ones are predicted once, at the end, by the initial and the fitted vehicle.
-Writes RUN/report.json (`sysid.report`), RUN/*.png and RUN/vehicle.toml.
+Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN/*.png and RUN/vehicle.toml.
 """
 
 from __future__ import annotations
@@ -20,9 +20,20 @@ from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
 from sysid.objective import Noise, Objective, estimate_noise
-from sysid.report import KIND, SCHEMA, error_rows, parameter_table, summaries, table, write_report
+from sysid.report import (
+    KIND,
+    SCHEMA,
+    code_hashes,
+    error_rows,
+    parameter_table,
+    summaries,
+    table,
+    write_html,
+    write_report,
+)
 from sysid.result import FitResult, Progress
 from sysid.rollout import Plant, Replay, make_batch, predictions, vehicle_plant
+from sysid.series import collect, save
 from sysid.space import Space, make_space
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
@@ -153,7 +164,7 @@ def fit_dataset(
     path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
     progress: Progress | None = None, source: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Fit a dataset and write report.json, plots and vehicle.toml into the folder `out`.
+    """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
 
     Args:
         path: dataset folder; only named in the report when `log` is given.
@@ -180,6 +191,9 @@ def fit_dataset(
     report = make_report(log, config, fit, rows, str(path), source)
     write_report(out / "report.json", report)
     write_plots(out, trials, initial, fitted, rows)
+    series = collect(trials, initial, fitted)
+    save(out, series)
+    write_html(out, series)
     intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
     save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
     return report
@@ -204,6 +218,7 @@ def make_report(
         "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
                     "notes": list(log.notes), "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out], **(source or {})},
+        "code": code_hashes(),
         "settings": asdict(config),
         "model": {"preset": config.preset, "effects": [effect.name for effect in fit.params.effects]},
         "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},
@@ -323,7 +338,7 @@ def main(arguments: Arguments) -> None:
         close()
     print(parameter_table(report))
     print(table(report))
-    print(f"wrote {arguments.out / 'report.json'}, {arguments.out / 'vehicle.toml'} and the plots")
+    print(f"wrote {arguments.out / 'report.html'}, report.json, vehicle.toml and the plots")
 
 
 def cli() -> None:

@@ -40,6 +40,7 @@ PARAMETERS = (
 HELD_OUT = "figure_eight"
 TRAJECTORY_FIGURES, YAW_FIGURES = ("s_curve", "figure_eight"), ("turn", "circle")
 SIGNIFICANT = 0.05
+WORSE = 1.001  # times as much counts as more than before
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,7 @@ def sections(content: dict[str, Any], series: Sequence[TrialSeries], figures: Se
 def _html_table(channel: str, entries: Sequence[dict[str, Any]]) -> str:
     rows: list[list[Any]] = []
     for one in entries:
-        better = one["optimised"][0] < one["initial"][0]
+        better = one["optimised"][0] < WORSE * one["initial"][0]
         rows.append([one["manoeuvre"] + (" (held out)" if one["held_out"] else ""),
                      f"{one['metric'].replace('_', ' ')} [{one['unit']}]", one["drives"], _spread(one["initial"]),
                      Cell(_spread(one["optimised"]), "good" if better else "bad"), one["p"], one["p_holm"]])

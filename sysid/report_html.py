@@ -82,7 +82,7 @@ def headline(report: dict[str, Any]) -> str:
         return "No position was measured; see the table."
     text = (f"Position error on {'held-out' if part == 'held_out' else 'training'} trials "
             f"({CHANNEL_NAMES[channel]}): {number(one['initial'])} m before the fit, {number(one['fitted'])} m after")
-    if one.get("noise_floor"):
+    if one.get("noise_floor") and one["fitted"] is not None:
         text += f"; {number(one['fitted'] / one['noise_floor'])} times the spread between replicates"
     return text + f" (ideal vehicle: {number(one['ideal'])} m)."
 
