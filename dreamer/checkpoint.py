@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dreamer import parallel
 from dreamer.config import DreamerConfig
 
 KEEP = 2
@@ -50,11 +51,13 @@ def save(
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
     target = folder / f"{env_steps:012d}"
+    arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
+    if not parallel.is_first_process():
+        return target
+    temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
     try:
-        arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
-        with ocp.PyTreeCheckpointer() as writer:
+        with _checkpointer(ocp) as writer:
             writer.save((temporary / "state").resolve(), {k: v for k, v in arrays.items() if v.size})
         meta = {
             "schema": SCHEMA,
@@ -124,10 +127,22 @@ def load(path: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[st
                 f"{path / name}: length or checksum is not what was written, so the file is damaged. "
                 f"Delete {path} and resume from an older checkpoint, or start in a new folder."
             )
-    with ocp.PyTreeCheckpointer() as reader:
+    with _checkpointer(ocp) as reader:
         arrays = reader.restore((path / "state").resolve())
     leaves = {name: _from_numpy(path, name, leaf, arrays) for name, leaf in _named_leaves(template).items()}
     return jax.tree.unflatten(jax.tree.structure(template), list(leaves.values())), meta
+
+
+def _checkpointer(ocp: Any) -> Any:
+    """Reader and writer of plain arrays, which does not wait for other processes."""
+    if jax.process_count() == 1:
+        return ocp.PyTreeCheckpointer()
+    index = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=index, active_processes={index}, barrier_sync_key_prefix=f"process{index}"
+    )
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -162,14 +177,19 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_numpy(leaf: Any, name: str, rows: Rows | None) -> np.ndarray:
-    if rows is not None and name.startswith(rows[0]) and np.shape(leaf)[:1] == (rows[2],):
+    cut = rows is not None and name.startswith(rows[0]) and np.shape(leaf)[:1] == (rows[2],)
+    if isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated):
+        leaf = jax.jit(jax.random.key_data)(leaf) if _is_key(leaf) else leaf
+        whole = parallel.to_host(leaf)
+        return whole[: rows[1]] if rows is not None and cut else whole
+    if rows is not None and cut:
         leaf = leaf[: rows[1]]
     return np.asarray(jax.device_get(jax.random.key_data(leaf) if _is_key(leaf) else leaf))
 
 
 def _from_numpy(path: Path, name: str, leaf: Any, arrays: dict[str, Any]) -> Any:
-    plain = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-    shape = np.shape(plain)
+    plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+    shape = tuple(plain.shape) if hasattr(plain, "shape") else np.shape(plain)
     if int(np.prod(shape)) == 0:
         return leaf
     if name not in arrays:

@@ -9,12 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.sharding import Mesh
 
 from dreamer import agent as agents
-from dreamer import image, replay
+from dreamer import image, parallel, replay
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
-from dreamer.replay import Replay
+from dreamer.replay import Batch, Replay
 from dreamer.rssm import Latent
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
 
@@ -65,7 +66,9 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int) -> TrainSta
     )
 
 
-def train_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState) -> tuple[TrainState, Metrics]:
+def train_iteration(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None
+) -> tuple[TrainState, Metrics]:
     """Advance every instance by `steps_per_iter` steps, with the updates that the train ratio asks for in between.
 
     Compile it once with the state donated; the replay is then changed in place.
@@ -74,6 +77,7 @@ def train_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState
         env: vector environment, static.
         config: hyperparameters, static.
         state: from `init_state` or the previous call.
+        mesh: devices over which batches are split; None for one device.
 
     Returns:
         New state, and sums over the iteration: `updates` and `episodes` count the terms of `update/...` and
@@ -83,7 +87,7 @@ def train_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState
     def body(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, act_key, update_key = jax.random.split(state.key, 3)
         state, episode_metrics = collect(env, config, dataclasses.replace(state, key=key), act_key)
-        state, update_metrics = learn(env, config, state, update_key)
+        state, update_metrics = learn(env, config, state, update_key, mesh)
         return state, {**episode_metrics, **update_metrics}
 
     if config.steps_per_iter == 1:
@@ -124,7 +128,9 @@ def collect(
     return state, metrics
 
 
-def learn(env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+def learn(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax.Array, mesh: Mesh | None = None
+) -> tuple[TrainState, Metrics]:
     """As many updates as the collected steps have earned.
 
     Steps earn credit only once learning has started and is kept exactly, so nothing is caught up later and a resumed
@@ -140,7 +146,7 @@ def learn(env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax
         agent, memory = carry
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         memory, batch, window = replay.sample(config, memory, sample_key)
-        agent, latent, metrics = agents.update(config, agent, batch, update_key)
+        agent, latent, metrics = agents.update(config, agent, split_batch(mesh, batch), update_key)
         return agent, replay.write_back(config, memory, window, latent), metrics
 
     def add(i: jax.Array, carry: tuple[AgentState, Replay, Metrics]) -> tuple[AgentState, Replay, Metrics]:
@@ -154,12 +160,37 @@ def learn(env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax
     return dataclasses.replace(state, agent=agent, replay=memory, credit=credit - updates * price), metrics
 
 
+def split_batch(mesh: Mesh | None, batch: Batch) -> Batch:
+    """The batch with its sequences split over the devices."""
+    steps = {field.name: getattr(batch, field.name) for field in dataclasses.fields(batch) if field.name != "start"}
+    return Batch(**parallel.split(mesh, steps, 1), start=parallel.split(mesh, batch.start, 0))
+
+
 def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:
     """Credit earned by one step of all instances, and the price of one update, as whole numbers."""
     ratio = Fraction(config.train_ratio).limit_denominator(1000)
     return num_envs * ratio.numerator, config.replayed_per_update * ratio.denominator
 
 
-def compile_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState) -> Any:
+def compile_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None) -> Any:
     """The compiled iteration, state -> (state, metrics), with the state donated."""
-    return jax.jit(lambda s: train_iteration(env, config, s), donate_argnums=0).lower(state).compile()
+
+    def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
+        return train_iteration(env, config, state, mesh)
+
+    if mesh is None:
+        return jax.jit(iterate, donate_argnums=0).lower(state).compile()
+    placement = parallel.state_shardings(mesh, state, env.num_envs)
+    out = (placement, parallel.replicated(mesh))
+    return jax.jit(iterate, donate_argnums=0, in_shardings=(placement,), out_shardings=out).lower(state).compile()
+
+
+def compile_init(env: FunctionalEnv, config: DreamerConfig, seed: int, mesh: Mesh | None = None) -> Any:
+    """The compiled `init_state`, () -> state, each array made where it belongs."""
+
+    def begin() -> TrainState:
+        return init_state(env, config, seed)
+
+    if mesh is None:
+        return jax.jit(begin)
+    return jax.jit(begin, out_shardings=parallel.state_shardings(mesh, jax.eval_shape(begin), env.num_envs))

@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
-from dreamer import checkpoint
+from dreamer import checkpoint, parallel
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
-from dreamer.iteration import TrainState, compile_iteration, init_state, train_iteration
+from dreamer.iteration import TrainState, compile_init, compile_iteration, init_state, train_iteration
 from dreamer.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
@@ -25,6 +26,9 @@ __all__ = ["TrainResult", "TrainState", "evaluate", "init_state", "train", "trai
 
 EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
+StopFn = Callable[[dict[str, float]], bool]
+AGREE_EVERY = 16
+"""Iterations between the moments at which several processes agree on the clock."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +105,10 @@ def train(
     resume: bool = True,
     progress: bool = True,
     on_metrics: MetricsFn | None = None,
+    stop: StopFn | None = None,
+    devices: Sequence[jax.Device] = (),
 ) -> TrainResult:
-    """Train until `total_steps` control steps, summed over instances, are done.
+    """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
 
     `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
     again goes on from its last checkpoint as if nothing had happened.
@@ -120,19 +126,23 @@ def train(
         resume: go on from the newest checkpoint in `out`, if there is one; otherwise start anew and overwrite.
         progress: show a bar on stderr.
         on_metrics: called with every logged line.
+        stop: called with every logged line that holds an evaluation; True ends the run there. With several processes
+            it must come to the same answer in each.
+        devices: over which instances and batches are split, those of all processes; none takes the first one.
 
     Raises:
         ValueError: environment and configuration do not fit, or the checkpoint does not belong to them.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    state, wall_before = _first_state(env, config, out, seed, resume)
+    mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
+    state, wall_before = _first_state(env, config, out, seed, resume, mesh)
     began = time.monotonic()
     steps_per_iter = env.num_envs * config.steps_per_iter
     env_steps = int(state.env_steps)
     log = _Log(out / "metrics.jsonl", env_steps, on_metrics)
-    iterate = compile_iteration(env, config, state)
-    bar = Progress(total_steps, env_steps, progress)
+    iterate = compile_iteration(env, config, state, mesh)
+    bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
     meter, saved_at = Meter(), time.monotonic()
 
     def wall_s() -> float:
@@ -142,13 +152,16 @@ def train(
         line = {"env_steps": env_steps, "updates": int(state.agent.updates), "wall_s": wall_s()}
         line |= meter.read(config, steps_per_iter)
         if evaluated and eval_fn is not None:
-            line |= {f"eval/{name}": float(value) for name, value in eval_fn(state.agent.params, env_steps).items()}
+            # Several processes evaluate side by side, each on its own device.
+            params = state.agent.params if jax.process_count() == 1 else jax.device_get(state.agent.params)
+            line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, env_steps).items()}
         log.write(line)
         bar.show(env_steps, _headline(line))
 
     logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
+    stopped, iterations = False, 0
     try:
-        while env_steps < total_steps:
+        while env_steps < total_steps and not stopped:
             state, metrics = iterate(state)
             env_steps += steps_per_iter
             meter.add(metrics)
@@ -159,11 +172,17 @@ def train(
             if finished or evaluate_now or now - logged_at >= log_every_s:
                 write_log(state, evaluate_now)
                 logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
-            if finished or now - saved_at >= checkpoint_every_s:
+                stopped = evaluate_now and stop is not None and stop(log.last)
+            iterations += 1
+            due = now - saved_at >= checkpoint_every_s
+            if jax.process_count() > 1:
+                due = iterations % AGREE_EVERY == 0 and parallel.agree(due)
+            if finished or stopped or due:
                 save_state(out, state, config, wall_s())
                 saved_at = time.monotonic()
     except KeyboardInterrupt:
-        save_state(out, state, config, wall_s())
+        if jax.process_count() == 1:  # the other processes may not be there to take part
+            save_state(out, state, config, wall_s())
         raise
     finally:
         bar.close()
@@ -179,15 +198,21 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
 
 
 def _first_state(
-    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int, resume: bool
+    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int, resume: bool, mesh: Mesh | None
 ) -> tuple[TrainState, float]:
     """State to start from and the time [s] already spent."""
-    state = jax.jit(lambda: init_state(env, config, seed))()
-    if resume:
-        restored = checkpoint.restore(out / "checkpoints", state, config)
+    if resume and checkpoint.complete(out / "checkpoints"):
+        template = jax.jit(lambda: init_state(env, config, seed))()
+        restored = checkpoint.restore(out / "checkpoints", template, config)
         if restored is not None:
-            return restored[0], float(restored[1]["wall_s"])
-    else:
+            state = restored[0]
+            if mesh is not None:
+                state = parallel.place(state, parallel.state_shardings(mesh, state, env.num_envs))
+            return state, float(restored[1]["wall_s"])
+    state = compile_init(env, config, seed, mesh)()
+    if not parallel.is_first_process():
+        return state, 0.0
+    if not resume:
         for path in checkpoint.complete(out / "checkpoints"):
             checkpoint.remove(path)
     _write_atomically(out / "config.json", json.dumps({**asdict(config), "seed": seed}, indent=1) + "\n")
@@ -211,7 +236,9 @@ class _Log:
     def __init__(self, path: Path, env_steps: int, on_metrics: MetricsFn | None) -> None:
         self._path, self._on_metrics = path, on_metrics
         self.last: dict[str, float] = {}
-        kept = []
+        kept: list[str] = []
+        if not parallel.is_first_process():
+            return
         for text in path.read_text().splitlines() if path.exists() else []:
             try:
                 line = json.loads(text)
@@ -224,9 +251,11 @@ class _Log:
 
     def write(self, line: dict[str, float]) -> None:
         """Append one line."""
+        self.last = line
+        if not parallel.is_first_process():
+            return
         with self._path.open("a") as file:
             file.write(json.dumps(line) + "\n")
-        self.last = line
         if self._on_metrics is not None:
             self._on_metrics(line)
 

@@ -1,0 +1,75 @@
+"""Run by test_parallel.py in fresh processes: a short training on some devices, its parameters written to a file.
+
+    run_parallel.py devices OUT               one process, all its devices, and one of them alone
+    run_parallel.py process OUT PORT INDEX    one of two processes
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+from dreamer_toys import corridor_env, tiny_config  # noqa: E402
+
+from dreamer import iteration, parallel  # noqa: E402
+from dreamer.train import _first_state, train  # noqa: E402
+
+# Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
+# two-hot critic are near 5e8, so that runs agree in what they learn but not in every digit.
+CONFIG = tiny_config(batch_size=8, learning_starts=72, train_ratio=16.0, warmup=1)
+ENV = corridor_env(8)
+QUIET = dict(progress=False, log_every_s=1e9, checkpoint_every_s=1e9)
+
+
+def run(devices, iterations=9):
+    """Parameters and summed metrics after some iterations, and how the state lies on the devices."""
+    mesh = parallel.make_mesh(devices, ENV.num_envs, CONFIG.batch_size)
+    state = iteration.compile_init(ENV, CONFIG, 0, mesh)()
+    step = iteration.compile_iteration(ENV, CONFIG, state, mesh)
+    sums = {}
+    for _ in range(iterations):
+        state, metrics = step(state)
+        sums = {name: sums.get(name, 0.0) + float(value) for name, value in metrics.items()}
+    placed = {
+        "shards": len(state.replay.obs.addressable_shards),
+        "columns": state.replay.obs.addressable_shards[0].data.shape[1],
+        "replicated": all(leaf.sharding.is_fully_replicated for leaf in jax.tree.leaves(state.agent)),
+        "reduces": "all-reduce" in step.as_text(),
+    }  # fmt: skip
+    return flat(state.agent.params), sums, placed
+
+
+def flat(params):
+    """All parameters in one row."""
+    return np.concatenate([np.asarray(leaf).ravel() for leaf in jax.tree.leaves(params)])
+
+
+def several_devices(out):
+    alone, alone_sums, _ = run(jax.devices()[:1])
+    many, many_sums, placed = run(jax.devices())
+    np.savez(out, alone=alone, many=many)
+    out.with_suffix(".json").write_text(json.dumps({"alone": alone_sums, "many": many_sums, **placed}))
+
+
+def one_of_two(out, port, index):
+    jax.distributed.initialize(f"localhost:{port}", 2, index)
+    assert jax.process_count() == 2 and len(jax.local_devices()) == 1
+    folder, devices = out.parent / "run", jax.devices()
+    result = train(ENV, CONFIG, folder, 72, 0, devices=devices, eval_fn=lambda params, steps: {"x": float(index)},
+                   **QUIET)  # fmt: skip
+    mesh = parallel.make_mesh(devices, ENV.num_envs, CONFIG.batch_size)
+    again, _ = _first_state(ENV, CONFIG, folder, 0, True, mesh)  # what a second start would go on from
+    assert len(again.replay.obs.sharding.device_set) == 2 and int(again.env_steps) == 72
+    many, restored = (flat(jax.device_get(agent.params)) for agent in (result.agent, again.agent))
+    if index == 0:
+        np.savez(out, many=many, restored=restored)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "devices":
+        several_devices(Path(sys.argv[2]))
+    else:
+        one_of_two(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
