@@ -111,6 +111,7 @@ def render_pallas(
         "atlas_shape": None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.shape,
         "starts": _first_labels(scene),
         "fast": tiling.fast and not interpret,
+        "interpret": interpret,
         "cull": tiling.cull,
     }
     down, across = -(-height // tiling.rows), -(-width // tiling.columns)
@@ -292,6 +293,7 @@ class Refs:
     atlas_shape: tuple | None
     starts: dict[str, int]
     fast: bool
+    interpret: bool
     cull: bool
 
     @property
@@ -382,7 +384,7 @@ class Refs:
         return fast_level(value) if self.fast else (value + 0.5).astype(jnp.int32)
 
     def settle(self, values) -> Any:
-        return values
+        return jax.lax.optimization_barrier(values) if self.interpret else values  # Triton needs none
 
     def shadow(self, x, y, z) -> jax.Array:
         tests = {name: getattr(visibility, f"{name}_shadow") for name in self.data.kinds}

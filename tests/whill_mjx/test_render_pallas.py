@@ -1,0 +1,112 @@
+"""The kernel against the jnp renderer, on the CPU: interpreted, and lowered for CUDA."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.finish import label_count, make_atlas, plain_finish
+from whill_mjx.render import Quality, camera_rotation, pinhole, render
+from whill_mjx.render.pallas import Tiling, fast_level, fast_small, fast_whole, render_pallas
+from whill_mjx.scene import Boxes, Marker, Scene, default_looks
+from whill_mjx.solids import Solids, block, person, post, stack_rounds
+
+EYE, TURN = jnp.array([0.0, 0.1, 1.0]), camera_rotation(0.1, 0.15, 0.05)
+BEST = Quality(antialias=True, shadows=True)
+DISTORTED = dataclasses.replace(pinhole(1.2, 32, 32), distortion=jnp.array([-0.2, 0.05, 0.001, 0.0, 0.0]))
+
+
+def crowd(count, key=0):
+    keys = jax.random.split(jax.random.key(key), 4)
+    place = jax.random.uniform(keys[0], (count, 2), minval=-3.0, maxval=3.0) + jnp.array([4.0, 0.0])
+    half = jax.random.uniform(keys[1], (count, 3), minval=0.05, maxval=0.4)
+    yaw = jax.random.uniform(keys[2], (count,), maxval=6.0)
+    colour = jax.random.uniform(keys[3], (count, 3))
+    boxes = Boxes(jnp.concatenate([place, half[:, 2:]], 1), half, yaw, colour, jnp.arange(count) % 5 != 1)
+    marker = Marker(jnp.array([5.0, 0.0, 1.0]), jnp.array([0.02, 0.3, 0.3]), jnp.zeros(()), jnp.array([0.0, 0.1, 0.9]))
+    return Scene(boxes, marker, default_looks())
+
+
+def furnished(count=6):
+    tilt = camera_rotation(0.4, 0.3, 0.5)
+    rounds = stack_rounds([person(3.0, 0.5), post(2.5, -0.5, 1.0, 0.06, (0.9, 0.7, 0.1))])
+    blocks = block((3.0, -1.0, 0.5), (0.3, 0.3, 0.3), tilt, (0.3, 0.6, 0.3))
+    scene = dataclasses.replace(crowd(count), solids=Solids(blocks, rounds))
+    labels = label_count(scene)
+    finish = plain_finish(labels)
+    picture = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    finish = dataclasses.replace(
+        finish,
+        texture=jnp.arange(labels) % 7 + jnp.where(jnp.arange(labels) == 4, 12, 0),
+        scale=jnp.full(labels, 0.7),
+        lamp_colour=jnp.array([[0.5, 0.4, 0.3]]),
+        fog=jnp.array(0.05),
+        atlas=make_atlas([picture]),
+    )
+    return dataclasses.replace(scene, finish=finish)
+
+
+def both(scene, lens, quality, tiling, size=32):
+    one = jax.jit(lambda s: render(EYE, TURN, lens, s, size, size, quality))(scene)
+    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, size, size, quality, tiling, interpret=True))(scene)
+    return np.abs(np.asarray(one).astype(int) - np.asarray(other)).max(-1), np.asarray(one)
+
+
+@pytest.mark.parametrize(
+    "scene, quality, lens, tiling",
+    [
+        (crowd(12), Quality(), pinhole(1.2, 32, 32), Tiling(8, 8)),
+        (crowd(70), Quality(), pinhole(1.2, 32, 32), Tiling(8, 16)),
+        (crowd(12), BEST, pinhole(1.2, 32, 32), Tiling(16, 16, words=True)),
+        (furnished(), Quality(shadows=True), DISTORTED, Tiling(16, 16)),
+    ],
+    ids=["plain", "several chunks", "antialias and shadows", "furnished"],
+)
+def test_kernel_draws_what_the_jnp_renderer_draws(scene, quality, lens, tiling):
+    difference, image = both(scene, lens, quality, tiling)
+    assert image.std() > 20
+    assert (difference > 1).mean() < 5e-3  # a silhouette may fall to either side
+
+
+def test_kernel_draws_sizes_that_tiles_do_not_divide():
+    scene, lens = crowd(5), pinhole(1.0, 20, 28)
+    one = jax.jit(lambda s: render(EYE, TURN, lens, s, 20, 28))(scene)
+    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, 20, 28, interpret=True))(scene)
+    assert other.shape == (20, 28, 3)
+    assert (np.abs(np.asarray(one).astype(int) - np.asarray(other)) > 1).mean() < 5e-3
+
+
+def test_a_batch_of_kernels_equals_single_ones_and_bad_poses_are_black():
+    scenes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), crowd(4))
+    eyes = jnp.stack([EYE, EYE.at[0].set(jnp.nan)])
+    lens = pinhole(1.2, 16, 16)
+    draw = jax.jit(jax.vmap(lambda p, s: render_pallas(p, TURN, lens, s, 16, 16, interpret=True)))
+    images = np.asarray(draw(eyes, scenes))
+    single = np.asarray(jax.jit(lambda s: render(EYE, TURN, lens, s, 16, 16))(crowd(4)))
+    assert (np.abs(images[0].astype(int) - single) > 1).mean() < 5e-3 and images[0].std() > 10
+    assert not images[1].any()
+
+
+@pytest.mark.parametrize("scene, quality", [(crowd(12), Quality()), (furnished(40), BEST)], ids=["plain", "all"])
+def test_kernel_lowers_for_cuda(scene, quality):
+    scenes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((4, *leaf.shape), leaf.dtype), scene)
+    draw = jax.jit(jax.vmap(lambda s: render_pallas(EYE, TURN, DISTORTED, s, 32, 32, quality)))
+    assert "triton" in draw.trace(scenes).lower(lowering_platforms=("cuda",)).as_text()
+
+
+@pytest.mark.quick
+def test_sums_replace_conversions():
+    x = np.linspace(-300.0, 300.0, 10001).astype(np.float32) + np.float32(0.0137)
+    np.testing.assert_array_equal(fast_whole(x), np.floor(x))  # eagerly: XLA would merge the sums
+    np.testing.assert_array_equal(fast_small(jnp.arange(256, dtype=jnp.uint32)), np.arange(256))
+    np.testing.assert_array_equal(fast_level(np.array([0.0, 0.4, 0.6, 254.6, 255.0], np.float32)), [0, 0, 1, 255, 255])
+
+
+@pytest.mark.quick
+def test_tiles_that_triton_cannot_draw_are_refused():
+    with pytest.raises(ValueError, match="columns is 12"):
+        Tiling(8, 12)
