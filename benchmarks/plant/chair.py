@@ -65,14 +65,14 @@ class Chair:
 
     def on_day(self, random: np.random.Generator) -> Chair:
         """The same chair on another day: gains, mass, friction and wheel damping differ by a few percent."""
-        scale = np.exp(0.03 * np.clip(random.standard_normal(8), -2.0, 2.0))
+        scale = np.exp(0.02 * np.clip(random.standard_normal(8), -2.0, 2.0))
         return replace(
             self,
             kp=self.kp * scale[0],
             ki=self.ki * scale[1],
             mass=self.mass * scale[2],
             friction=self.friction * scale[3],
-            damping=self.damping * scale[4] ** 3,  # up to a fifth: bearings and tyres change most
+            damping=self.damping * scale[4] ** 3,  # bearings and tyres change most
             roller=self.roller * scale[5] ** 3,
             com=(self.com[0] * scale[6], self.com[1], self.com[2]),
             patch=self.patch * scale[7] ** 3,
