@@ -138,7 +138,8 @@ def test_silhouettes_and_depth_are_those_of_mujoco(renderer_of, kind, pose):
         ours, theirs = label == first + index, geom == index + 1
         assert theirs.sum() > 30
         assert within_a_pixel(ours, theirs), f"{kind} {index}"
-    inside = (np.where(label >= FIRST_BOX, label - first + 1, np.where(label == GROUND, 0, -1)) == geom) & (label != SKY)
+    number = np.where(label >= FIRST_BOX, label - first + 1, np.where(label == GROUND, 0, -1))
+    inside = (number == geom) & (label != SKY)
     inside &= np.pad(geom[1:-1, 1:-1] == geom[:-2, 1:-1], 1) & np.pad(geom[1:-1, 1:-1] == geom[1:-1, :-2], 1)
     near = inside & (depth < 5.0)
     error = np.abs(np.asarray(frame.depth) - depth)[near]
