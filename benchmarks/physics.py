@@ -1,29 +1,40 @@
-"""Physics throughput: physics steps/s of the free chassis with the paper's base model, parameters different everywhere.
+"""Physics: throughput with parameters different everywhere, kernels of one step, and the error of the time step.
 
-    python -m benchmarks.physics [--instances 1024 32768 131072]
+    python -m benchmarks.physics [--instances 1024 32768 131072] [--dynamics fused]
+    python -m benchmarks.physics --parts kernels     # operations of one compiled step, closed form against mjx.step
+    python -m benchmarks.physics --parts timestep    # a figure-eight against one of steps eight times smaller
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
+from whill_mjx.config import VehicleConfig
+from whill_mjx.kinematics import reference_pose
+from whill_mjx.manoeuvres import command_table
 from whill_mjx.model import VehicleModel, build_model
 from whill_mjx.presets import preset
 from whill_mjx.types import VehicleParams, VehicleState
 from whill_mjx.vehicle import drive, place
 
+CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
 SPREAD = 0.1  # relative spread of every parameter between instances
 
 
-def random_instances(vehicle: str, count: int) -> tuple[VehicleModel, VehicleParams, VehicleState]:
+def random_instances(
+    vehicle: str, count: int, dynamics: str = "fused"
+) -> tuple[VehicleModel, VehicleParams, VehicleState]:
     """`count` vehicles at rest with every parameter spread by SPREAD."""
     spec, params = preset(vehicle)
-    model = build_model(spec)
+    model = build_model(spec, VehicleConfig(dynamics=dynamics))
     key = jax.random.key(0)
 
     def scatter(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
@@ -37,9 +48,9 @@ def random_instances(vehicle: str, count: int) -> tuple[VehicleModel, VehiclePar
     return model, scattered, states
 
 
-def measure(vehicle: str, count: int, periods: int, repeats: int) -> tuple[list[float], float, dict[str, float]]:
-    """Physics steps/s of each repeat, compile seconds, and a check of the end state."""
-    model, params, states = random_instances(vehicle, count)
+def compiled_roll(vehicle: str, count: int, periods: int, dynamics: str) -> tuple[VehicleModel, Any, tuple]:
+    """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments."""
+    model, params, states = random_instances(vehicle, count, dynamics)
     commands = jax.random.uniform(jax.random.key(1), (periods, count, 2), minval=-1.0)
 
     @jax.jit
@@ -49,31 +60,112 @@ def measure(vehicle: str, count: int, periods: int, repeats: int) -> tuple[list[
 
         return jax.lax.scan(period, states, commands)[0]
 
+    arguments = params, states, commands
+    return model, roll.lower(*arguments).compile(), arguments
+
+
+def measure(
+    vehicle: str, count: int, periods: int, repeats: int, dynamics: str = "fused"
+) -> tuple[list[float], float, dict[str, float]]:
+    """Physics steps/s of each repeat, compile seconds, and a check of the end state."""
     start = time.perf_counter()
-    compiled = roll.lower(params, states, commands).compile()
+    model, compiled, arguments = compiled_roll(vehicle, count, periods, dynamics)
     compile_s = time.perf_counter() - start
-    end = compiled(params, states, commands)
-    seconds = time_calls(lambda: compiled(params, states, commands), repeats)
+    end = compiled(*arguments)
+    seconds = time_calls(lambda: compiled(*arguments), repeats)
     steps = count * periods * model.config.substeps
     check = {"diverged": float(end.diverged.mean()), "farthest_m": float(jnp.abs(end.qpos[:, :2]).max())}
     return [steps / second for second in seconds], compile_s, check
 
 
+def kernels_per_step(vehicle: str, dynamics: str) -> int:
+    """Fused loops, products and library calls in the compiled loop over physics steps: what a GPU launches per step."""
+    _, compiled, _ = compiled_roll(vehicle, 1024, 1, dynamics)
+    bodies = re.split(r"\n(?=%|ENTRY)", compiled.as_text())
+    kernel = re.compile(r" (?:fusion|dot|custom-call|copy)\(")
+    return max(len(kernel.findall(body)) for body in bodies if not body.startswith("ENTRY"))
+
+
+def timestep_errors(vehicle: str, dt: float) -> tuple[float, float, float]:
+    """Largest differences of a figure-eight at step dt from one at dt / 8, in float64.
+
+    Returns:
+        Position of the reference point [m], heading [rad], speed of the wheels' rims [m/s].
+    """
+    with jax.enable_x64(True):
+        spec, params = preset(vehicle)
+        table = jnp.asarray(command_table("figure_eight")[:, 1:])
+        drives = []
+        for step in (dt, dt / 8):
+            build_model.cache_clear()
+            model = build_model(spec, VehicleConfig(physics_dt=step))
+
+            def record(state: VehicleState, command: jax.Array, model=model) -> tuple[VehicleState, jax.Array]:
+                state = drive(model, params, state, command)
+                rims = state.qvel[6:8] * spec.wheel_radius
+                return state, jnp.concatenate([jnp.stack(reference_pose(model, state.qpos)), rims])
+
+            start = place(model, params, 0.0, 0.0, 0.0)
+            drives.append(np.array(jax.jit(lambda s, record=record: jax.lax.scan(record, s, table)[1])(start)))
+        build_model.cache_clear()
+    coarse, fine = drives
+    turn = np.abs(np.unwrap(coarse[:, 2]) - np.unwrap(fine[:, 2])).max()
+    position = np.hypot(*(coarse[:, :2] - fine[:, :2]).T).max()
+    return float(position), float(turn), float(np.abs(coarse[:, 3:] - fine[:, 3:]).max())
+
+
+def record_timestep(vehicle: str = "whill_cr_physical") -> None:
+    """Print and record the error of each time step, and the largest one within 2 mm and 2 mrad."""
+    figures, within = {}, []
+    for dt in (0.01, 0.005, 0.0025, 0.00125):
+        position, turn, rim = timestep_errors(vehicle, dt)
+        print(f"{vehicle} dt {dt * 1e3:5.2f} ms: {position * 1e3:.3f} mm, {turn * 1e3:.3f} mrad, {rim * 1e3:.2f} mm/s")
+        entry = figure([position * 1e3], "mm")
+        figures[f"figure_eight_error_dt_{dt * 1e3:g}ms"] = {**entry, "yaw_mrad": turn * 1e3, "rim_mm_per_s": rim * 1e3}
+        within += [dt] if position <= 2e-3 and turn <= 2e-3 else []
+    if within:
+        figures["largest_dt_within_2mm_2mrad"] = figure([max(within)], "s")
+    record("physics", CLAIM, figures)
+
+
+def record_kernels(vehicle: str = "whill_cr_physical") -> None:
+    """Print and record the operations of one compiled physics step."""
+    figures = {}
+    for dynamics in ("fused", "mjx"):
+        count = kernels_per_step(vehicle, dynamics)
+        print(f"{vehicle}, {dynamics}: {count} kernels per physics step")
+        figures[f"kernels_per_step_{dynamics}_{jax.devices()[0].platform}"] = figure([count], "kernels")
+    record("physics", CLAIM, figures)
+
+
 def main() -> None:
-    """Print and record steps/s for every instance count."""
+    """Print and record the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     on_cpu = jax.devices()[0].platform == "cpu"
     parser.add_argument("--instances", type=int, nargs="+", default=[1024, 2048] if on_cpu else [1024, 32768, 131072])
     parser.add_argument("--vehicles", nargs="+", default=["whill_cr_paper", "whill_cr_physical"])
     parser.add_argument("--periods", type=int, default=5 if on_cpu else 20)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--parts", nargs="+", choices=("speed", "kernels", "timestep"), default=["speed"])
+    parser.add_argument("--dynamics", choices=("fused", "mjx"), default="fused")
     options = parser.parse_args()
+    if "timestep" in options.parts:
+        record_timestep()
+    if "kernels" in options.parts:
+        record_kernels()
+    if "speed" in options.parts:
+        record_speed(options, on_cpu)
+
+
+def record_speed(options: argparse.Namespace, on_cpu: bool) -> None:
+    """Print and record steps/s for every instance count."""
     figures = {"dt_s": figure([0.005], "s")}
     best: list[float] = []
     for vehicle in options.vehicles:
         suffix = "" if vehicle == "whill_cr_paper" else f"_{vehicle.removeprefix('whill_cr_')}"
+        suffix += "" if options.dynamics == "fused" else f"_{options.dynamics}"
         for count in options.instances:
-            rates, compile_s, check = measure(vehicle, count, options.periods, options.repeats)
+            rates, compile_s, check = measure(vehicle, count, options.periods, options.repeats, options.dynamics)
             entry = {**figure(rates, "physics steps/s"), "compile_s": compile_s, **check}
             rate = entry["value"] / 1e6
             print(f"{vehicle:18s} {count:7d} instances: {rate:8.2f} M steps/s, compile {compile_s:.1f} s, {check}")
@@ -81,10 +173,12 @@ def main() -> None:
                 figures[f"steps_per_s_{count}{suffix}"] = entry
                 if count == 32768:
                     figures[f"simulated_s_per_s_32768{suffix}"] = figure([r * 0.005 for r in rates], "s/s")
-            elif not suffix and (not best or entry["value"] > max(best)):
+            elif suffix:
+                figures[f"cpu_steps_per_s_{count}{suffix}"] = entry
+            elif not best or entry["value"] > max(best):
                 best = rates
                 figures["cpu_steps_per_s"] = {**entry, "instances": count}
-    record("physics", "batched vehicle physics: free chassis on mjx.step, parameters different everywhere", figures)
+    record("physics", CLAIM, figures)
 
 
 if __name__ == "__main__":
