@@ -1,7 +1,7 @@
 """A smooth image for calibration: differentiable with respect to camera pose, intrinsics, and places of boxes.
 
-`render` has no useful gradient: a pixel shows one thing or the other. Here each thing covers a ray by a share that falls
-smoothly across its edge, and nearer things outweigh farther ones smoothly, so that forward and reverse mode give the
+`render` has no useful gradient: a pixel shows one thing or the other. Here each thing covers a ray by a share that
+falls smoothly across its edge, and nearer things hide farther ones smoothly, so that forward and reverse mode give the
 derivative of what is computed. Flat colours; upright boxes, marker and blocks; no textures.
 """
 
@@ -99,8 +99,8 @@ def render_soft(
 def _angle_inside(eye: jax.Array, half: jax.Array, ray: jax.Array) -> jax.Array:
     """Angle (H, W) by which rays pass inside the outline of a box, negative outside [rad, small angles].
 
-    Everything is in the box's own axes: the eye (3,), half sizes (3,) and rays (H, W, 3). An edge is in the outline where
-    one of its two faces is turned to the eye and the other is not; it spans a plane with the eye.
+    Everything is in the box's own axes: the eye (3,), half sizes (3,) and rays (H, W, 3). An edge is in the outline
+    where one of its two faces is turned to the eye and the other is not; it spans a plane with the eye.
     """
     corners = SIGNS * half - eye  # (8, 3)
     front = SIGNS * eye > half  # (8, 3): is the face of this axis and side turned to the eye?
