@@ -10,16 +10,27 @@ import jax.numpy as jnp
 from whill_mjx.effects import (
     AccelerationLimit,
     AirDrag,
+    CasterKick,
     CommandDelay,
+    CommandExpiry,
+    CommandQuantisation,
+    EncoderResolution,
     ForwardSlip,
+    GyroRange,
     LateralDamping,
     OdometryLag,
     PidDrive,
     RollingContact,
     RollingResistance,
     SlipTraction,
+    StateRate,
     TorqueDrive,
     YawScrub,
+    command_expiry,
+    command_quantisation,
+    encoder_resolution,
+    gyro_range,
+    state_rate,
 )
 from whill_mjx.model import box_inertia
 from whill_mjx.specs import VehicleSpec, find_spec
@@ -30,10 +41,15 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     """Spec and parameters of a built-in vehicle.
 
     "whill_cr" has the paper's initial values, "whill_cr_paper" its optimised ones, "whill_cr_ramp" these with the ramp
-    on commands that the maker documents, "whill_cr_physical" the physical base model; "husky", "warthog" and "create"
+    on commands that the maker documents, "whill_cr_physical" the physical base model,
+    "whill_cr_documented" that with everything the maker documents of the drive, "whill_cr_castored" a chair of the same
+    size on swivelling casters instead of omni-wheels; "husky", "warthog" and "create"
     are the paper's model on another spec.
     """
-    whill = {"whill_cr_paper": paper_optimised, "whill_cr_ramp": paper_ramp, "whill_cr_physical": physical}
+    whill = {
+        "whill_cr_paper": paper_optimised, "whill_cr_ramp": paper_ramp, "whill_cr_physical": physical,
+        "whill_cr_documented": documented, "whill_cr_castored": castored,
+    }  # fmt: skip
     if name in whill:
         spec = find_spec("whill_cr")
         return spec, whill[name](spec)
@@ -112,6 +128,35 @@ def physical(spec: VehicleSpec) -> VehicleParams:
             with_values(OdometryLag, time_constant=0.03),
         ),
     )
+
+
+def documented(spec: VehicleSpec) -> VehicleParams:
+    """The physical model with the drive as the maker documents it; each effect can be taken out of the tuple.
+
+    Commands lapse after 200 ms, come in words and are ramped; state and gyro come in steps and at a rate.
+    """
+    params = physical(spec)
+    before = (
+        with_values(CommandExpiry, **command_expiry.MAKER, loss=0.0),
+        with_values(CommandQuantisation, **command_quantisation.MAKER),
+    )
+    ramp = with_values(AccelerationLimit, linear=1.7, angular=1.7 / (spec.track / 2))
+    behind = (
+        with_values(EncoderResolution, **encoder_resolution.MAKER),
+        with_values(StateRate, **state_rate.MAKER),
+        with_values(GyroRange, **gyro_range.MAKER),
+    )
+    delay, *rest = params.effects
+    return VehicleParams(params.body, (*before, delay, ramp, *rest, *behind))
+
+
+def castored(spec: VehicleSpec) -> VehicleParams:
+    """The physical model on casters: they push across until they trail, and roll freely then (estimates)."""
+    params = physical(spec)
+    slip = with_values(SlipTraction, mu=0.8, slip_speed=0.02, side_slip_speed=0.05, mu_free=0.0)
+    kick = with_values(CasterKick, force_limit=20.0, trail=0.15, start_angle=0.0)
+    effects = tuple(slip if effect.name == "slip_traction" else effect for effect in params.effects)
+    return VehicleParams(params.body, (*effects, kick))
 
 
 def default_body(spec: VehicleSpec) -> Body:
