@@ -23,7 +23,7 @@ class Noise:
 
     road_force: float = 1.5
     """Along the chair [N], first-order, `correlation`."""
-    yaw_torque: float = 0.42
+    yaw_torque: float = 0.47
     """[N m], the same."""
     correlation: float = 0.35
     """[s]"""
