@@ -1,7 +1,7 @@
 """Frames per second of the camera: `python -m benchmarks.camera`. 64x64 RGB.
 
 Parts: "crowd" is 32 boxes and a textured ground (the goal marker is one of the boxes), by the jnp renderer and, on
-NVIDIA GPUs, by the kernel; "best" the same with anti-aliasing and hard shadows; "map" 200 wall pieces of a real corridor
+NVIDIA GPUs, by the kernel; "best" the same with anti-aliasing and hard shadows; "map" 200 pieces of real corridor walls
 and 8 people; "peer" MuJoCo Warp's ray tracer on the crowd, where it is installed; "tilings" compares tile sizes.
 """
 

@@ -1,13 +1,17 @@
-"""Pictures of a task: `python -m whill_mjx.look --task obstacle_course --out FILE.png`.
+"""Pictures of scenes: `python -m whill_mjx.look --scene obstacle_course --out FILE.png`, or FILE.mp4 for a video.
 
-One column per world: what the camera sees at the start, what it sees halfway, and the world from above.
+A task has one column per world: what the camera sees at the start, what it sees halfway, and the world from above;
+its video shows a planner driving. The gallery shows all that the camera can draw: plain, at its best, with lens and
+motion; depth, labels and normals; its video is a walk. `--scene all` writes every sheet beside FILE.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -15,10 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
+from whill_mjx.gallery import gallery, walk
 from whill_mjx.kinematics import reference_pose
 from whill_mjx.planner import first_plan, for_task, plan_action
-from whill_mjx.render import Intrinsics, render
+from whill_mjx.render import Intrinsics, Quality, pinhole, render, render_frame
+from whill_mjx.render.film import Film, develop, motion_blur
 from whill_mjx.scene import box, footprint, stack_boxes
+from whill_mjx.task import TASKS
 from whill_mjx.types import VehicleParams
 
 
@@ -26,10 +33,10 @@ from whill_mjx.types import VehicleParams
 class Look:
     """Options of the command."""
 
-    task: str = "obstacle_course"
-    """obstacle_course or corridor."""
+    scene: str = "obstacle_course"
+    """Name of a task, gallery, or all."""
     out: Path = Path("look.png")
-    """Picture to write."""
+    """Picture to write, or video with the ending .mp4 or .gif."""
     layout: str = "randomised"
     """randomised or fixed."""
     looks: bool = False
@@ -104,15 +111,96 @@ def write_png(path: Path, image: np.ndarray) -> None:
     os.replace(temporary, path)
 
 
+def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
+    """Sheet (2, 3 pictures) uint8 of the gallery: plain, best, lens and motion; depth, labels, normals."""
+    scene, lens = gallery(), pinhole(1.0, height, width)
+    best = Quality(antialias=True, shadows=True)
+    curved = dataclasses.replace(lens, distortion=jnp.array([-0.30, 0.08, 0.0, 0.0, 0.0]))
+    start, end = walk(jnp.array(0.1)), walk(jnp.array(0.14))
+
+    def moving():
+        draw = partial(render, intrinsics=curved, scene=scene, height=height, width=width, quality=best)
+        image = motion_blur(lambda position, rotation: draw(position, rotation), start, end, samples=6)
+        warm = Film(jnp.array(1.1), jnp.array([1.06, 1.0, 0.9]), jnp.array(0.45), jnp.array(2.0))
+        return develop(image, warm, jax.random.key(0))
+
+    plain = dataclasses.replace(scene, finish=None)
+    frame = jax.jit(lambda: render_frame(*start, lens, plain, height, width, normals=True))()
+    good = jax.jit(lambda: render(*start, lens, scene, height, width, best))()
+    depth = np.repeat((255.0 / (1.0 + np.asarray(frame.depth) / 2.0))[..., None], 3, -1).astype(np.uint8)
+    label = np.asarray(frame.label).astype(int)
+    colours = np.random.default_rng(3).integers(40, 256, (label.max() + 1, 3)).astype(np.uint8)[label]
+    normal = (np.asarray(frame.normal) * 127.0 + 128.0).astype(np.uint8)
+    top, bottom = (np.asarray(frame.rgb), np.asarray(good), np.asarray(jax.jit(moving)())), (depth, colours, normal)
+    return np.vstack([np.hstack(top), np.hstack(bottom)])
+
+
+def film_of(options: Look) -> list[np.ndarray]:
+    """Frames of the video of a scene, at the size of its camera image."""
+    if options.scene == "gallery":
+        scene, lens, best = gallery(), pinhole(1.0, 144, 192), Quality(antialias=True, shadows=True)
+        draw = jax.jit(lambda share: render(*walk(share), lens, scene, 144, 192, best))
+        return [np.asarray(draw(share)) for share in jnp.linspace(0.0, 1.0, 60)]
+    env, params = _env(options)
+    config = for_task(env.task)
+    key, plan_key = jax.random.split(jax.random.key(options.seed))
+    state = jax.jit(partial(reset_state, env, params))(key)
+    plan = first_plan(config, env, state, plan_key)
+
+    def one_step(state, plan, step_key):
+        action, plan = plan_action(config, env, state, plan, step_key)
+        return step_state(env, params, state, action)[0], plan, observe(env, state)
+
+    step, frames = jax.jit(one_step), []
+    for number in range(env.task.max_steps):
+        state, plan, image = step(state, plan, jax.random.fold_in(plan_key, number))
+        frames.append(np.asarray(image))
+        if bool(state.done):
+            break
+    return frames
+
+
+def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10) -> None:
+    """Write frames (H, W, 3) uint8 as a video, whole or not at all."""
+    import imageio.v2 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.stem}.part{path.suffix}")
+    large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
+    options = {"duration": 1000 / rate, "loop": 0} if path.suffix == ".gif" else {"fps": rate, "macro_block_size": 2}
+    imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
+    os.replace(temporary, path)
+
+
+def _env(options: Look) -> tuple[Env, VehicleParams]:
+    return make_env(options.scene, layout=options.layout, random_looks=options.looks, photometric=options.looks)
+
+
 def main(options: Look) -> None:
-    """Write the sheet of `options`."""
-    env, params = make_env(options.task, layout=options.layout, random_looks=options.looks, photometric=options.looks)
-    sheet = contact_sheet(env, params, options.worlds, options.steps, options.seed)
+    """Write the sheet or the video of `options`."""
+    known = (*TASKS, "gallery")
+    if options.scene not in (*known, "all"):
+        raise ValueError(f"unknown scene {options.scene!r} (known: {', '.join(known)}, all).")
+    if options.scene == "all":
+        for name in known:
+            out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
+            main(dataclasses.replace(options, scene=name, out=out))
+        return
+    if options.out.suffix in (".mp4", ".gif"):
+        frames = film_of(options)
+        write_video(options.out, frames, options.scale)
+        print(f"{options.out}: {len(frames)} frames of {options.scene}")
+        return
+    if options.scene == "gallery":
+        sheet = gallery_sheet()
+    else:
+        sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
-    print(f"{options.out}: {options.worlds} worlds, start, after {options.steps} steps, and from above")
+    print(f"{options.out}: {options.scene}")
 
 
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Look))
+    # `--task` is the option's former name.
+    main(tyro.cli(Look, args=["--scene" if word == "--task" else word for word in sys.argv[1:]]))
