@@ -102,12 +102,13 @@ class Course:
         params = self.vehicles(keys) if params is None else params
         late = 0 if condition is None else int(np.round(np.max(np.asarray(condition.latency))))
         run = self._rollout(driver, sight, late, frames=False)
+        size = -(-len(keys) // -(-len(keys) // self.batch))  # parts of one size, so that one program serves all
         parts = []
-        for begin in range(0, len(keys), self.batch):
-            cut = slice(begin, min(begin + self.batch, len(keys)))
-            parts.append(jax.device_get(run(*jax.tree.map(lambda leaf, cut=cut: leaf[cut],
-                                                          (params, keys, condition, memory)))))
-        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        for begin in range(0, len(keys), size):
+            index = (begin + np.arange(size)) % len(keys)
+            given = jax.tree.map(lambda leaf, index=index: leaf[index], (params, keys, condition, memory))
+            parts.append(jax.device_get(run(*given)))
+        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(keys)], *parts)
         return Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
 
     def film(self, driver: Driver, keys: jax.Array) -> tuple[Episodes, np.ndarray, np.ndarray]:

@@ -78,6 +78,12 @@ class Network(nn.Module):
         return mean, log_std, value
 
 
+def forward(config: PpoConfig, params: Any, frames: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean (..., A), log standard deviation (A,) and value (...,) for stacked frames (..., H, W, 3 * stack) uint8."""
+    result: Any = Network(config, params["params"]["log_std"].shape[0]).apply(params, frames)
+    return result
+
+
 @struct.dataclass
 class ReturnScale:
     """Running variance of the discounted return, by which rewards are divided."""
@@ -170,13 +176,13 @@ def iterate(
     state, rollout, last_value, metrics = collect(env, config, state)
     advantage, target = advantages(config, rollout, last_value)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (rollout, advantage, target))
-    network, transform = Network(config, env.action_dim), optimiser(config, total_iterations)
+    transform = optimiser(config, total_iterations)
     size = advantage.size
 
     def minibatch(carry: tuple, index: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
         params, opt = carry
         chosen = jax.tree.map(lambda leaf: leaf[index], flat)
-        gradients, figures = jax.grad(lambda p: loss(config, network, p, *chosen), has_aux=True)(params)
+        gradients, figures = jax.grad(lambda p: loss(config, p, *chosen), has_aux=True)(params)
         updates, opt = transform.update(gradients, opt, params)
         return (optax.apply_updates(params, updates), opt), figures
 
@@ -195,11 +201,9 @@ def collect(
     env: Any, config: PpoConfig, state: PpoState
 ) -> tuple[PpoState, Rollout, jax.Array, dict[str, jax.Array]]:
     """T steps of all instances with sampled actions, the value (N,) after them, and sums over ended episodes."""
-    network = Network(config, env.action_dim)
-
     def one(carry: tuple, key: jax.Array) -> tuple[tuple, tuple[Rollout, dict[str, jax.Array]]]:
         env_state, step, frames, scale = carry
-        mean, log_std, value = network.apply(state.params, frames)
+        mean, log_std, value = forward(config, state.params, frames)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
         env_state, after = env.step(env_state, jnp.clip(action, -1.0, 1.0))
         scale = track(config, scale, after.reward, step.is_last)
@@ -216,7 +220,7 @@ def collect(
     carry = (state.env_state, state.step, state.frames, state.scale)
     carry, (rollout, watched) = jax.lax.scan(one, carry, jnp.stack(step_keys))
     env_state, step, frames, scale = carry
-    _, _, last_value = network.apply(state.params, frames)
+    _, _, last_value = forward(config, state.params, frames)
     state = dataclasses.replace(state, env_state=env_state, step=step, frames=frames, scale=scale, key=key)
     return state, rollout, last_value, {name: value.sum(0) for name, value in watched.items()}
 
@@ -249,7 +253,7 @@ def advantages(config: PpoConfig, rollout: Rollout, last_value: jax.Array) -> tu
 
 
 def loss(
-    config: PpoConfig, network: Network, params: Any, rollout: Rollout, advantage: jax.Array, target: jax.Array
+    config: PpoConfig, params: Any, rollout: Rollout, advantage: jax.Array, target: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped policy loss, value loss and entropy of a minibatch (M, ...); ignored actions do not count."""
     used = rollout.used.astype(jnp.float32)
@@ -257,7 +261,7 @@ def loss(
     def mean_used(values: jax.Array) -> jax.Array:
         return jnp.sum(used * values) / jnp.maximum(used.sum(), 1.0)
 
-    mean, log_std, value = network.apply(params, rollout.frames)
+    mean, log_std, value = forward(config, params, rollout.frames)
     centred = advantage - mean_used(advantage)
     normalised = centred / (jnp.sqrt(mean_used(centred**2)) + 1e-8)
     ratio = jnp.exp(log_probability(rollout.action, mean, log_std) - rollout.log_prob)
@@ -290,9 +294,8 @@ def policy_step(
     Returns:
         The new carry and the action (A,) in [-1, 1].
     """
-    actions = params["params"]["log_std"].shape[0]
     frames = jnp.concatenate([carry["frames"], image], axis=-1)
-    mean, _, _ = Network(config, actions).apply(params, frames[None])
+    mean, _, _ = forward(config, params, frames[None])
     return {"frames": frames[..., 3:]}, jnp.clip(mean[0], -1.0, 1.0)
 
 
