@@ -118,29 +118,30 @@ def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
     curved = dataclasses.replace(lens, distortion=jnp.array([-0.30, 0.08, 0.0, 0.0, 0.0]))
     start, end = walk(jnp.array(0.1)), walk(jnp.array(0.14))
 
-    def moving():
+    def moving(scene):
         draw = partial(render, intrinsics=curved, scene=scene, height=height, width=width, quality=best)
         image = motion_blur(lambda position, rotation: draw(position, rotation), start, end, samples=6)
         warm = Film(jnp.array(1.1), jnp.array([1.06, 1.0, 0.9]), jnp.array(0.45), jnp.array(2.0))
         return develop(image, warm, jax.random.key(0))
 
     plain = dataclasses.replace(scene, finish=None)
-    frame = jax.jit(lambda: render_frame(*start, lens, plain, height, width, normals=True))()
-    good = jax.jit(lambda: render(*start, lens, scene, height, width, best))()
+    frame = jax.jit(lambda scene: render_frame(*start, lens, scene, height, width, normals=True))(plain)
+    good = jax.jit(lambda scene: render(*start, lens, scene, height, width, best))(scene)
     depth = np.repeat((255.0 / (1.0 + np.asarray(frame.depth) / 2.0))[..., None], 3, -1).astype(np.uint8)
     label = np.asarray(frame.label).astype(int)
     colours = np.random.default_rng(3).integers(40, 256, (label.max() + 1, 3)).astype(np.uint8)[label]
     normal = (np.asarray(frame.normal) * 127.0 + 128.0).astype(np.uint8)
-    top, bottom = (np.asarray(frame.rgb), np.asarray(good), np.asarray(jax.jit(moving)())), (depth, colours, normal)
-    return np.vstack([np.hstack(top), np.hstack(bottom)])
+    top = [np.asarray(image) for image in (frame.rgb, good, jax.jit(moving)(scene))]
+    return np.vstack([np.hstack(top), np.hstack([depth, colours, normal])])
 
 
 def film_of(options: Look) -> list[np.ndarray]:
     """Frames of the video of a scene, at the size of its camera image."""
     if options.scene == "gallery":
         scene, lens, best = gallery(), pinhole(1.0, 144, 192), Quality(antialias=True, shadows=True)
-        draw = jax.jit(lambda share: render(*walk(share), lens, scene, 144, 192, best))
-        return [np.asarray(draw(share)) for share in jnp.linspace(0.0, 1.0, 60)]
+        # The scene is an argument: as a constant, XLA would work it out while compiling.
+        draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, 144, 192, best))
+        return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)]
     env, params = _env(options)
     config = for_task(env.task)
     key, plan_key = jax.random.split(jax.random.key(options.seed))
