@@ -182,6 +182,12 @@ class Replay:
         self._jacobian = jax.jit(jax.vmap(one_jacobian, in_axes=(0, None)))
         self._sizes: dict[Any, set[int]] = {self._simulate: set(), self._jacobian: set()}
 
+    def on(self, batch: Batch) -> Replay:
+        """The same replay of another batch; nothing is compiled again where its shapes are the same."""
+        other = object.__new__(Replay)
+        other.__dict__ = {**self.__dict__, "_batch": batch}
+        return other
+
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay with each of values (N, P); leaves gain the axis N in front."""
         return self._call(self._simulate, values)

@@ -1,0 +1,249 @@
+"""From the residual to the missing effect: `python -m sysid.close_loop DATASET --reference DATASET ... --out RUN`.
+
+The base model is fitted to the reference drives. The drives in question are then asked what has changed or is missing
+against that vehicle: every effect of the catalogue is tried, the best are refitted together with the base parameters
+within their day-to-day spread, and the verdict is one of
+
+    named        these effects, each with the class of effects that these drives cannot tell from it
+    none         nothing is missing at this noise level
+    unexplained  something is missing and the catalogue does not have it
+
+Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
+scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
+
+Writes RUN/report.json (`sysid.loop.report`), RUN/report.html, RUN/vehicle.toml with the effect in it, and where
+something is left undecided RUN/next_manoeuvre.csv.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.log import Log
+from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.loop.drives import make_drives
+from sysid.loop.evidence import Evidence, gather
+from sysid.loop.reference import Reference, make_reference
+from sysid.loop.refit import Refitter
+from sysid.loop.search import Search, Thresholds, search
+from sysid.rollout import Plant, vehicle_plant
+from whill_mjx.config import VehicleConfig
+from whill_mjx.parameters import set_values
+from whill_mjx.presets import preset_params
+
+Progress = Callable[[int, str], None]
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How the loop is closed."""
+
+    preset: Literal["paper", "physical"] = "physical"
+    """Base model."""
+    iterations: int = 15
+    """Iterations of the base fit."""
+    draws: int = 1000
+    """Simulated nulls that the decision is calibrated on."""
+    seed: int = 0
+    """Of the simulated nulls."""
+    quick: bool = False
+    """Fewer iterations, nulls and candidates."""
+    physics_dt: float = 0.005
+    """Physics step [s]."""
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    """When something counts as found."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A closed loop before the held-out trials are opened."""
+
+    log: Log
+    references: tuple[Log, ...]
+    config: LoopConfig
+    reference: Reference
+    hypotheses: tuple[Hypothesis, ...]
+    full: Any
+    """The vehicle with the whole catalogue at neutral."""
+    names: tuple[str, ...]
+    search: Search
+    evidence: Evidence
+    plant: Plant
+    seconds: dict[str, float]
+
+
+def close_loop(
+    log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
+    progress: Progress | None = None, reference: Reference | None = None,
+) -> Result:
+    """Verdict on the training trials of a log; its held-out trials are not looked at.
+
+    Args:
+        log: the drives in question.
+        references: drives of the same vehicle on other days.
+        vehicle: `VehicleParams` fitted before, kept as the reference.
+        reference: a reference made before, for many logs of one vehicle.
+    """
+    config = config or LoopConfig()
+    _check(log, references)
+    began = time.perf_counter()
+    plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
+    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+    if reference is None:
+        known = bool(references) or vehicle is not None
+        start = preset_params(log.spec, config.preset) if vehicle is None else vehicle
+        logs = tuple(references) or (log,)
+        reference = make_reference(plant, start, logs, known, iterations, progress=progress,
+                                   fitted=vehicle is not None)
+    fitted = time.perf_counter()
+    found = hypotheses(log.spec, reference.params)
+    full = with_catalogue(reference.params, found)
+    base = base_values(full)
+    names = tuple(base)
+    drives = make_drives(plant, full, names, log.training)
+    at = drives.simulate(np.array([base[name] for name in names])[None])[0]
+    drives = drives.weighted(at, reference.factors, log.spec.track)
+    evidence, slopes = gather(drives, reference, found, full, progress)
+    gathered = time.perf_counter()
+    refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
+    draws = min(config.draws, 300) if config.quick else config.draws
+    outcome = search(evidence, found, refitter, config.thresholds, draws, config.seed, progress)
+    seconds = {"reference": fitted - began, "signatures": gathered - fitted,
+               "search": time.perf_counter() - gathered}
+    return Result(log, tuple(references), config, reference, found, full, names, outcome, evidence, plant, seconds)
+
+
+def vehicle_before(result: Result) -> Any:
+    """The base model with its parameters refitted within their spread."""
+    base = result.search.base
+    names = result.reference.space.names
+    return set_values(result.reference.params, names,
+                      jnp.asarray(result.reference.space.to_values(base.u), jnp.result_type(float)))
+
+
+def vehicle_after(result: Result) -> Any:
+    """The vehicle with the accepted effects in it, and only these."""
+    if result.search.verdict != "named":
+        return vehicle_before(result)
+    final = result.search.final
+    moved = set_values(result.full, result.names, jnp.asarray(final.values, jnp.result_type(float)))
+    kept = {effect.name for effect in result.reference.params.effects}
+    for one in final.hypotheses:
+        kept |= {axis.parameter.partition(".")[0] for axis in one.axes}
+    return type(moved)(moved.body, tuple(effect for effect in moved.effects if effect.name in kept))
+
+
+def _check(log: Log, references: Sequence[Log]) -> None:
+    if not log.training:
+        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
+    for other in references:
+        if not other.training:
+            raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
+                             "held_out.")
+        for name in ("wheel_radius", "track", "wheelbase", "drive"):
+            mine, theirs = getattr(log.spec, name), getattr(other.spec, name)
+            if mine != theirs:
+                raise ValueError(f"reference {other.name!r}: {name} is {theirs}, but {mine} in {log.name!r}. A "
+                                 "reference must be a drive of the same vehicle; correct dataset.toml or leave it out.")
+
+
+def expected_steps(config: LoopConfig) -> int:
+    """How far the progress bar goes at most."""
+    return 2 * config.iterations + 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Command line of `python -m sysid.close_loop`."""
+
+    dataset: Path
+    """Folder with the drives in question."""
+    reference: tuple[Path, ...] = ()
+    """Folders with drives of the same vehicle on other days."""
+    vehicle: Path | None = None
+    """Vehicle file fitted before, taken as the reference instead of drives."""
+    out: Path = Path("runs/close_loop")
+    """Folder for the report and the vehicle file."""
+    quick: bool = False
+    """Fewer iterations, nulls and candidates."""
+    seed: int = 0
+    """Seed of the simulated nulls."""
+    iterations: int = 15
+    """Iterations of the base fit."""
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Load, close the loop, open the held-out trials, write and print the verdict."""
+    from sysid.loop.report import make_report, summary, write_run
+    from sysid.measured import load_any
+
+    log = load_any(arguments.dataset)
+    references = [load_any(path) for path in arguments.reference]
+    vehicle = None
+    if arguments.vehicle is not None:
+        from whill_mjx.vehicle_file import load_vehicle
+
+        if references:
+            raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
+                             "them.")
+        _, vehicle, _ = load_vehicle(arguments.vehicle)
+    config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations)
+    progress, close = progress_bar(expected_steps(config))
+    try:
+        result = close_loop(log, references, config, vehicle, progress)
+    finally:
+        close()
+    report = make_report(result)
+    write_run(arguments.out, result, report)
+    print(summary(report))
+    print(f"wrote report.json, report.html and vehicle.toml into {arguments.out}")
+    return report
+
+
+def progress_bar(total: int) -> tuple[Progress, Callable[[], None]]:
+    """A bar with the stage, rate and remaining time, and the function that closes it."""
+    from tqdm import tqdm
+
+    bar: Any = tqdm(total=total, desc="close the loop", unit="step")
+
+    def advance(count: int, remark: str) -> None:
+        bar.set_postfix_str(remark, refresh=False)
+        bar.update(min(count, max(bar.total - bar.n, 0)))
+
+    return advance, bar.close
+
+
+def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:
+    """Everything that was fixed before the drives were looked at."""
+    space = reference.space
+    return {
+        "settings": {key: value for key, value in asdict(config).items() if key != "thresholds"},
+        "thresholds": asdict(config.thresholds),
+        "catalogue": [{"effect": one.effect, "variant": one.variant, "kind": one.kind,
+                       "axes": [asdict(axis) for axis in one.axes]} for one in found],
+        "bounds": {name: [float(space.low[i]), float(space.high[i])] for i, name in enumerate(space.names)},
+    }
+
+
+def cli() -> None:
+    """Command line: errors in the input end with one line, not a traceback."""
+    import sys
+
+    import tyro
+
+    arguments = tyro.cli(Arguments, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
+    try:
+        main(arguments)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,172 @@
+"""Everything the verdict needs from the simulator, as small matrices.
+
+The white residual of the drives, the columns by which base parameters change it and those by which each hypothesis
+does are multiplied with each other once, trial by trial. Fits, tests between trials, held-back manoeuvres and
+thousands of simulated nulls are then algebra on these products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.loop.catalogue import LEVELS, Hypothesis, base_values
+from sysid.loop.drives import CHUNK, Drives
+from sysid.loop.reference import Reference, alike, difference_sizes, expected_without
+from whill_mjx.types import VehicleParams
+
+Progress = Callable[[int, str], None]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where the columns of one hypothesis at one level are."""
+
+    hypothesis: int
+    level: float
+    index: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """White residual d and columns X = [base | hypotheses] of B trials, and their products."""
+
+    residual: np.ndarray  # (B, n)
+    design: np.ndarray  # (B, n, P + S)
+    base_size: int
+    columns: tuple[Columns, ...]
+    precision: np.ndarray  # (P, P) of the base parameters, in unit coordinates
+    pool: tuple[np.ndarray, ...]  # per trial (J, n) white noise of drives like it
+    products: np.ndarray  # (B, P + S, P + S)
+    moments: np.ndarray  # (B, P + S)
+    pool_moments: tuple[np.ndarray, ...]  # per trial (J, P + S)
+    groups: tuple[tuple[int, ...], ...]  # trials of one manoeuvre
+
+
+def base_columns(drives: Drives, reference: Reference, values: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(B, K, C, P) derivative of the features by the base parameters' unit coordinates."""
+    space = reference.space
+
+    def sets(u: np.ndarray) -> np.ndarray:
+        row = values.copy()
+        row[[names.index(name) for name in space.names]] = space.to_values(u)
+        return row
+
+    return drives.differences(sets, reference.u, difference_sizes(reference.spread))
+
+
+def signature_columns(
+    drives: Drives, hypotheses: Sequence[Hypothesis], values: np.ndarray, names: Sequence[str], at: np.ndarray,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, list[Columns]]:
+    """(B, K, C, S) change of the features per unit of each coordinate, and which column is which.
+
+    Two-sided axes: central differences at 1. One-sided: the change at each level, per unit.
+    """
+    base = dict(zip(names, values.tolist(), strict=True))
+    sets: list[np.ndarray] = []
+    jobs: list[tuple[int, float, int, bool]] = []
+    for number, one in enumerate(hypotheses):
+        for level in ((1.0,) if one.signed else LEVELS):
+            for position, axis in enumerate(one.axes):
+                q = np.zeros(len(one.axes))
+                if axis.form == "moment":
+                    q[0] = level  # a place needs a mass to be at; its effect is taken relative to the mass alone
+                for sign in ((1, -1) if axis.signed else (1,)):
+                    q[position] = sign * (1.0 if axis.signed else level)
+                    sets.append(with_values(values, names, one.values(q, base)))
+                jobs.append((number, level, position, axis.signed))
+    seen = []
+    rows = max(CHUNK // len(drives.trials), 1)
+    for start in range(0, len(sets), rows):
+        seen.append(drives.simulate(np.stack(sets[start : start + rows])))
+        if progress is not None:
+            progress(1, "signatures")
+    flat, cursor = np.concatenate(seen), 0
+    parts, columns = [], []
+    for number, level, position, signed in jobs:
+        if signed:
+            parts.append((flat[cursor] - flat[cursor + 1]) / 2)
+            cursor += 2
+        else:
+            parts.append((flat[cursor] - at) / level)
+            cursor += 1
+        if position == 0:
+            columns.append(Columns(number, level, ()))
+        columns[-1] = Columns(number, level, (*columns[-1].index, len(parts) - 1))
+    return np.stack(parts, axis=-1), columns
+
+
+def with_values(values: np.ndarray, names: Sequence[str], changes: dict[str, float]) -> np.ndarray:
+    """Values (P,) with some of them replaced."""
+    out = values.copy()
+    for name, value in changes.items():
+        out[names.index(name)] = value
+    return out
+
+
+def gather(
+    drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams,
+    progress: Progress | None = None,
+) -> tuple[Evidence, np.ndarray]:
+    """Simulate and multiply out; also returns the base's derivatives (B, K, C, P).
+
+    `full` is the vehicle with the catalogue; `drives` free all its parameters.
+    """
+    base = base_values(full)
+    names = list(drives.names)
+    values = np.array([base[name] for name in names])
+    at = drives.simulate(values[None])[0]
+    slopes = base_columns(drives, reference, values, names)
+    signatures, columns = signature_columns(drives, hypotheses, values, names, at, progress)
+    bins = drives.target.shape[1]
+    expected = np.stack([reference.expected(trial, bins) for trial in drives.trials])
+    white = reference.whitener
+    residual = white.apply(drives.target - expected - at, drives.mask)
+    design = white.apply(np.concatenate([slopes, signatures], axis=-1), drives.mask)
+    count, size = len(residual), residual[0].size
+    residual, design = residual.reshape(count, size), design.reshape(count, size, -1)
+    pool = tuple(_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials))
+    offset = reference.space.size
+    placed = tuple(Columns(c.hypothesis, c.level, tuple(offset + i for i in c.index)) for c in columns)
+    evidence = Evidence(
+        residual, design, offset, placed, np.linalg.inv(reference.spread), pool,
+        np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
+        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives))
+    return evidence, slopes
+
+
+def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
+    """Trials of one manoeuvre, in order of first appearance; single windows of a long drive are put into eighths."""
+    names: dict[str, list[int]] = {}
+    for i, trial in enumerate(drives.trials):
+        names.setdefault(trial.manoeuvre, []).append(i)
+    if len(names) > 40:
+        parts = np.array_split(np.arange(len(drives.trials)), 8)
+        return tuple(tuple(int(i) for i in part) for part in parts)
+    return tuple(tuple(each) for each in names.values())
+
+
+def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
+    """(J, n) white noise of reference drives of the same manoeuvre; of any manoeuvre where there are few."""
+    like = [one for one in reference.leftovers if alike(one.trial, trial)]
+    if len(like) < 3:
+        same = [one for one in reference.leftovers if one.trial.manoeuvre == trial.manoeuvre]
+        like = same if len(same) >= 3 else list(reference.leftovers)
+    bins, channels = mask.shape
+    rows = []
+    for one in like:
+        series = (one.series - (expected_without(reference.leftovers, one) if reference.known else 0.0)) * one.mask
+        inside = np.flatnonzero(one.mask.prod(-1) > 0)
+        last = inside[-1] + 1 if len(inside) else len(series)
+        fitted = np.resize(series[:last], (bins, channels))  # a longer drive repeats a shorter one's noise
+        rows.append(_whiten_one(reference, fitted, (mask > 0).astype(float)))
+    return np.stack(rows)
+
+
+def _whiten_one(reference: Reference, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    return reference.whitener.apply(series[None], mask[None]).reshape(-1)
+

@@ -1,0 +1,97 @@
+"""What is compared when the loop is closed: motion in short bins, seen from the vehicle itself.
+
+A pose error grows along a drive and depends on everything before it. The motion within a bin, in the frame the vehicle
+had at the bin's start, does not: it needs no start pose, its noise is nearly stationary, and an effect shows in it at
+the time and place where it acts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.rollout import Measured, Simulated
+
+BIN = 0.25  # s
+CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.yaw")
+"""Mean reported speeds, and displacement over a bin divided by its length [m/s, rad/s].
+
+The pose that the odometry adds up is left out: it tells no more than the reported speeds, and where a vehicle
+updates it in steps of its own clock, those steps would be taken for motion."""
+MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Interpolation of a stream's samples to the edges of the bins."""
+
+    index: np.ndarray  # (B, K + 1) sample before each edge
+    weight: np.ndarray  # (B, K + 1) share of the sample after it
+    known: np.ndarray  # (B, K) bool, bins between known edges
+
+    def at(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., B, K + 1, C) at the edges, from samples (..., B, M, C)."""
+        row = np.arange(len(self.index))[:, None]
+        weight = self.weight[..., None]
+        last = np.minimum(self.index + 1, values.shape[-2] - 1)
+        return (1 - weight) * values[..., row, self.index, :] + weight * values[..., row, last, :]
+
+
+@dataclass(frozen=True)
+class Features:
+    """The map from measured or simulated samples of B trials to K bins of 5 channels."""
+
+    width: float
+    pose: _Edges
+    first: np.ndarray  # (B, K) first odometry sample of each bin
+    last: np.ndarray  # (B, K) first sample after it
+    mask: np.ndarray  # (B, K, 5) 1 where measured
+    middle: np.ndarray  # (K,) time of each bin's middle [s]
+
+    def of(self, values: Measured | Simulated) -> np.ndarray:
+        """Features (..., B, K, 5); what was not measured is 0."""
+        pose, odometry = np.asarray(values.pose, float), np.asarray(values.odometry, float)
+        total = np.concatenate([np.zeros_like(odometry[..., :1, 3:]), np.cumsum(odometry[..., 3:], axis=-2)], axis=-2)
+        row = np.arange(len(self.first))[:, None]
+        count = np.maximum(self.last - self.first, 1)[..., None]
+        speeds = (total[..., row, self.last, :] - total[..., row, self.first, :]) / count
+        return np.concatenate([speeds, _motion(self.pose.at(pose)) / self.width], axis=-1) * self.mask
+
+
+def make_features(trials: tuple[Trial, ...], width: float = BIN) -> Features:
+    """The feature map of trials that are padded as in `sysid.rollout.make_batch`."""
+    bins = max(int(np.floor(trial.duration / width + 1e-6)) for trial in trials)
+    edge = np.arange(bins + 1) * width
+    pose_t = [np.zeros(0) if t.ground_truth is None else t.ground_truth.t for t in trials]
+    odometry_t = [np.zeros(0) if t.odometry is None else t.odometry.t for t in trials]
+    pose = _edges(pose_t, edge)
+    first = np.stack([np.searchsorted(t, edge[:-1] - 1e-9) for t in odometry_t])
+    last = np.stack([np.searchsorted(t, edge[1:] - 1e-9) for t in odometry_t])
+    sampled = last > first
+    mask = np.stack([sampled, sampled, pose.known, pose.known, pose.known], axis=-1).astype(float)
+    return Features(width, pose, first, last, mask, (edge[:-1] + edge[1:]) / 2)
+
+
+def _edges(times: list[np.ndarray], edge: np.ndarray) -> _Edges:
+    index = np.zeros((len(times), len(edge)), int)
+    weight = np.zeros((len(times), len(edge)))
+    known = np.zeros((len(times), len(edge) - 1), bool)
+    for i, t in enumerate(times):
+        if len(t) < 2:
+            continue
+        index[i] = np.clip(np.searchsorted(t, edge + 1e-9) - 1, 0, len(t) - 2)
+        gap = t[index[i] + 1] - t[index[i]]
+        weight[i] = np.clip((edge - t[index[i]]) / gap, 0.0, 1.0)
+        near = (edge >= t[0] - 1e-6) & (edge <= t[-1] + gap[-1]) & (gap <= MAX_GAP * (edge[1] - edge[0]))
+        known[i] = near[:-1] & near[1:]
+    return _Edges(index, weight, known)
+
+
+def _motion(pose: np.ndarray) -> np.ndarray:
+    """Displacement (..., K, 3) forward, left and in yaw between edges (..., K + 1, 3), in the frame of the earlier."""
+    step = np.diff(pose, axis=-2)
+    cos, sin = np.cos(pose[..., :-1, 2]), np.sin(pose[..., :-1, 2])
+    return np.stack([cos * step[..., 0] + sin * step[..., 1], -sin * step[..., 0] + cos * step[..., 1], step[..., 2]],
+                    axis=-1)

@@ -1,0 +1,115 @@
+"""The page of a closed loop: RUN/report.html, self-contained."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from sysid.html import Section, bullets, charts, html_page, paragraph, table
+from sysid.metrics import METRICS, UNITS
+from sysid.svg import bar_chart
+
+
+def write_page(out: Path, report: dict[str, Any]) -> Path:
+    """Write the page of a report into a folder."""
+    sections = [Section("Verdict", verdict(report)), Section("Error before and after", errors(report)),
+                Section("What was tried", candidates(report))]
+    if report["lives_in"]:
+        sections.append(Section("Where the unexplained residual lives", lives(report)))
+    if report["verdict"] != "named":
+        sections.append(Section("What these drives would have shown", detectable(report)))
+    sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
+    page = html_page(f"{report['dataset']['name']}: {report['verdict']}", sections,
+                     f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}")
+    path, partial = out / "report.html", out / "report.html.partial"
+    partial.write_text(page)
+    os.replace(partial, path)
+    return path
+
+
+def verdict(report: dict[str, Any]) -> str:
+    """The verdict in words, and the effects."""
+    missing = report["missing"]
+    parts = [paragraph(f"{report['verdict'].capitalize()}: {report['reason']}."),
+             paragraph(f"Asked: {report['question']}. {report['remark']}."),
+             paragraph(f"The squared residual exceeds the noise by {missing['excess_before']:.0%} before and by "
+                       f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
+                       f"{missing['p_value']:.2g}.")]
+    rows = []
+    for one in report["effects"]:
+        for name, p in one["parameters"].items():
+            rows.append([one["name"], one["kind"], ", ".join(one["class"]), name, p["value"], p["interval"][0],
+                         p["interval"][1], p["unit"]])
+    if rows:
+        parts.append(table(["effect", "kind", "cannot be told from", "parameter", "value", "95 % from", "to", "unit"],
+                           rows))
+        parts.append(bullets([f"{one['name']}: {one['equation']}" for one in report["effects"] if one["equation"]]))
+        for one in report["effects"]:
+            evidence = one["evidence"]["by_manoeuvre"]
+            parts.append(table(
+                ["manoeuvre", "factor on the effect", "standard error", "gain when left out"],
+                [[each["manoeuvre"], each["factor"], each["standard_error"],
+                  one["evidence"]["left_out_gain"].get(each["manoeuvre"])] for each in evidence],
+                f"{one['name']}: what each manoeuvre says by itself (1 agrees with the joint fit), and by how much the "
+                "effect fitted to the others lowers the squared residual there"))
+    return "".join(parts)
+
+
+def errors(report: dict[str, Any]) -> str:
+    """Tables of mean errors, training and held out apart."""
+    parts = []
+    for part in ("held_out", "training"):
+        rows = []
+        for channel, metrics in report["before"][part].items():
+            floor = metrics.get("noise_floor") or {}
+            for metric in METRICS:
+                if metric not in metrics:
+                    continue
+                moved = report["change"][part][channel][metric]
+                rows.append([f"{channel}, {metric} [{UNITS[metric]}]".replace("_", " "), metrics[metric],
+                             report["after"][part][channel][metric], floor.get(metric), moved["interval"][0],
+                             moved["interval"][1], f"{moved['worse']} of {moved['trials']}"])
+        if rows:
+            parts.append(table(["RMSE", "before", "after", "replicates", "change from", "to", "worse in"], rows,
+                               f"{part.replace('_', '-')} trials; the change with its 95 % interval over trials"))
+    return "".join(parts)
+
+
+def candidates(report: dict[str, Any]) -> str:
+    """The refitted candidates of each round."""
+    parts = []
+    for number, each in enumerate(report["candidates"], start=1):
+        parts.append(table(["effect", "gain", "explains", "p by itself"],
+                           [[f"{one['effect']} {one['variant']}".strip(), one["gain"], f"{one['explained']:.0%}",
+                             one["p_value"]] for one in each], f"round {number}"))
+    return "".join(parts) or paragraph("Nothing stood out, so nothing was refitted.")
+
+
+def lives(report: dict[str, Any]) -> str:
+    """Shares of the residual by quantity."""
+    rows = report["lives_in"][:10]
+    chart = bar_chart([one["quantity"] for one in rows], {"share": [one["share"] for one in rows]},
+                      "share predicted on other drives", log_y=False)
+    return charts([chart])
+
+
+def detectable(report: dict[str, Any]) -> str:
+    """Smallest sizes."""
+    return table(["effect", "parameter", "smallest size with 80 % power", "unit"],
+                 [[one["effect"], one["parameter"], one["value"] if one["value"] is not None else "not visible",
+                   one["unit"]] for one in report["detectable"]])
+
+
+def base(report: dict[str, Any]) -> str:
+    """Base parameters beside their day-to-day spread."""
+    return table(["parameter", "reference", "day-to-day spread", "these drives", "off by [spreads]"],
+                 [[one["name"], one["reference"], one["spread"], one["value"], one["away"]] for one in report["base"]])
+
+
+def fixed(report: dict[str, Any]) -> str:
+    """The manifest in short."""
+    manifest = report["manifest"]
+    return table(["setting", "value"],
+                 [[key, str(value)] for part in ("settings", "thresholds") for key, value in manifest[part].items()],
+                 f"{len(manifest['catalogue'])} hypotheses; SHA-256 {manifest['sha256']}")

@@ -1,0 +1,323 @@
+"""The report of a closed loop: `report.json` (versioned, below), the page, the vehicle file with the effect in it.
+
+    schema, kind      1, "sysid-close-loop"
+    verdict, reason   "named", "none" or "unexplained", and why in one sentence
+    question          what was asked: against a reference, or of the model family
+    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
+                      p_value, equation, evidence
+    before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
+                      noise_floor of the same where there are replicates
+    change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
+                      resampled trials, and how many trials got worse
+    missing           p-value of "nothing is missing"; squared residual in excess of the noise, as a share of it, before
+                      and after; share of it explained
+    candidates        per round the refitted effects: gain, share of the residual explained, coordinates
+    detectable        per effect the smallest size that these drives would show with 80 % power
+    lives_in          where the unexplained residual lives
+    next_manoeuvre    the drive that would decide what is left open
+    base              base parameters: reference value, day-to-day spread, value on these drives
+    manifest          everything fixed beforehand, and its SHA-256
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.loop.catalogue import Hypothesis, base_values
+from sysid.loop.refit import Refit
+from sysid.loop.scan import Solver
+from sysid.metrics import METRICS, Prediction, noise_floor
+from sysid.report import code_hashes, error_rows
+from sysid.rollout import Replay, make_batch, predictions
+from whill_mjx.effects import EFFECTS
+from whill_mjx.parameters import describe, get_values, set_values
+from whill_mjx.types import parameters_of
+
+if TYPE_CHECKING:
+    from sysid.close_loop import Result
+
+SCHEMA = 1
+KIND = "sysid-close-loop"
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+
+
+def make_report(result: Result) -> dict[str, Any]:
+    """The report; this is where the held-out trials are opened."""
+    from sysid.close_loop import manifest, vehicle_after, vehicle_before
+
+    found = result.search
+    settings = manifest(result.config, result.hypotheses, result.reference)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
+    trials = (*result.log.training, *result.log.held_out)
+    before, after = (replay(result, vehicle, trials) for vehicle in (vehicle_before(result), vehicle_after(result)))
+    rows = error_rows(trials, before, after)
+    about = [one.name for one in result.references]
+    asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
+             if result.reference.known else "what the model family lacks")
+    return {
+        "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
+        "question": asked, "remark": result.reference.remark,
+        "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
+                    "training": [t.name for t in result.log.training],
+                    "held_out": [t.name for t in result.log.held_out]},
+        "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
+        "effects": effects(result) if found.verdict == "named" else [],
+        "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
+        "missing": {"p_value": found.scan.p_family, "excess_before": found.excess[0],
+                    "excess_after": found.excess[1], "explained": found.share},
+        "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
+                         "p_value": one.p, "explained": one.share,
+                         "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
+                       for each in found.rounds],
+        "detectable": detectable(result), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "next_manoeuvre": None, "base": base_table(result), "seconds": result.seconds,
+        "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
+    }
+
+
+def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
+    """Replays of trials by a vehicle."""
+    batch, _ = make_batch(trials, result.plant.dt)
+    name = next(iter(describe(vehicle)))
+    value = np.asarray(get_values(vehicle, [name]), float)[None]
+    simulated = Replay(result.plant, batch, lambda values: set_values(vehicle, [name], values)).simulate(value)
+    return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
+
+
+def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> dict[str, Any]:
+    """part -> channel -> metric -> mean RMSE, with the noise floor."""
+    out: dict[str, Any] = {}
+    for part, held in (("training", False), ("held_out", True)):
+        floor = noise_floor(tuple(t for t in trials if t.held_out is held))
+        out[part] = {}
+        for channel in dict.fromkeys(row["channel"] for row in rows):
+            mine = [row for row in rows if row["channel"] == channel and row["held_out"] is held]
+            means = {metric: [row["metrics"][metric][which] for row in mine if metric in row["metrics"]]
+                     for metric in METRICS}
+            out[part][channel] = {metric: float(np.mean(values)) for metric, values in means.items() if values}
+            if floor and mine:
+                out[part][channel]["noise_floor"] = floor.get(channel)
+    return out
+
+
+def change(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Mean change of each RMSE, its interval from trials drawn anew, and the share of trials that got worse."""
+    rng = np.random.default_rng(0)
+    out: dict[str, Any] = {}
+    for part, held in (("training", False), ("held_out", True)):
+        out[part] = {}
+        for channel in dict.fromkeys(row["channel"] for row in rows):
+            mine = [row for row in rows if row["channel"] == channel and row["held_out"] is held]
+            for metric in METRICS:
+                pairs = np.array([[row["metrics"][metric]["initial"], row["metrics"][metric]["fitted"]]
+                                  for row in mine if metric in row["metrics"]])
+                if len(pairs) == 0:
+                    continue
+                difference = pairs[:, 1] - pairs[:, 0]
+                draws = difference[rng.integers(0, len(pairs), (RESAMPLES, len(pairs)))].mean(1)
+                out[part].setdefault(channel, {})[metric] = {
+                    "mean": float(difference.mean()), "interval": np.quantile(draws, [0.025, 0.975]).tolist(),
+                    "relative": float(difference.mean() / max(pairs[:, 0].mean(), 1e-12)),
+                    "worse": int((difference > 0).sum()), "trials": len(pairs)}
+    return out
+
+
+def effects(result: Result) -> list[dict[str, Any]]:
+    """The named effects with values, intervals and evidence."""
+    final, found = result.search.final, result.search
+    low, high = intervals(final, result)
+    values = dict(zip(result.names, final.values.tolist(), strict=True))
+    base = base_values(result.full)
+    for index, name in enumerate(result.reference.space.names):
+        base[name] = float(result.reference.space.to_values(final.u)[index])
+    kept = {one.hypothesis.key for one in found.accepted}
+    out, start = [], 0
+    for number, one in enumerate(final.hypotheses):
+        stop = start + len(one.axes)
+        ends = [one.values(np.clip(edge, [-a.limit if a.signed else 0.0 for a in one.axes], None), base)
+                for edge in (low[start:stop], high[start:stop])]
+        if one.key in kept:
+            index = [c.hypothesis.key for c in found.accepted].index(one.key)
+            out.append({
+                "name": one.effect, "kind": one.kind, "variant": one.variant, "class": found.classes[index],
+                "parameters": {axis.parameter: {
+                    "value": values[axis.parameter],
+                    "interval": sorted(end[axis.parameter] for end in ends),
+                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
+                "p_value": found.accepted[index].p, "equation": equation_of(one),
+                "evidence": evidence_for(result, number, slice(start, stop))})
+        start = stop
+    return out
+
+
+def unit_of(parameter: str) -> str:
+    """Unit of a dotted parameter name."""
+    effect, _, name = parameter.partition(".")
+    return parameters_of(EFFECTS[effect])[name].unit
+
+
+def equation_of(one: Hypothesis) -> str:
+    """The first line of the effect's description, which is its equation."""
+    return (EFFECTS[one.effect].__doc__ or "").strip().splitlines()[0] if one.effect in EFFECTS else ""
+
+
+def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (k,), (k,) of the coordinates' confidence intervals; blocks are whole manoeuvres."""
+    from scipy import stats
+
+    covariance = np.linalg.inv(information(final, result))
+    size = len(final.u)
+    scores = np.einsum("bni,bn->bi", final.jacobian, final.residual)
+    groups = result.evidence.groups
+    summed = np.stack([scores[list(group)].sum(0) for group in groups])
+    robust = covariance @ (summed.T @ summed) @ covariance * len(groups) / max(len(groups) - 1, 1)
+    deviation = np.sqrt(np.maximum(np.diag(covariance), np.diag(robust)))[size:]
+    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(groups) - 1, 1))
+    return final.q - quantile * deviation, final.q + quantile * deviation
+
+
+def information(final: Refit, result: Result) -> np.ndarray:
+    """(P + k, P + k) of the joint fit, with the day-to-day spread as prior."""
+    flat = final.jacobian.reshape(-1, final.jacobian.shape[-1])
+    matrix = flat.T @ flat
+    size = len(final.u)
+    matrix[:size, :size] += result.evidence.precision
+    matrix[np.diag_indices(len(matrix))] += 1e-9 * np.diag(matrix).max()
+    return matrix
+
+
+def evidence_for(result: Result, number: int, part: slice) -> dict[str, Any]:
+    """What each manoeuvre says of an effect by itself, and whether it predicts manoeuvres that were left out."""
+    final, base, groups = result.search.final, result.search.base, result.evidence.groups
+    size = len(final.u)
+    index = np.arange(size + part.start, size + part.stop)
+    gain = {}
+    for group in groups:
+        name = result.log.training[group[0]].manoeuvre
+        gain[name] = left_out(base, group, result) - left_out(final, group, result)
+    matrix = information(final, result)
+    scales = []
+    for group in groups:
+        chosen = list(group)
+        flat = final.jacobian[chosen].reshape(-1, final.jacobian.shape[-1])
+        column = flat[:, index] @ final.q[part]
+        others = np.delete(flat, index, axis=1)
+        prior = np.delete(np.delete(matrix - flat.T @ flat, index, 0), index, 1)
+        own = np.linalg.solve(others.T @ others + prior, others.T @ column)
+        left = column - others @ own
+        strength = float(left @ left)
+        residual = final.residual[chosen].reshape(-1)
+        scales.append({"manoeuvre": result.log.training[group[0]].manoeuvre,
+                       "factor": 1 + float(left @ residual) / max(strength, 1e-9),
+                       "standard_error": 1 / np.sqrt(max(strength, 1e-9))})
+    del number
+    seen = [one for one in scales if one["standard_error"] < 0.5]
+    weight = np.array([one["standard_error"] ** -2.0 for one in seen])
+    factor = np.array([one["factor"] for one in seen])
+    mean = float((weight * factor).sum() / max(weight.sum(), 1e-9)) if len(seen) else 1.0
+    return {"left_out_gain": gain, "left_out_total": float(sum(gain.values())), "by_manoeuvre": scales,
+            "heterogeneity": {"q": float((weight * (factor - mean) ** 2).sum()), "manoeuvres": len(seen)}}
+
+
+def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
+    """Squared white residual of a manoeuvre predicted by a fit to all others (one linear step from the joint fit)."""
+    chosen = list(group)
+    flat = fit.jacobian[chosen].reshape(-1, fit.jacobian.shape[-1])
+    residual = fit.residual[chosen].reshape(-1)
+    matrix = information(fit, result) - flat.T @ flat
+    step = np.linalg.solve(matrix + 1e-9 * np.diag(matrix).max() * np.eye(len(matrix)), -flat.T @ residual)
+    return float(np.square(residual - flat @ step).sum())
+
+
+def detectable(result: Result) -> list[dict[str, Any]]:
+    """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units."""
+    found = result.search
+    limit = result.config.thresholds.margin * float(np.quantile(found.scan.null.max(1), 0.99))
+    solver = Solver(result.evidence)
+    size, precision = result.evidence.base_size, result.evidence.precision
+    base = base_values(result.full)
+    inner = np.linalg.inv(solver.products[:size, :size] + precision)
+    out, done = [], set()
+    for columns in result.evidence.columns:
+        one = result.hypotheses[columns.hypothesis]
+        for axis, index in zip(one.axes, columns.index, strict=True):
+            cross = solver.products[:size, index]
+            strength = solver.products[index, index] - cross @ inner @ cross
+            q = (np.sqrt(limit) + 0.84) / np.sqrt(max(strength, 1e-12))
+            usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
+            if (one.key, axis.parameter) in done or not usable:
+                continue
+            done.add((one.key, axis.parameter))
+            if axis.form == "moment":
+                continue
+            at = np.array([q if other is axis else 0.0 for other in one.axes])
+            value = one.values(at, base)[axis.parameter]
+            reach = bool(q <= axis.limit)
+            out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
+                        "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
+                        "unit": unit_of(axis.parameter)})
+    return out
+
+
+def lives_in(result: Result) -> list[dict[str, Any]]:
+    """Where the unexplained residual lives (`sysid.loop.unexplained`)."""
+    from sysid.loop.unexplained import where_it_lives
+
+    return where_it_lives(result)
+
+
+def base_table(result: Result) -> list[dict[str, Any]]:
+    """Base parameters on these drives beside the reference."""
+    space, reference = result.reference.space, result.reference
+    away = (result.search.final.u - reference.u) / np.sqrt(np.diag(reference.spread))
+    slope = space.slope(reference.u)
+    return [{"name": name, "reference": float(space.to_values(reference.u)[i]),
+             "spread": float(np.sqrt(reference.spread[i, i]) * slope[i]),
+             "value": float(space.to_values(result.search.final.u)[i]), "away": float(away[i])}
+            for i, name in enumerate(space.names)]
+
+
+def summary(report: dict[str, Any]) -> str:
+    """What a person reads first."""
+    lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+    for one in report["effects"]:
+        values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
+                           for name, p in one["parameters"].items())
+        lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
+    for part in ("training", "held_out"):
+        for channel, metrics in report["before"][part].items():
+            if "trajectory" in metrics:
+                after = report["after"][part][channel]["trajectory"]
+                lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} -> {after:.4f} m")
+    for one in report["lives_in"][:4]:
+        lines.append(f"  lives in {one['quantity']}: {one['share']:.0%} of what is left")
+    return "\n".join(lines)
+
+
+def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
+    """Write report.json, report.html and vehicle.toml into a folder."""
+    from sysid.close_loop import vehicle_after
+    from sysid.loop.page import write_page
+    from sysid.report import write_report
+    from whill_mjx.vehicle_file import save_vehicle
+
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    vehicle = vehicle_after(result)
+    known = describe(vehicle)
+    bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
+              if name in known and np.isfinite(p["interval"]).all()}
+    save_vehicle(out / "vehicle.toml", result.log.spec, vehicle, bounds,
+                 {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
+                  "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
+                  "effects_added": [one["name"] for one in report["effects"]]})
+    write_report(out / "report.json", report)
+    write_page(out, report)
+

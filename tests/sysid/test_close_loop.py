@@ -1,0 +1,178 @@
+"""The closed loop on drives with known contents: named, none, the effect in the file, held-out trials closed."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.close_loop import LoopConfig, close_loop, vehicle_after
+from sysid.log import load_log
+from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
+from sysid.loop.features import CHANNELS, make_features
+from sysid.loop.noise import deviations, fit_whitener, replicate_groups
+from sysid.loop.report import make_report, write_run
+from sysid.rollout import Measured
+from sysid.synthetic import write_dataset
+from whill_mjx.effects import make_effect
+from whill_mjx.manoeuvres import Scenario
+from whill_mjx.parameters import set_values
+from whill_mjx.presets import preset
+from whill_mjx.types import VehicleParams
+from whill_mjx.vehicle_file import load_vehicle
+
+DRIVES = ("straight", "circle", "s_curve")
+CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200)
+
+
+def day(seed):
+    """The chair on one day: gains and friction a few percent off."""
+    spec, params = preset("whill_cr_physical")
+    random = np.random.default_rng(seed)
+    names = ["torque_drive.kp", "torque_drive.limit", "rolling_resistance.mu_r"]
+    base = base_values(params)
+    return spec, set_values(params, names, np.array([base[n] * (1 + 0.02 * random.standard_normal()) for n in names]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("drives")
+
+
+@pytest.fixture(scope="module")
+def drives(folder):
+    """Two reference days, a day with nothing, and one on a slope."""
+    scenario = Scenario(length=4.0)
+    logs = {}
+    for number, name in enumerate(("reference_1", "reference_2", "plain", "sloping")):
+        spec, params = day(number)
+        if name == "sloping":
+            params = VehicleParams(params.body, (*params.effects, make_effect("slope", along_x=0.03)))
+        write_dataset(folder / name, spec, params, manoeuvres=(*DRIVES, "figure_eight"), replicates=3,
+                      scenario=scenario, seed=number)
+        logs[name] = load_log(folder / name)
+    return logs
+
+
+@pytest.fixture(scope="module")
+def sloping(drives):
+    return close_loop(drives["sloping"], (drives["reference_1"], drives["reference_2"]), CONFIG)
+
+
+def test_names_the_slope_and_its_size(sloping):
+    assert sloping.search.verdict == "named"
+    one = sloping.search.accepted[0]
+    assert one.hypothesis.effect in ("slope", "wind")  # a constant pull in the room: no drive on one floor splits them
+    assert "slope" in sloping.search.classes[0]
+
+
+def test_finds_nothing_where_nothing_is(drives, sloping):
+    result = close_loop(drives["plain"], (), CONFIG, reference=sloping.reference)
+    assert result.search.verdict == "none"
+
+
+def test_report_and_vehicle_file(sloping, tmp_path):
+    report = make_report(sloping)
+    write_run(tmp_path, sloping, report)
+    read = json.loads((tmp_path / "report.json").read_text())
+    assert read["verdict"] == "named"
+    assert read["effects"][0]["name"] in ("slope", "wind")
+    values = read["effects"][0]["parameters"]
+    if "slope.along_x" in values:
+        low, high = values["slope.along_x"]["interval"]
+        assert low - 0.01 < 0.03 < high + 0.01
+    before, after = (read[key]["held_out"]["ground_truth"]["trajectory"] for key in ("before", "after"))
+    assert after < before
+    assert read["manifest"]["sha256"]
+    _, params, provenance = load_vehicle(tmp_path / "vehicle.toml")
+    assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
+    assert provenance["verdict"] == "named"
+    assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_held_out_trials_cannot_change_the_verdict(drives, sloping):
+    log = drives["sloping"]
+    altered = []
+    for trial in log.trials:
+        if trial.held_out:
+            truth = trial.ground_truth
+            trial = replace(trial, ground_truth=replace(truth, x=truth.x + 3 * truth.t), odometry=None)
+        altered.append(trial)
+    again = close_loop(replace(log, trials=tuple(altered)), (), CONFIG, reference=sloping.reference)
+    assert again.search.verdict == sloping.search.verdict
+    assert np.array_equal(again.search.final.values, sloping.search.final.values)
+
+
+def test_vehicle_after_has_only_the_accepted_effect(sloping):
+    names = [effect.name for effect in vehicle_after(sloping).effects]
+    extra = set(names) - {effect.name for effect in sloping.reference.params.effects}
+    assert extra == {sloping.search.accepted[0].hypothesis.effect}
+
+
+@pytest.mark.quick
+def test_every_hypothesis_vanishes_at_zero():
+    spec, params = preset("whill_cr_physical")
+    found = hypotheses(spec, params)
+    full = with_catalogue(params, found)
+    base = base_values(full)
+    for one in found:
+        values = one.values(np.zeros(len(one.axes)), base)
+        for axis in one.axes:
+            if axis.form != "moment":
+                assert values[axis.parameter] == base[axis.parameter], one.key
+
+
+@pytest.mark.quick
+def test_keys_are_unique():
+    spec, params = preset("whill_cr_physical")
+    keys = [one.key for one in hypotheses(spec, params)]
+    assert len(keys) == len(set(keys))
+
+
+@pytest.mark.quick
+def test_features_do_not_depend_on_the_start_pose(drives):
+    trials = drives["plain"].training[:2]
+    features = make_features(trials)
+    pose = np.zeros((2, 200, 3))
+    t = np.arange(200) * 0.05
+    pose[0] = np.stack([0.4 * t, 0.1 * t, 0.2 * t], axis=-1)
+    turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+    pose[1, :, :2] = pose[0, :, :2] @ turn.T + [3.0, -2.0]
+    pose[1, :, 2] = pose[0, :, 2] + 1.0
+    seen = features.of(Measured(pose, np.ones_like(pose), np.zeros((2, 200, 5)), np.ones((2, 200, 5))))
+    assert np.allclose(seen[0], seen[1], atol=1e-9)
+    assert seen.shape[-1] == len(CHANNELS)
+
+
+@pytest.mark.quick
+def test_whitener_makes_autocorrelated_noise_white():
+    random = np.random.default_rng(0)
+    noise = np.zeros((40, 200, 2))
+    for k in range(1, 200):
+        noise[:, k] = 0.9 * noise[:, k - 1] + random.standard_normal((40, 2)) @ np.array([[1.0, 0.5], [0.0, 0.2]])
+    mask = np.ones_like(noise)
+    white = fit_whitener(noise, mask).apply(noise, mask)[:, 20:]
+    assert abs(white.std() - 1) < 0.05
+    assert abs(np.mean(white[:, 1:, 0] * white[:, :-1, 0])) < 0.03
+    assert abs(np.mean(white[..., 0] * white[..., 1])) < 0.03
+
+
+@pytest.mark.quick
+def test_deviations_have_the_size_of_the_noise(drives):
+    trials = drives["plain"].training
+    groups = replicate_groups(trials)
+    assert sorted(len(group) for group in groups) == [3, 3, 3]
+    random = np.random.default_rng(1)
+    shared = random.standard_normal((len(trials), 500, 3))
+    for group in groups:
+        shared[group] = shared[group[0]]
+    out = deviations(shared + 0.3 * random.standard_normal(shared.shape), groups)
+    assert abs(out.std() - 0.3) < 0.02
+
+
+@pytest.mark.quick
+def test_a_reference_of_another_vehicle_is_refused(drives):
+    other = drives["reference_1"]
+    other = replace(other, spec=replace(other.spec, track=0.6))
+    with pytest.raises(ValueError, match="track is 0.6.*same vehicle"):
+        close_loop(drives["plain"], (other,), CONFIG)
