@@ -55,6 +55,8 @@ class Benchmark:
     """Multiples of each effect's base size."""
     seeds: int = 1
     """Logs of each effect and size."""
+    classes: bool = False
+    """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     work: Path = Path("runs/undeclared")
     """Folder for logs and verdicts."""
     part: str = "1/1"
@@ -67,6 +69,8 @@ def main(settings: Benchmark) -> None:
         shared(settings)
     if settings.nulls or settings.effects:
         plant(settings)
+    if settings.classes:
+        look_alikes(settings)
 
 
 def shared(settings: Benchmark) -> None:
@@ -107,12 +111,7 @@ def plant(settings: Benchmark) -> None:
     from benchmarks.plant.make import make_log
 
     work = settings.work / "plant"
-    days = []
-    for number in range(6):
-        path = work / "reference" / f"day_{number + 1}"
-        if not path.exists():
-            make_log(path, seed=1001 + number, replicates=3 if number == 0 else 1)
-        days.append(load_log(path))
+    days = reference_days(work)
     jobs: list[tuple[str, dict[str, float], int]] = [(f"null_{n:03d}", {}, 2000 + n) for n in range(settings.nulls)]
     if settings.effects:
         for index, (name, effect) in enumerate(sorted(EFFECTS.items())):
@@ -141,6 +140,45 @@ def plant(settings: Benchmark) -> None:
         print(label, result.search.verdict, [one.hypothesis.key for one in result.search.accepted],
               f"{result.search.share:.2f}", flush=True)
     figures(work)
+
+
+def reference_days(work: Path) -> list[Log]:
+    """Six days of the contact plant with nothing in them: one with three replicates, five with one."""
+    from benchmarks.plant.make import make_log
+
+    days = []
+    for number in range(6):
+        path = work / "reference" / f"day_{number + 1}"
+        if not path.exists():
+            make_log(path, seed=1001 + number, replicates=3 if number == 0 else 1)
+        days.append(load_log(path))
+    return days
+
+
+def look_alikes(settings: Benchmark) -> None:
+    """Classes of effects on the nine manoeuvres, with and without an outside pose."""
+    from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
+    from sysid.loop.classes import classes, imitation
+    from sysid.loop.drives import make_drives
+    from sysid.loop.evidence import gather
+
+    days = reference_days(settings.work / "plant")
+    content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
+    for sensors, keep in (("odometry", False), ("odometry and outside pose", True)):
+        logs = [log if keep else replace(log, trials=tuple(replace(t, ground_truth=None) for t in log.trials))
+                for log in days]
+        reference = reference_of(logs, LoopConfig())
+        found = hypotheses(logs[0].spec, reference.params)
+        full = with_catalogue(reference.params, found)
+        base = base_values(full)
+        plant = vehicle_plant(logs[0].spec, VehicleConfig())
+        drives = make_drives(plant, full, tuple(base), logs[0].training)
+        at = drives.simulate(np.array([list(base.values())]))[0]
+        evidence, _ = gather(drives.weighted(at, reference.factors, logs[0].spec.track), reference, found, full)
+        members = classes(imitation(evidence, found), found)
+        content["sensors"][sensors] = {"classes": members,
+                                       "mean_size": float(np.mean([len(each) for each in members.values()]))}
+    write_json(Path("sysid/data/classes.json"), content)
 
 
 def brief(result: Result) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.log import Trial
 
 ORDER = 4  # bins of memory of the filter
-RIDGE = 1e-2  # of the regression, as a share of its data
+RIDGE = 2e-3  # of the regression, as a share of its data
 FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sysid.loop.catalogue import Hypothesis
+from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence
 from sysid.loop.refit import Refit, Refitter
 from sysid.loop.scan import Scan, Solver, gains, run, tail
@@ -101,6 +102,7 @@ def search(
         found.reason = "nothing stands out of the noise and the day-to-day spread"
         return found
     current = base
+    similar = imitation(evidence, hypotheses)
     for number in range(thresholds.rounds):
         scan_gain, starts, p = _rescan(evidence, hypotheses, current, refitter, first)
         order = _distinct(hypotheses, scan_gain, [one.hypothesis for one in found.accepted], thresholds.candidates)
@@ -127,7 +129,7 @@ def search(
         if best.gain < needed:
             break
         found.accepted.append(best)
-        found.classes.append(_class_of(best, candidates, refitter, current, thresholds))
+        found.classes.append(_class_of(best, candidates, hypotheses, similar, thresholds))
         current = best.refit
         if excess(current) < thresholds.excess:
             break
@@ -199,12 +201,15 @@ def _distinct(
 
 
 def _class_of(
-    best: Candidate, candidates: Sequence[Candidate], refitter: Refitter, current: Refit, thresholds: Thresholds
+    best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
+    thresholds: Thresholds,
 ) -> list[str]:
-    """Effects that these drives do not tell from the best: alike signatures, and nearly as good a fit."""
-    members = [best.hypothesis.effect]
-    for other in candidates[1:]:
-        close = best.gain - other.gain < max(12.0, 0.1 * best.gain)
-        if close and other.hypothesis.effect not in members:
-            members.append(other.hypothesis.effect)
-    return members[:4]
+    """Effects that these drives do not tell from the best: nearly as good a fit, or alike signatures, at most four."""
+    near = {other.hypothesis.effect: other.gain / best.gain for other in candidates[1:]
+            if best.gain - other.gain < max(12.0, 0.1 * best.gain)}
+    mine = list(hypotheses).index(best.hypothesis)
+    for j, other in enumerate(hypotheses):
+        if similar[mine, j] > thresholds.alike:
+            near[other.effect] = max(near.get(other.effect, 0.0), float(similar[mine, j]))
+    near.pop(best.hypothesis.effect, None)
+    return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])][:4]

@@ -12,8 +12,9 @@ from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_whitener, replicate_groups
 from sysid.loop.report import make_report, write_run
-from sysid.rollout import Measured
+from sysid.rollout import Measured, vehicle_plant
 from sysid.synthetic import write_dataset
+from whill_mjx.config import VehicleConfig
 from whill_mjx.effects import make_effect
 from whill_mjx.manoeuvres import Scenario
 from whill_mjx.parameters import set_values
@@ -49,7 +50,7 @@ def drives(folder):
         if name == "sloping":
             params = VehicleParams(params.body, (*params.effects, make_effect("slope", along_x=0.03)))
         write_dataset(folder / name, spec, params, manoeuvres=(*DRIVES, "figure_eight"), replicates=3,
-                      scenario=scenario, seed=number)
+                      scenario=scenario, seed=number, plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
         logs[name] = load_log(folder / name)
     return logs
 
