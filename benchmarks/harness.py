@@ -59,16 +59,21 @@ def record(stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Pa
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}.json"
     old = json.loads(path.read_text()) if path.exists() else {}
-    versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
-    arguments = [os.path.relpath(word) if os.path.isabs(word) else word for word in sys.argv[1:]]
-    stamp = {"command": " ".join(["python", "-m", _module_name(), *arguments]), "versions": versions,
-             "commit": _commit(), "date": datetime.date.today().isoformat()}
+    stamp = provenance()
     merged = {**old.get("figures", {}), **{name: {**value, **stamp} for name, value in figures.items()}}
     content = {"claim": claim, **stamp, "figures": merged}
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(content, indent=1) + "\n")
     os.replace(temporary, path)
     return path
+
+
+def provenance() -> dict[str, Any]:
+    """Command, versions, commit and date of what is running."""
+    versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
+    arguments = [os.path.relpath(word) if os.path.isabs(word) else word for word in sys.argv[1:]]
+    return {"command": " ".join(["python", "-m", _module_name(), *arguments]), "versions": versions,
+            "commit": _commit(), "date": datetime.date.today().isoformat()}
 
 
 def _module_name() -> str:

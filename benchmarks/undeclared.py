@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, device_name, figure, record
+from benchmarks.harness import RESULTS, device_name, figure, provenance, record
 from sysid.close_loop import LoopConfig, Result, close_loop
 from sysid.log import Log, load_log
 from sysid.loop.reference import Reference, make_reference
@@ -80,8 +80,7 @@ def shared(settings: Benchmark) -> None:
     reference = reference_of(references, config)
     path = RESULTS / "undeclared_shared.json"
     content = json.loads(path.read_text()) if path.exists() else {"sets": {}}
-    content.update(claim="Verdicts on logs with at most one undeclared effect each",
-                   command="python -m benchmarks.undeclared --shared", device=device_name())
+    content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(), **provenance())
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
