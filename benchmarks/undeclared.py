@@ -80,7 +80,8 @@ def shared(settings: Benchmark) -> None:
     reference = reference_of(references, config)
     path = RESULTS / "undeclared_shared.json"
     content = json.loads(path.read_text()) if path.exists() else {"sets": {}}
-    content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(), **provenance())
+    content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
+                   **provenance())
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)

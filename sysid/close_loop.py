@@ -143,6 +143,8 @@ def vehicle_after(result: Result) -> Any:
 def _check(log: Log, references: Sequence[Log]) -> None:
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
+    if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
+        raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
     for other in references:
         if not other.training:
             raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
@@ -181,7 +183,6 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Load, close the loop, open the held-out trials, write and print the verdict."""
-    from sysid.loop.report import make_report, summary, write_run
     from sysid.measured import load_any
 
     log = load_any(arguments.dataset)
@@ -195,15 +196,22 @@ def main(arguments: Arguments) -> dict[str, Any]:
                              "them.")
         _, vehicle, _ = load_vehicle(arguments.vehicle)
     config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations)
+    return run(log, references, arguments.out, config, vehicle)
+
+
+def run(log: Log, references: Sequence[Log], out: Path, config: LoopConfig, vehicle: Any = None) -> dict[str, Any]:
+    """Close the loop with a progress bar, open the held-out trials, write the folder `out` and print the verdict."""
+    from sysid.loop.report import make_report, summary, write_run
+
     progress, close = progress_bar(expected_steps(config))
     try:
         result = close_loop(log, references, config, vehicle, progress)
     finally:
         close()
     report = make_report(result)
-    write_run(arguments.out, result, report)
+    write_run(out, result, report)
     print(summary(report))
-    print(f"wrote report.json, report.html and vehicle.toml into {arguments.out}")
+    print(f"wrote report.json, report.html and vehicle.toml into {out}")
     return report
 
 

@@ -321,6 +321,10 @@ class Arguments(FitConfig):
     """Trials to predict in a measured set, in the same form."""
     chained: bool = False
     """DRIVE: 6 s steps, chained from 2 s windows, instead of the windows."""
+    close_loop: bool = False
+    """Then ask what the model lacks, into OUT/close_loop (`sysid.close_loop`)."""
+    reference: tuple[Path, ...] = ()
+    """For that: drives of the same vehicle on other days."""
 
 
 def main(arguments: Arguments) -> None:
@@ -339,6 +343,13 @@ def main(arguments: Arguments) -> None:
     print(parameter_table(report))
     print(table(report))
     print(f"wrote {arguments.out / 'report.html'}, report.json, vehicle.toml and the plots")
+    if arguments.close_loop:
+        from sysid.close_loop import LoopConfig, run
+
+        references = [load_any(path) for path in arguments.reference]
+        if settings.preset != "physical":
+            print("the loop starts from the physical base model")
+        run(log, references, arguments.out / "close_loop", LoopConfig(quick=settings.quick, seed=settings.seed))
 
 
 def cli() -> None:
