@@ -14,26 +14,30 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from dreamer import agent as agents
+from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
-from dreamer.train import TrainResult, train
+from dreamer.train import train
 from whill_mjx.batch import BatchEnv
+from whill_mjx.devices import choose_devices, join
+from whill_mjx.drivers import planner_driver, random_driver
+from whill_mjx.evaluation import Course, episode_keys
+from whill_mjx.final import evaluate_drivers, write_report
+from whill_mjx.ppo_run import train_ppo
+from whill_mjx.rollouts import rollout
+from whill_mjx.safe import Step, find_safety
 from whill_mjx.training import (
-    Drives,
     Preset,
+    dreamer_policy,
     find_preset,
     functional_env,
     make_training_env,
-    policy_driver,
-    random_driver,
-    record_drives,
-    summarise,
+    ppo_policy,
+    step_driver,
 )
 
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
@@ -53,7 +57,9 @@ class TrainOptions:
     task: str = "obstacle_course"
     """obstacle_course or corridor."""
     preset: str = "auto"
-    """paper, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
+    """paper, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
+    learner: Literal["dreamer", "ppo"] = "dreamer"
+    """The world model, or the model-free baseline with as many environment steps."""
     layout: str = "randomised"
     """randomised (a new world in each episode) or fixed."""
     seed: int = 0
@@ -61,33 +67,73 @@ class TrainOptions:
     steps: int | None = None
     """Environment steps to train; none takes the preset's."""
     episodes: int = 100
-    """Episodes of the final evaluation, of the policy and of a random one."""
+    """Episodes of the final evaluation, of the policy, the planner and a random one."""
+    planner: bool = True
+    """Whether the planner that knows the truth drives the final evaluation too."""
+    videos: int = 4
+    """Episodes, and failures, of the final evaluation shown as videos."""
     checkpoint_every_s: float = 60.0
     """Time between checkpoints [s]."""
     lr: float | None = None
     """Learning rate; none takes the preset's."""
     train_ratio: float | None = None
     """Replayed steps per environment step; none takes the preset's."""
+    instances: int | None = None
+    """Chairs side by side; none takes the preset's."""
+    safety: str = "none"
+    """none (the task's reward alone), smooth (gentle commands) or safe (gentle commands and a distance kept)."""
+    stop_success: float | None = None
+    """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
+    export: Literal["last", "best"] = "last"
+    """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run."""
+    devices: int | None = None
+    """Devices over which instances and batches are split; none takes all."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What either learner leaves."""
+
+    params: Any
+    env_steps: int
+    updates: int
+    wall_s: float
 
 
 def main(options: TrainOptions) -> dict[str, Any]:
     """Do the whole job and return the evaluation; everything is left in `options.out`."""
     started = time.perf_counter()
+    processes = join()
     say(f"devices: {', '.join(str(device) for device in jax.devices())}")
     preset = choose_preset(options)
+    if processes > 1 and options.learner == "ppo":
+        raise ValueError("the baseline trains in one process; start it alone or choose --learner dreamer.")
     options.out.mkdir(parents=True, exist_ok=True)
-    write_json(options.out / "config.json", {"command": _plain(options), "preset": _plain(preset)})
-    vehicle = prepare_vehicle(options)
-    result = train_policy(options, preset, vehicle)
-    evaluation = evaluate_policy(options, preset, vehicle, result)
-    policy = export(options, preset, vehicle, result)
+    vehicle = options.out / "vehicle.toml"
+    if parallel.is_first_process():
+        write_json(options.out / "config.json", {"command": _plain(options), "preset": _plain(preset)})
+        prepare_vehicle(options)
+    parallel.agree(True)  # the others wait for the vehicle file
+    result = train_policy(options, preset, vehicle) if options.learner == "dreamer" else train_baseline(
+        options, preset, vehicle
+    )
+    if not parallel.is_first_process():
+        return {}
+    best = best_params(options, preset, result) if options.learner == "dreamer" else None
+    chosen = best if options.export == "best" and best is not None else result
+    evaluation = evaluate_policy(options, preset, vehicle, chosen)
+    policy = export(options, preset, vehicle, chosen, options.out / "policy")
+    if best is not None and chosen is not best:
+        export(options, preset, vehicle, best, options.out / "policy_best")
     seconds = time.perf_counter() - started
     evaluation["seconds"] = {"this_command": seconds, "training": result.wall_s}
     write_json(options.out / "evaluation.json", evaluation)
     share, interval = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
+    baselines = [name for name in ("planner", "random") if name in evaluation]
+    others = ", ".join(f"{name} {evaluation[name]['success']:.0%}" for name in baselines)
     say(
-        f"success {share:.0%} (95 % interval {interval[0]:.0%} to {interval[1]:.0%}), random policy "
-        f"{evaluation['random']['success']:.0%}; policy file {policy}; {seconds / 60:.1f} min"
+        f"success {share:.0%} (95 % interval {interval[0]:.0%} to {interval[1]:.0%}), {others}; policy file {policy}; "
+        f"{seconds / 60:.1f} min"
     )
     return evaluation
 
@@ -98,13 +144,22 @@ def choose_preset(options: TrainOptions) -> Preset:
     name = options.preset if options.preset != "auto" else ("cpu" if on_cpu else "paper")
     preset = find_preset(name, options.task)
     say(f"preset {name}")
-    learner = preset.learner
+    learner, baseline = preset.learner, preset.ppo
     if options.lr is not None:
         learner = dataclasses.replace(learner, lr=options.lr)
+        baseline = dataclasses.replace(baseline, lr=options.lr)
     if options.train_ratio is not None:
         learner = dataclasses.replace(learner, train_ratio=options.train_ratio)
-    task = dataclasses.replace(preset.task, layout=options.layout)
-    return dataclasses.replace(preset, task=task, learner=learner, total_steps=options.steps or preset.total_steps)
+    return dataclasses.replace(
+        preset,
+        task=dataclasses.replace(preset.task, layout=options.layout),
+        learner=learner,
+        ppo=baseline,
+        total_steps=options.steps or preset.total_steps,
+        instances=options.instances or preset.instances,
+        safety=find_safety(options.safety),
+        stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
+    )
 
 
 def prepare_vehicle(options: TrainOptions) -> Path:
@@ -140,82 +195,182 @@ def prepare_vehicle(options: TrainOptions) -> Path:
     return target
 
 
-def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> TrainResult:
-    """Train, with an evaluation every `eval_every` steps."""
-    batch = make_training_env(preset.task, vehicle, preset.instances)
-    held_out = make_training_env(preset.task, vehicle, min(preset.eval_episodes, 200))
-    evaluate = evaluation_of(held_out, preset, options.seed)
-    return train(
-        functional_env(batch),
+def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
+    """Train the world model and its policy, with an evaluation every `eval_every` steps."""
+    devices = choose_devices(options.devices)
+    batch = make_training_env(preset.task, vehicle, preset.instances, devices=devices)
+    held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
+    evaluate = keep_best(options.out, preset, evaluation_of(held_out, preset, options.seed))
+    stopper = Stopper(options.out, preset.stop_success)
+    result = train(
+        functional_env(batch, preset.safety),
         preset.learner,
         options.out,
-        preset.total_steps,
+        stopper.total_steps(preset.total_steps),
         options.seed,
         eval_fn=evaluate,
         eval_every=preset.eval_every,
         checkpoint_every_s=options.checkpoint_every_s,
+        stop=stopper,
+        devices=devices,
     )
+    return Trained(jax.device_get(result.agent.params), result.env_steps, result.updates, result.wall_s)
+
+
+def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
+    """Train the model-free baseline with as many environment steps."""
+    batch = make_training_env(preset.task, vehicle, preset.instances, devices=choose_devices(options.devices))
+    course = make_course(preset, vehicle)
+    keys = episode_keys(options.seed + 77, preset.eval_episodes)
+    vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt
+    size = (course.env.height, course.env.width)
+
+    @jax.jit
+    def ends(params: Any) -> dict[str, jax.Array]:
+        step, carry = ppo_policy(preset, params, control_dt, size)
+        return rollout(course.env, vehicles, keys, step_driver(step, carry, preset.task.action_repeat)).ends
+
+    def evaluate(params: Any, env_steps: int) -> dict[str, float]:
+        episodes = jax.device_get(ends(params))
+        return _figures({**episodes, "return": episodes["episode_return"]})
+
+    return Trained(*train_ppo(
+        functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
+        preset.eval_every, Stopper(options.out, preset.stop_success), say,
+    ))  # fmt: skip
 
 
 def evaluation_of(batch: BatchEnv, preset: Preset, seed: int):
     """(params, steps) -> figures of one episode in every instance of `batch`; always the same worlds."""
     from dreamer.train import evaluate
 
-    env = functional_env(batch)
+    env = functional_env(batch, preset.safety, shaped=False)
 
     def run(params: Any, env_steps: int) -> dict[str, float]:
-        episodes = evaluate(env, preset.learner, params, jax.random.key(seed + 77), batch.count)
-        success = episodes["success"] > 0.5
-        figures = {name: float(np.mean(episodes[name])) for name in ("return", "success", "collision", "timeout")}
-        if success.any():
-            figures["arrival_s"] = float(np.mean(episodes["time_s"][success]))
+        return _figures(evaluate(env, preset.learner, params, jax.random.key(seed + 77), batch.count))
+
+    return run
+
+
+def _figures(episodes: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means of an evaluation inside the run."""
+    success = np.asarray(episodes["success"]) > 0.5
+    figures = {name: float(np.mean(episodes[name])) for name in ("return", "success", "collision", "timeout")}
+    if success.any():
+        figures["arrival_s"] = float(np.mean(np.asarray(episodes["time_s"])[success]))
+    return figures
+
+
+def keep_best(out: Path, preset: Preset, evaluate: Any):
+    """The evaluation, which now also saves the parameters in RUN/best when they are the best so far.
+
+    The best has the highest share of successes, and among equals the highest return. These episodes are not those of
+    the final evaluation, so choosing by them does not flatter it.
+    """
+
+    def run(params: Any, env_steps: int) -> dict[str, float]:
+        figures = evaluate(params, env_steps)
+        before = read_best(out)
+        # A run that goes on from an older checkpoint comes by the same steps again.
+        if before is None or _rank(figures) > _rank(before) or before["env_steps"] == env_steps:
+            checkpoint.save(out / "best", {"params": params}, preset.learner, env_steps)
+            if parallel.is_first_process():
+                write_json(out / "best.json", {"env_steps": env_steps, **figures})
         return figures
 
     return run
 
 
-def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result: TrainResult) -> dict[str, Any]:
-    """Drive the final evaluation with the policy and with random actions; write pictures and video."""
+def _rank(figures: dict[str, float]) -> tuple[float, float]:
+    return figures["success"], figures["return"]
+
+
+def read_best(out: Path) -> dict[str, float] | None:
+    """RUN/best.json, if there is one."""
+    path = out / "best.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Trained | None:
+    """The best parameters, if they are not those at the end of the run."""
+    best = read_best(options.out)
+    if best is None or best["env_steps"] == result.env_steps:
+        return None
+    path = options.out / "best" / f"{int(best['env_steps']):012d}"
+    state, _ = checkpoint.load(path, {"params": result.params}, preset.learner)
+    return Trained(state["params"], int(best["env_steps"]), result.updates, result.wall_s)
+
+
+class Stopper:
+    """Ends a run after two good evaluations in a row, or when there is a file RUN/stop."""
+
+    def __init__(self, out: Path, success: float | None):
+        self._out, self._success, self._good = out, success, 0
+
+    def total_steps(self, planned: int) -> int:
+        """Steps to train: those at which an earlier start has ended for its success, if it asked the same."""
+        path = self._out / "stopped.json"
+        if self._success is None or not path.is_file():
+            return planned
+        told = json.loads(path.read_text())
+        return min(planned, int(told["env_steps"])) if told["success"] == self._success else planned
+
+    def __call__(self, line: dict[str, float]) -> bool:
+        """Whether the run ends after this line."""
+        if parallel.agree((self._out / "stop").exists()):
+            say(f"stopped, since {self._out / 'stop'} exists; remove it to go on.")
+            return True
+        reached = self._success is not None and line.get("eval/success", 0.0) >= self._success
+        self._good = self._good + 1 if reached else 0
+        if self._good < 2:
+            return False
+        if parallel.is_first_process():
+            write_json(self._out / "stopped.json", {"env_steps": line["env_steps"], "success": self._success})
+        say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
+        return True
+
+
+def make_course(preset: Preset, vehicle: Path) -> Course:
+    """The environment of evaluations."""
+    batch = make_training_env(preset.task, vehicle, 1)
+    return Course(batch.env, batch.params)
+
+
+def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Course) -> tuple[Step, dict[str, Any]]:
+    """What drives, and is exported: the step of one instance and its first carry."""
+    control_dt = course.env.model.config.control_dt
+    if options.learner == "ppo":
+        return ppo_policy(preset, result.params, control_dt, (course.env.height, course.env.width))
+    return dreamer_policy(preset, result.params, control_dt)
+
+
+def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained) -> dict[str, Any]:
+    """Drive the final evaluation with the policy, the planner and random actions; write pictures and videos."""
     from whill_mjx import pictures
 
-    batch = make_training_env(preset.task, vehicle, options.episodes)
-    key = jax.random.key(FINAL_SEED + options.seed)
-    drives = record_drives(batch, *policy_driver(preset.learner, result.agent.params, batch.count), key)
-    at_random = record_drives(batch, *random_driver(), key, videos=1)
-    rate = 1.0 / (batch.env.model.config.control_dt * preset.task.action_repeat)
-    summary = {"policy": summarise(drives), "random": summarise(at_random)}
-    references = {"random policy": summary["random"]["return_mean"]}
-    draw = {
-        "reward_curve.png": lambda path: pictures.reward_curve(
-            options.out / "metrics.jsonl", path, preset.task.action_repeat, references
-        ),
-        "drives.png": lambda path: pictures.drives_from_above(drives, preset.task.goal_radius, path),
-        "camera.mp4": lambda path: pictures.camera_video(drives, path, rate),
-    }
-    for name, draw_one in draw.items():
-        try:
-            draw_one(options.out / name)
-        except ImportError as error:
-            say(f"{name} is left out: {error}. Install the base package to draw it.")
-    save_drives(options.out / "drives.npz", drives)
-    return {"task": _plain(preset.task), "seed": options.seed, "env_steps": result.env_steps,
-            "updates": result.updates, **summary}
+    course = make_course(preset, vehicle)
+    driver = step_driver(*policy_of(options, preset, result, course), preset.task.action_repeat)
+    drivers = {"policy": driver, "random": random_driver(preset.task.action_repeat)}
+    if options.planner:
+        drivers["planner"] = planner_driver(course.env)
+    driven = evaluate_drivers(course, drivers, FINAL_SEED + options.seed, options.episodes)
+    summary = write_report(options.out, course, driver, driven, options.videos, say)
+    references: dict[str, float] = {name: summary[name]["return"] for name in drivers if name != "policy"}
+    try:
+        pictures.reward_curve(
+            options.out / "metrics.jsonl", options.out / "reward_curve.png", preset.task.action_repeat, references
+        )
+    except ImportError as error:
+        say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
+    return {"task": _plain(preset.task), "learner": options.learner, "seed": options.seed,
+            "env_steps": result.env_steps, "updates": result.updates, **summary}
 
 
-def save_drives(path: Path, drives: Drives) -> None:
-    """Paths, lengths and endings of the evaluation drives as plain arrays."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
-        arrays: dict[str, Any] = {"path": drives.path, "length": drives.length, **drives.metrics}
-        np.savez_compressed(file, **arrays)
-    os.replace(temporary, path)
-
-
-def export(options: TrainOptions, preset: Preset, vehicle: Path, result: TrainResult) -> Path | None:
-    """Write the policy file RUN/policy."""
+def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
+    """Write a policy file."""
     from whill_mjx.vehicle_file import load_vehicle
 
-    task, learner = preset.task, preset.learner
+    task = preset.task
     spec, _, _ = load_vehicle(vehicle)
     contract = PolicyContract(
         action_low=(task.v_min, -task.omega_max),
@@ -225,15 +380,9 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: TrainRe
         action_repeat=task.action_repeat,
         camera=dataclasses.asdict(spec.camera),
     )
-    params = jax.tree.map(jnp.asarray, result.agent.params)
-
-    def step(carry: Any, image: jax.Array) -> tuple[Any, jax.Array]:
-        return agents.policy_step(learner, params, carry, image)
-
+    step, carry = policy_of(options, preset, result, make_course(preset, vehicle))
     try:
-        return export_policy(
-            options.out / "policy", step, agents.policy_carry(learner, 2), params, contract, vehicle_file=vehicle
-        )
+        return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")
         return None

@@ -1,23 +1,32 @@
-"""The training command from end to end, in a tiny size: what it leaves behind, resuming, and bad input."""
+"""The training command from end to end, in a tiny size: what it leaves behind, resuming, stopping, and bad input."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.train import TrainOptions, main, prepare_vehicle
-from whill_mjx.training import find_preset, wilson_interval
+from whill_mjx.devices import choose_devices, join, launched_processes
+from whill_mjx.intervals import wilson_interval
+from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
+from whill_mjx.task import Corridor, ObstacleCourse
+from whill_mjx.train import Stopper, TrainOptions, keep_best, main, prepare_vehicle, read_best
+from whill_mjx.training import find_preset, functional_env
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A finished run of the smoke preset with a built-in vehicle."""
     options = TrainOptions(
-        out=tmp_path_factory.mktemp("run"), vehicle=Path("whill_cr_ramp"), preset="smoke", steps=200, episodes=8
-    )
+        out=tmp_path_factory.mktemp("run"), vehicle=Path("whill_cr_ramp"), preset="smoke", steps=200, episodes=8,
+        planner=False, safety="safe",
+    )  # fmt: skip
     return options, main(options)
 
 
@@ -26,7 +35,7 @@ def test_a_run_leaves_everything_a_user_needs(run):
     left = {path.name for path in options.out.iterdir()}
     assert left >= {
         "config.json", "vehicle.toml", "metrics.jsonl", "reward_curve.png", "drives.png", "camera.mp4", "drives.npz",
-        "evaluation.json", "checkpoints", "policy",
+        "evaluation.json", "checkpoints", "policy", "best", "best.json", "failures.png", "failures.mp4",
     }  # fmt: skip
     assert {"policy.json", "policy.onnx", "weights.npz", "vehicle.toml"} <= {
         path.name for path in (options.out / "policy").iterdir()
@@ -34,13 +43,16 @@ def test_a_run_leaves_everything_a_user_needs(run):
     assert json.loads((options.out / "evaluation.json").read_text())["policy"]["episodes"] == 8
     for driver in ("policy", "random"):
         figures = evaluation[driver]
+        for name in ("return", "min_clearance_m", "path_length_m", "command_change_rad_s2", "near_misses"):
+            low, high = figures[f"{name}_interval_95"]
+            assert low <= figures[name] <= high
         assert figures["success"] + figures["collision"] + figures["timeout"] + figures["diverged"] == pytest.approx(1)
 
 
 def test_the_same_command_again_goes_on_from_the_end_and_gives_the_same_policy(run):
     options, before = run
     lines = (options.out / "metrics.jsonl").read_text()
-    again = main(options)
+    again = main(dataclasses.replace(options, videos=0))  # the videos of the first time stay
     assert again["env_steps"] == before["env_steps"] and again["updates"] == before["updates"]
     assert again["policy"] == before["policy"]
     assert (options.out / "metrics.jsonl").read_text() == lines
@@ -56,6 +68,118 @@ def test_the_exported_policy_runs_on_the_bridge_and_gives_commands_within_the_li
     for frame in frames:
         v, omega = policy.step(frame)
         assert 0.0 <= v <= 1.0 and -1.0 <= omega <= 1.0
+
+
+def test_the_exported_policy_keeps_to_the_limits_of_its_training_by_itself(run):
+    """Commands of the file change by at most 0.5 m/s and 1 rad/s from one decision (0.5 s) to the next, from rest."""
+    from whill_mjx.policy_file import load_policy
+
+    policy = load_policy(run[0].out / "policy")
+    assert "command" in policy.carry
+    step, carry = jax.jit(policy.step), policy.start()
+    frames = np.random.default_rng(1).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    command = np.zeros(2)
+    for frame in frames:
+        carry, action = step(carry, frame)
+        new = np.array([(float(action[0]) + 1) / 2, float(action[1])])
+        assert (np.abs(new - command) <= np.array([0.5, 1.0]) + 1e-5).all()
+        np.testing.assert_allclose(carry["command"], new, atol=1e-6)
+        command = new
+
+
+@pytest.mark.quick
+def test_limited_actions_stay_within_reach_and_no_limit_changes_nothing():
+    task, gentle = Corridor(), Safety(acceleration=0.5, yaw_acceleration=1.0)
+    from_rest = limit_action(task, gentle, jnp.array([1.0, -1.0]), jnp.zeros(2), 0.1)
+    np.testing.assert_allclose(from_rest, [2 * 0.05 / 0.3 - 1, -0.1 / 0.6], atol=1e-6)
+    free = limit_action(task, Safety(), jnp.array([0.3, -0.7]), jnp.zeros(2), 0.1)
+    np.testing.assert_allclose(free, [0.3, -0.7], atol=1e-6)
+    step, carry = limited_policy(task, Safety(), len, {}, 0.1)
+    assert step is len and carry == {}
+    with pytest.raises(ValueError, match="must not be negative"):
+        Safety(clearance_gain=-1.0)
+    with pytest.raises(ValueError, match="known: none, smooth, safe"):
+        find_safety("bold")
+
+
+@pytest.mark.quick
+def test_penalties_by_hand():
+    safety = Safety(clearance_gain=40.0, clearance_margin=0.25, change_gain=0.2)
+    lost = penalty(safety, jnp.array(0.15), jnp.array([0.5, -1.0]), 0.1)
+    assert float(lost) == pytest.approx(40 * 0.1 * 0.1 + 0.2 * 1.5)
+    assert float(penalty(safety, jnp.array(0.3), jnp.zeros(2), 0.1)) == 0.0
+
+
+@pytest.mark.quick
+def test_shaping_changes_the_learners_reward_and_not_the_evaluations():
+    """A made-up batch: the wrapper takes the penalty off the reward, except on a first frame and in evaluations."""
+    task = ObstacleCourse()
+    zero = jnp.zeros(2)
+    metrics = dict.fromkeys(("success", "collision", "timeout", "diverged", "time_s", "episode_return"), zero)
+    told = SimpleNamespace(obs=zero, reward=jnp.ones(2), first=jnp.array([False, True]), terminated=zero > 0,
+                           truncated=zero > 0, metrics={**metrics, "clearance": jnp.full(2, 0.05)})
+
+    @dataclasses.dataclass
+    class Step:
+        obs: object
+        reward: object
+        first: object
+        terminated: object
+        truncated: object
+        metrics: object
+
+    commands = jnp.zeros((2, 2))
+
+    def step(state, action):
+        return SimpleNamespace(env=SimpleNamespace(command=action)), Step(**vars(told))
+
+    batch = SimpleNamespace(count=2, step=step, env=SimpleNamespace(
+        task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1))))
+    state, action = SimpleNamespace(env=SimpleNamespace(command=commands)), jnp.ones((2, 2))
+    new, shaped = functional_env(batch, SAFETY["safe"]).step(state, action)
+    np.testing.assert_allclose(new.env.command, [[0.1, 0.2]] * 2, atol=1e-6)  # 1 m/s^2 and 2 rad/s^2 for 0.1 s
+    np.testing.assert_allclose(shaped.reward, [1 - 40 * 0.1 * 0.2 - 0.2 * 0.3, 1.0], atol=1e-6)
+    _, plain = functional_env(batch, SAFETY["safe"], shaped=False).step(state, action)
+    np.testing.assert_allclose(plain.reward, 1.0)
+
+
+@pytest.mark.quick
+def test_a_run_stops_after_two_good_evaluations_or_for_a_file(tmp_path):
+    stopper = Stopper(tmp_path, 0.9)
+    lines = [{"env_steps": step, "eval/success": share} for step, share in ((1, 0.95), (2, 0.5), (3, 0.9), (4, 1.0))]
+    assert [stopper(line) for line in lines] == [False, False, False, True]
+    assert Stopper(tmp_path, 0.9).total_steps(10) == 4 and Stopper(tmp_path, 0.99).total_steps(10) == 10
+    assert not Stopper(tmp_path, None)(lines[3])
+    (tmp_path / "stop").touch()
+    assert Stopper(tmp_path, None)(lines[0])
+
+
+@pytest.mark.quick
+def test_the_best_parameters_are_those_of_most_successes_then_of_most_return(tmp_path):
+    told = iter([(0.5, 10.0), (0.4, 90.0), (0.5, 20.0), (0.5, 15.0)])
+    preset = find_preset("smoke", "corridor")
+    names = ("success", "return")
+    evaluate = keep_best(tmp_path, preset, lambda params, steps: dict(zip(names, next(told), strict=True)))
+    for steps in (1, 2, 3, 4):
+        evaluate({"w": jnp.full(2, float(steps))}, steps)
+    assert read_best(tmp_path)["env_steps"] == 3
+    from dreamer import checkpoint
+
+    state, _ = checkpoint.load(tmp_path / "best" / f"{3:012d}", {"params": {"w": jnp.zeros(2)}}, preset.learner)
+    np.testing.assert_array_equal(state["params"]["w"], 3.0)
+
+
+@pytest.mark.quick
+def test_launchers_are_recognised_and_half_told_ones_refused():
+    assert launched_processes({}) == (1, "") and launched_processes({"SLURM_STEP_NUM_TASKS": "1"}) == (1, "")
+    assert launched_processes({"SLURM_STEP_NUM_TASKS": "4"}) == (4, "SLURM")
+    assert launched_processes({"OMPI_COMM_WORLD_SIZE": "2"}) == (2, "Open MPI")
+    assert join({}) == 1
+    with pytest.raises(ValueError, match="JAX_COORDINATOR_ADDRESS is None"):
+        join({"JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": "0"})
+    with pytest.raises(ValueError, match="devices = 99"):
+        choose_devices(99)
+    assert choose_devices(1) == ()
 
 
 @pytest.mark.quick
@@ -74,6 +198,21 @@ def test_a_bad_vehicle_file_is_refused_before_anything_is_written(tmp_path):
 def test_unknown_presets_and_tasks_are_named(name, task, message):
     with pytest.raises(ValueError, match=message):
         find_preset(name, task)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("task", ["corridor", "obstacle_course"])
+def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
+    from dreamer.replay import rows_for
+
+    paper, fast = find_preset("paper", task), find_preset("wallclock", task)
+    assert paper.total_steps == {"corridor": 200_000, "obstacle_course": 22_000}[task] and paper.instances == 16
+    assert (paper.task.v_min, paper.task.v_max) == {"corridor": (0.0, 0.3), "obstacle_course": (-1.0, 1.0)}[task]
+    assert fast.task == paper.task and fast.stop_success == 0.99
+    for preset in (paper, fast):
+        assert rows_for(preset.learner, preset.instances) * preset.instances >= preset.learner.learning_starts
+        assert preset.instances % 8 == 0 and preset.learner.batch_size % 8 == 0
+        assert preset.instances * preset.ppo.rollout % preset.ppo.minibatches == 0
 
 
 @pytest.mark.quick
