@@ -164,14 +164,14 @@ def _gemm(xp, attributes, count, a, b, c=None):
 
 def _conv(xp, attributes, count, values, kernel, bias=None):
     rank = values.ndim - 2
-    if attributes.get("auto_pad", b"NOTSET") != b"NOTSET":
-        raise ValueError("automatic padding is not known here. Evaluate with the runtime 'onnxruntime' instead.")
     pads = attributes.get("pads", [0] * 2 * rank)
+    automatic = {b"SAME_UPPER": "SAME", b"SAME_LOWER": "SAME_LOWER", b"VALID": "VALID"}
+    padding = automatic.get(attributes.get("auto_pad", b"NOTSET"), list(zip(pads[:rank], pads[rank:], strict=True)))
     result = jax.lax.conv_general_dilated(
         jnp.asarray(values),
         jnp.asarray(kernel),
         window_strides=attributes.get("strides", [1] * rank),
-        padding=list(zip(pads[:rank], pads[rank:], strict=True)),
+        padding=padding,
         rhs_dilation=attributes.get("dilations", [1] * rank),
         feature_group_count=attributes.get("group", 1),
     )
@@ -234,6 +234,7 @@ OPERATORS: dict[str, Operator] = {
     "Log": _elementwise("log"),
     "MatMul": _elementwise("matmul"),
     "Max": _folded("maximum"),
+    "Mean": lambda xp, a, count, *values: _folded("add")(xp, a, count, *values) / len(values),
     "Min": _folded("minimum"),
     "Mul": _elementwise("multiply"),
     "Neg": _elementwise("negative"),
@@ -260,6 +261,7 @@ OPERATORS: dict[str, Operator] = {
     "Sqrt": _elementwise("sqrt"),
     "Squeeze": _squeeze,
     "Sub": _elementwise("subtract"),
+    "Sum": _folded("add"),
     "Tanh": _elementwise("tanh"),
     "Transpose": lambda xp, a, count, values: xp.transpose(values, a.get("perm")),
     "Unsqueeze": _unsqueeze,

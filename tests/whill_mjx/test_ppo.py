@@ -132,6 +132,27 @@ def test_the_exported_step_sees_what_the_network_was_trained_on():
         np.testing.assert_allclose(action, Network(TINY, 2).apply(params, frames)[0][0], atol=1e-6)
 
 
+def test_the_exported_network_acts_like_the_trained_one(tmp_path):
+    from dreamer.export import PolicyContract, export_policy
+    from whill_mjx.policy_file import load_policy
+
+    params = Network(TINY, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 6), jnp.uint8))
+    params["params"]["Dense_1"]["kernel"] *= 1e4  # a new network's actions are all near zero
+    contract = PolicyContract((0.0, -0.6), (0.3, 0.6), height=8, width=8)
+
+    def step(carry, image):
+        return policy_step(TINY, params, carry, image)
+
+    export_policy(tmp_path / "policy", step, policy_carry(TINY, 8, 8), params, contract, check_steps=5)
+    policy = load_policy(tmp_path / "policy")
+    ours, theirs = policy_carry(TINY, 8, 8), policy.start()
+    for image in np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8):
+        (ours, action), (theirs, same) = step(ours, image), policy.step(theirs, image)
+        np.testing.assert_allclose(action, same, atol=1e-5)
+        np.testing.assert_array_equal(ours["frames"], theirs["frames"])
+    assert float(jnp.abs(action).max()) > 0.05
+
+
 @pytest.mark.quick
 def test_minibatches_that_do_not_divide_a_rollout_are_refused():
     with pytest.raises(ValueError, match="minibatches"):
