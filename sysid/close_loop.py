@@ -20,6 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +36,7 @@ from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
 from sysid.rollout import Plant, vehicle_plant
 from whill_mjx.config import VehicleConfig
-from whill_mjx.parameters import set_values
+from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
 
 Progress = Callable[[int, str], None]
@@ -77,6 +78,16 @@ class Result:
     evidence: Evidence
     plant: Plant
     seconds: dict[str, float]
+
+    @cached_property
+    def before(self) -> Any:
+        """The base model fitted to these drives."""
+        return refit_poses(self, vehicle_before(self))
+
+    @cached_property
+    def after(self) -> Any:
+        """The vehicle with the accepted effects, fitted to these drives."""
+        return refit_poses(self, vehicle_after(self)) if self.search.verdict == "named" else self.before
 
 
 def close_loop(
@@ -138,6 +149,33 @@ def vehicle_after(result: Result) -> Any:
     for one in final.hypotheses:
         kept |= {axis.parameter.partition(".")[0] for axis in one.axes}
     return type(moved)(moved.body, tuple(effect for effect in moved.effects if effect.name in kept))
+
+
+def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
+    """A vehicle refitted to whole poses and speeds, as `sysid.fit` does, from where the search left it.
+
+    The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
+    refit may move base parameters and the accepted effects' own, and nothing else.
+    """
+    from sysid import gradient
+    from sysid.fit import make_objective
+    from sysid.objective import estimate_noise
+    from sysid.space import make_space
+
+    have = describe(vehicle)
+    names = list(result.reference.space.names)
+    if result.search.verdict == "named":
+        moved = [axis.parameter for one in result.search.final.hypotheses for axis in one.axes]
+        names += [name for name in dict.fromkeys(moved) if name in have and name not in names
+                  and np.isfinite(float(get_values(vehicle, [name])[0]))]
+    space = make_space(vehicle, result.log.spec, names)
+    objective = make_objective(result.plant, vehicle, space, result.log.training, estimate_noise(result.log.training))
+    if objective.noise.source == "defaults":
+        objective = objective.with_noise(objective.residual_noise(space.to_unit(space.initial)))
+    fit = gradient.fit(objective, space, iterations=iterations)
+    if not fit.cost < fit.initial_cost:
+        return vehicle
+    return set_values(vehicle, space.names, jnp.asarray(space.to_values(fit.u), jnp.result_type(float)))
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:

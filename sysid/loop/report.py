@@ -50,13 +50,13 @@ RESAMPLES = 2000
 
 def make_report(result: Result) -> dict[str, Any]:
     """The report; this is where the held-out trials are opened."""
-    from sysid.close_loop import manifest, vehicle_after, vehicle_before
+    from sysid.close_loop import manifest
 
     found = result.search
     settings = manifest(result.config, result.hypotheses, result.reference)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
     trials = (*result.log.training, *result.log.held_out)
-    before, after = (replay(result, vehicle, trials) for vehicle in (vehicle_before(result), vehicle_after(result)))
+    before, after = (replay(result, vehicle, trials) for vehicle in (result.before, result.after))
     rows = error_rows(trials, before, after)
     about = [one.name for one in result.references]
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
@@ -130,7 +130,10 @@ def change(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
-    """The named effects with values, intervals and evidence."""
+    """The named effects with values, intervals and evidence.
+
+    Values are those of the joint refit that decided; the vehicle file has them after the last refit to whole poses.
+    """
     final, found = result.search.final, result.search
     low, high = intervals(final, result)
     values = dict(zip(result.names, final.values.tolist(), strict=True))
@@ -303,14 +306,13 @@ def summary(report: dict[str, Any]) -> str:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, report.html and vehicle.toml into a folder."""
-    from sysid.close_loop import vehicle_after
     from sysid.loop.page import write_page
     from sysid.report import write_report
     from whill_mjx.vehicle_file import save_vehicle
 
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    vehicle = vehicle_after(result)
+    vehicle = result.after
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all()}
