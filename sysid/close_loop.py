@@ -58,6 +58,8 @@ class LoopConfig:
     """Fewer iterations, nulls and candidates."""
     physics_dt: float = 0.005
     """Physics step [s]."""
+    poses: bool = True
+    """After the verdict, refit the vehicle to whole poses."""
     thresholds: Thresholds = field(default_factory=Thresholds)
     """When something counts as found."""
 
@@ -82,12 +84,14 @@ class Result:
     @cached_property
     def before(self) -> Any:
         """The base model fitted to these drives."""
-        return refit_poses(self, vehicle_before(self))
+        return refit_poses(self, vehicle_before(self)) if self.config.poses else vehicle_before(self)
 
     @cached_property
     def after(self) -> Any:
         """The vehicle with the accepted effects, fitted to these drives."""
-        return refit_poses(self, vehicle_after(self)) if self.search.verdict == "named" else self.before
+        if self.search.verdict != "named":
+            return self.before
+        return refit_poses(self, vehicle_after(self)) if self.config.poses else vehicle_after(self)
 
 
 def close_loop(

@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.close_loop import LoopConfig, close_loop, vehicle_after
+from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after, vehicle_before
 from sysid.log import load_log
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_whitener, replicate_groups
-from sysid.loop.report import make_report, write_run
+from sysid.loop.report import make_report, replay, write_run
+from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
 from sysid.synthetic import write_dataset
 from whill_mjx.config import VehicleConfig
@@ -23,7 +24,7 @@ from whill_mjx.types import VehicleParams
 from whill_mjx.vehicle_file import load_vehicle
 
 DRIVES = ("straight", "circle", "s_curve")
-CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200)
+CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200, poses=False)
 
 
 def day(seed):
@@ -89,6 +90,18 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
     assert provenance["verdict"] == "named"
     assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_refit_to_poses_lowers_the_training_error(drives, sloping):
+    few = replace(drives["plain"], trials=drives["plain"].training[::3])
+    plain = replace(sloping, log=few, search=replace(sloping.search, verdict="none"))
+
+    def error(vehicle):
+        pairs = zip(few.trials, replay(plain, vehicle, few.trials), strict=True)
+        return np.mean([score(trial, prediction)["ground_truth"].trajectory for trial, prediction in pairs])
+
+    before = vehicle_before(plain)
+    assert error(refit_poses(plain, before, iterations=4)) < error(before)
 
 
 def test_held_out_trials_cannot_change_the_verdict(drives, sloping):
