@@ -66,5 +66,6 @@ def save_drives(path: Path, episodes: Episodes) -> None:
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         arrays: dict[str, Any] = {"trace": episodes.trace, "length": episodes.length, "channels": np.array(CHANNELS)}
-        np.savez_compressed(file, **arrays, **episodes.ends)
+        arrays.update(episodes.ends)
+        np.savez_compressed(file, **arrays)
     os.replace(temporary, path)

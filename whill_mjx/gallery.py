@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +45,8 @@ def gallery() -> Scene:
     marker = Marker(jnp.array([8.9, 0.3, 1.05]), half, jnp.zeros(()), blue)
     solids = Solids(stack_blocks([part for *_, part in blocks]), rounds)
     scene = Scene(stack_boxes([part for *_, part in boxes]), marker, default_looks(), solids)
-    named = [("plain", 1.0), ("tiles", 0.6), ("plain", 1.0), *((name, scale) for name, scale, _ in boxes + blocks)]
+    named: list[tuple[Any, float]] = [("plain", 1.0), ("tiles", 0.6), ("plain", 1.0)]
+    named += [(name, scale) for name, scale, _ in boxes + blocks]
     labels = label_count(scene)
     named += [("plain", 1.0)] * (labels - len(named))
     numbers = [name if isinstance(name, int) else texture_number(name) for name, _ in named]

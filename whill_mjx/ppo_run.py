@@ -70,7 +70,7 @@ def train_ppo(
 
 def _line(metrics: dict[str, Any], env_steps: int, updates: int) -> dict[str, float]:
     """Sums over ended episodes as means."""
-    line = {"env_steps": env_steps, "updates": updates}
+    line: dict[str, float] = {"env_steps": env_steps, "updates": updates}
     episodes = float(metrics["episodes"])
     for name, value in metrics.items():
         if not name.startswith("episode/"):

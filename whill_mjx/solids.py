@@ -41,8 +41,8 @@ class Solids:
 
 def block(centre, half, rotation, colour) -> Blocks:
     """One box of any rotation."""
-    leaves = (jnp.asarray(value, jnp.float32)[None] for value in (centre, half, rotation, colour))
-    return Blocks(*leaves, mask=jnp.ones(1, bool))
+    leaves = [jnp.asarray(value, jnp.float32)[None] for value in (centre, half, rotation, colour)]
+    return Blocks(leaves[0], leaves[1], leaves[2], leaves[3], mask=jnp.ones(1, bool))
 
 
 def rod(start, end, radius, colour, capsule: bool = True) -> Rounds:
