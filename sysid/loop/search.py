@@ -33,8 +33,10 @@ class Thresholds:
     days differ by among themselves."""
     missing: float = 0.15
     """Excess above which something is missing even where no hypothesis gains."""
-    second: float = 0.1
-    """Least gain of a further effect, as a share of the first one's."""
+    second: float = 0.25
+    """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
+    step: float = 0.15
+    """Least further share of the excess that it explains."""
     rounds: int = 3
     worthwhile: float = 0.15
     """Least scanned gain of an effect that is refitted, as a share of the best one's."""
@@ -150,7 +152,7 @@ def _decide(found: Search, thresholds: Thresholds) -> None:
         shares = [found.accepted[0].share]
         keep = [found.accepted[0]]
         for one in found.accepted[1:]:
-            if one.share - shares[-1] > 0.1:
+            if one.share - shares[-1] > thresholds.step:
                 keep.append(one)
             shares.append(one.share)
         found.accepted, found.classes = keep, found.classes[: len(keep)]
