@@ -135,27 +135,26 @@ def search(
         current = best.refit
         if excess(current) < thresholds.excess:
             break
-    found.final = current
-    found.excess = (excess(base), excess(current))
-    found.share = explained(current)
-    _decide(found, thresholds)
+    _decide(found, thresholds, excess)
     return found
 
 
-def _decide(found: Search, thresholds: Thresholds) -> None:
-    before, after = found.excess
-    if not found.accepted and before < thresholds.missing:
+def _decide(found: Search, thresholds: Thresholds, excess: Callable[[Refit], float]) -> None:
+    """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one."""
+    keep = found.accepted[:1]
+    for one in found.accepted[1:]:
+        if one.share - keep[-1].share <= thresholds.step:
+            break  # what came after was fitted beside it
+        keep.append(one)
+    found.accepted, found.classes = keep, found.classes[: len(keep)]
+    if keep:
+        found.final, found.share = keep[-1].refit, keep[-1].share
+    before, after = excess(found.base), excess(found.final)
+    found.excess = (before, after)
+    if not keep and before < thresholds.missing:
         found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif found.accepted and (found.share >= thresholds.share or after < thresholds.excess):
+    elif keep and (found.share >= thresholds.share or after < thresholds.excess):
         found.verdict = "named"
-        # An effect is kept for its own sake, not to mend the form of another one.
-        shares = [found.accepted[0].share]
-        keep = [found.accepted[0]]
-        for one in found.accepted[1:]:
-            if one.share - shares[-1] > thresholds.step:
-                keep.append(one)
-            shares.append(one.share)
-        found.accepted, found.classes = keep, found.classes[: len(keep)]
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
     else:
         found.verdict = "unexplained"
