@@ -23,6 +23,7 @@ single times.
 | `python -m benchmarks.learner` | DreamerV3 updates/s |
 | `python -m benchmarks.course` | trainings of the obstacle course, every seed; the ground-truth planner |
 | `python -m benchmarks.fit` | fits against planted truth, contact-plant logs and measured robots |
+| `python -m benchmarks.undeclared` | verdicts of the closed loop on logs with effects that nobody declared |
 | `python -m benchmarks.bridge` | latencies, stops and losses of the ROS 2 bridge |
 
 All run on a CPU as well, in smaller sizes. The logs of measured robots are other people's: the script reads them from
@@ -36,6 +37,7 @@ TITLES = {
     "course": "Obstacle course",
     "fit": "Fit: planted truth and contact-plant logs",
     "measured": "Fit: measured robots",
+    "undeclared": "Undeclared effects: logs of the contact plant",
     "bridge": "Bridge",
 }
 PICTURES = "course_*.png"
@@ -68,7 +70,37 @@ def table(content: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def number(value: float) -> str:
+def confusion(cases: list[dict[str, Any]]) -> str:
+    """Every log of the contact plant: what was in it and what was said."""
+    rows = ["| in the log | size | verdict | named | cannot be told from | explained |", "|---|---|---|---|---|---|"]
+    for case in cases:
+        inside = ", ".join(case["truth"]) or "nothing"
+        sizes = ", ".join(number(size) for size in case["truth"].values())
+        others = ", ".join(name for each in case["classes"] for name in each[1:])
+        rows.append(f"| {inside} | {sizes} | {case['verdict']} | {', '.join(case['named'])} | {others} | "
+                    f"{case['explained']:.0%} |")
+    return "\n".join(rows)
+
+
+def verdicts(content: dict[str, Any]) -> str:
+    """The undeclared sets: verdict, effect, values, held-out error before and after."""
+    rows = ["| set | verdict | effect | class | values | held-out trajectory before, after, replicates [m] |",
+            "|---|---|---|---|---|---|"]
+    for name, one in sorted(content["sets"].items()):
+        channel = "ground_truth" if "ground_truth" in one["before"]["held_out"] else "odometry"
+        before, after = (one[key]["held_out"].get(channel, {}) for key in ("before", "after"))
+        floor = (before.get("noise_floor") or {}).get("trajectory")
+        values = ", ".join(f"{key} = {number(p['value'])} {p['unit']}" for each in one["effects"]
+                           for key, p in each["parameters"].items())
+        rows.append(f"| {name} | {one['verdict']} | {', '.join(each['name'] for each in one['effects'])} | "
+                    f"{', '.join(member for each in one['effects'] for member in each['class'])} | {values} | "
+                    f"{number(before.get('trajectory'))}, {number(after.get('trajectory'))}, {number(floor)} |")
+    made = f"Made by `{content['command']}` at {content['commit'][:7]}, {content['device']}."
+    title = "## Undeclared effects: eight sets whose contents are not known here"
+    return "\n".join([title, content["claim"] + ".", "", *rows, "", made, ""])
+
+
+def number(value: float | None) -> str:
     """Four significant digits; thousands separated."""
     if value is None:
         return "-"
@@ -89,6 +121,11 @@ def page(results: Path) -> str:
             parts.append(f"## {title}\n{content['claim']}.\n\n{table(content)}\n\n{made}\n")
             if stem == "course":
                 parts += [f"![{picture.stem}](results/{picture.name})\n" for picture in sorted(results.glob(PICTURES))]
+            if "confusion" in content:
+                parts.append(confusion(content["confusion"]) + "\n")
+    shared = results / "undeclared_shared.json"
+    if shared.exists():
+        parts.append(verdicts(json.loads(shared.read_text())))
     return "\n".join(parts)
 
 
