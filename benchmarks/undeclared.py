@@ -57,6 +57,8 @@ class Benchmark:
     """Logs of each effect and size."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
+    collect: bool = False
+    """Only write the figures from the verdicts that are there."""
     work: Path = Path("runs/undeclared")
     """Folder for logs and verdicts."""
     part: str = "1/1"
@@ -71,6 +73,8 @@ def main(settings: Benchmark) -> None:
         plant(settings)
     if settings.classes:
         look_alikes(settings)
+    if settings.collect:
+        figures(settings.work / "plant")
 
 
 def shared(settings: Benchmark) -> None:
