@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_mesh
 
 from whill_mjx.finish import label_count, make_atlas, plain_finish
 from whill_mjx.render import Quality, camera_rotation, pinhole, render
@@ -95,7 +96,9 @@ def test_a_batch_of_kernels_equals_single_ones_and_bad_poses_are_black():
 def test_kernel_lowers_for_cuda(scene, quality):
     scenes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((4, *leaf.shape), leaf.dtype), scene)
     draw = jax.jit(jax.vmap(lambda s: render_pallas(EYE, TURN, DISTORTED, s, 32, 32, quality)))
-    assert "triton" in draw.trace(scenes).lower(lowering_platforms=("cuda",)).as_text()
+    device = AbstractDevice("NVIDIA H200", None, "cuda")  # newer versions of JAX ask for one
+    with use_abstract_mesh(AbstractMesh((1,), ("one",), (AxisType.Auto,), abstract_device=device)):
+        assert "triton" in draw.trace(scenes).lower(lowering_platforms=("cuda",)).as_text()
 
 
 @pytest.mark.quick
