@@ -81,6 +81,14 @@ def to_host(leaf: jax.Array) -> np.ndarray:
     return np.asarray(multihost_utils.process_allgather(leaf, tiled=True))
 
 
+def wait_for_all(what: str) -> None:
+    """Return when every process has come here; at once where there is only one."""
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices(what)
+
+
 def agree(flag: bool) -> bool:
     """The first process's answer, on all of them: decisions by the clock must not differ."""
     if jax.process_count() == 1:

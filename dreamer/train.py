@@ -194,7 +194,9 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     rows = state.replay.reward.shape[0]
     used = max(1, min(rows, int(state.replay.written)))
     folder = out / "checkpoints"
-    return checkpoint.save(folder, state, config, int(state.env_steps), wall_s, rows=("replay.", used, rows))
+    path = checkpoint.save(folder, state, config, int(state.env_steps), wall_s, rows=("replay.", used, rows))
+    parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
+    return path
 
 
 def _first_state(
