@@ -5,7 +5,10 @@ The two pictures of each scene are saved side by side; see `SHEET`.
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -22,27 +25,24 @@ SHEET = Path(os.environ.get("CONTACT_SHEET", Path(tempfile.gettempdir()) / "came
 SIZE = 160
 FOV = 1.1
 EYE = np.array([0.1, -0.2, 1.0])
-LEVEL, TILTED = camera_rotation(0.05, 0.15), camera_rotation(-0.1, 0.25, 0.3)
+ROTATIONS = {"level": camera_rotation(0.05, 0.15), "tilted": camera_rotation(-0.1, 0.25, 0.3)}
+KINDS = ("upright", "blocks", "cylinders", "capsules")
 
 
 @pytest.fixture(scope="module")
-def renderer_of():
-    """Function that gives MuJoCo's renderer of a model, or skips where it has no OpenGL."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    import mujoco
-
-    made = []
-
-    def make(model):
-        try:
-            made.append(mujoco.Renderer(model, SIZE, SIZE))
-        except Exception as error:  # a missing library shows in many ways
-            pytest.skip(f"MuJoCo cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
-        return made[-1]
-
-    yield make
-    for renderer in made:
-        renderer.close()
+def mujoco_frames(tmp_path_factory):
+    """MuJoCo's pictures of all cases, drawn by a process of its own: a missing or unlucky OpenGL may end it."""
+    folder = tmp_path_factory.mktemp("mujoco")
+    cases = {f"{kind} {pose}": {"xml": scene_and_xml(kind)[1], "rotation": np.asarray(ROTATIONS[pose]).tolist()}
+             for kind in KINDS for pose in ROTATIONS}
+    (folder / "cases.json").write_text(json.dumps(cases))
+    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+    answer = subprocess.run([sys.executable, __file__, folder / "cases.json", folder / "frames.npz"], env=environment,
+                            capture_output=True, text=True)
+    if answer.returncode != 0:
+        last = (answer.stderr.strip().splitlines() or ["no message"])[-1]
+        pytest.skip(f"MuJoCo cannot render with MUJOCO_GL={environment['MUJOCO_GL']}: {last}")
+    return np.load(folder / "frames.npz")
 
 
 def rotations(key, count):
@@ -87,7 +87,7 @@ def scene_and_xml(kind):
     return Scene(boxes, marker, default_looks(), solids), xml
 
 
-def mujoco_frame(renderer_of, xml, rotation):
+def mujoco_frame(xml, rotation):
     """Image, depth and geom numbers (-1: nothing) of a camera at EYE."""
     import mujoco
 
@@ -95,20 +95,20 @@ def mujoco_frame(renderer_of, xml, rotation):
     model.vis.global_.fovy = np.rad2deg(FOV)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = renderer_of(model)
-    renderer.update_scene(data)
-    forward, up = np.asarray(rotation)[:, 2], -np.asarray(rotation)[:, 1]
-    for camera in renderer.scene.camera:
-        camera.pos, camera.forward, camera.up = EYE, forward, up
-        near, high = 0.01, 0.01 * np.tan(FOV / 2)
-        camera.frustum_bottom, camera.frustum_top = -high, high
-        camera.frustum_center, camera.frustum_width, camera.frustum_near, camera.frustum_far = 0.0, high, near, 60.0
-    image = renderer.render().copy()
-    renderer.enable_depth_rendering()
-    depth = renderer.render().copy()
-    renderer.disable_depth_rendering()
-    renderer.enable_segmentation_rendering()
-    return image, depth, renderer.render()[..., 0].copy()
+    with mujoco.Renderer(model, SIZE, SIZE) as renderer:
+        renderer.update_scene(data)
+        forward, up = np.asarray(rotation)[:, 2], -np.asarray(rotation)[:, 1]
+        for camera in renderer.scene.camera:
+            camera.pos, camera.forward, camera.up = EYE, forward, up
+            near, high = 0.01, 0.01 * np.tan(FOV / 2)
+            camera.frustum_bottom, camera.frustum_top = -high, high
+            camera.frustum_center, camera.frustum_width, camera.frustum_near, camera.frustum_far = 0.0, high, near, 60.0
+        image = renderer.render().copy()
+        renderer.enable_depth_rendering()
+        depth = renderer.render().copy()
+        renderer.disable_depth_rendering()
+        renderer.enable_segmentation_rendering()
+        return image, depth, renderer.render()[..., 0].copy()
 
 
 def within_a_pixel(one, other):
@@ -123,12 +123,12 @@ def within_a_pixel(one, other):
 PICTURES: dict[str, np.ndarray] = {}
 
 
-@pytest.mark.parametrize("pose", ["level", "tilted"])
-@pytest.mark.parametrize("kind", ["upright", "blocks", "cylinders", "capsules"])
-def test_silhouettes_and_depth_are_those_of_mujoco(renderer_of, kind, pose):
-    rotation = LEVEL if pose == "level" else TILTED
-    scene, xml = scene_and_xml(kind)
-    picture, depth, geom = mujoco_frame(renderer_of, xml, rotation)
+@pytest.mark.parametrize("pose", list(ROTATIONS))
+@pytest.mark.parametrize("kind", KINDS)
+def test_silhouettes_and_depth_are_those_of_mujoco(mujoco_frames, kind, pose):
+    rotation = ROTATIONS[pose]
+    scene, _ = scene_and_xml(kind)
+    picture, depth, geom = (mujoco_frames[f"{kind} {pose} {what}"] for what in ("image", "depth", "geom"))
     draw = jax.jit(lambda s, turn: render_frame(jnp.asarray(EYE), turn, pinhole(FOV, SIZE, SIZE), s, SIZE, SIZE))
     frame = draw(scene, rotation)
     PICTURES[f"{kind} {pose}"] = np.hstack([np.asarray(frame.rgb), picture])
@@ -153,3 +153,16 @@ def test_contact_sheet_of_both_renderers_is_saved():
 
     rows = [np.hstack(list(PICTURES.values())[i : i + 2]) for i in range(0, len(PICTURES) - 1, 2)]
     assert cv2.imwrite(str(SHEET), np.vstack(rows)[..., ::-1]) and SHEET.stat().st_size > 10_000
+
+
+def draw_all(cases, out):
+    """Draw the cases of a JSON file into an npz file."""
+    frames = {}
+    for name, case in json.loads(Path(cases).read_text()).items():
+        drawn = mujoco_frame(case["xml"], np.array(case["rotation"]))
+        frames.update({f"{name} {what}": array for what, array in zip(("image", "depth", "geom"), drawn, strict=True)})
+    np.savez(out, **frames)
+
+
+if __name__ == "__main__":
+    draw_all(*sys.argv[1:])
