@@ -27,6 +27,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
+from sysid import command_line
 from sysid.log import Log
 from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.drives import make_drives
@@ -245,7 +246,7 @@ def run(log: Log, references: Sequence[Log], out: Path, config: LoopConfig, vehi
     """Close the loop with a progress bar, open the held-out trials, write the folder `out` and print the verdict."""
     from sysid.loop.report import make_report, summary, write_run
 
-    progress, close = progress_bar(expected_steps(config))
+    progress, close = command_line.progress_bar(expected_steps(config), "close the loop", "step")
     try:
         result = close_loop(log, references, config, vehicle, progress)
     finally:
@@ -255,19 +256,6 @@ def run(log: Log, references: Sequence[Log], out: Path, config: LoopConfig, vehi
     print(summary(report))
     print(f"wrote report.json, report.html and vehicle.toml into {out}")
     return report
-
-
-def progress_bar(total: int) -> tuple[Progress, Callable[[], None]]:
-    """A bar with the stage, rate and remaining time, and the function that closes it."""
-    from tqdm import tqdm
-
-    bar: Any = tqdm(total=total, desc="close the loop", unit="step")
-
-    def advance(count: int, remark: str) -> None:
-        bar.set_postfix_str(remark, refresh=False)
-        bar.update(min(count, max(bar.total - bar.n, 0)))
-
-    return advance, bar.close
 
 
 def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:
@@ -283,16 +271,8 @@ def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Referen
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import sys
-
-    import tyro
-
-    arguments = tyro.cli(Arguments, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(arguments)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(Arguments, main, __doc__)
 
 
 if __name__ == "__main__":

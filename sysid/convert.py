@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 
+from sysid import command_line
 from sysid.log import Log, Trial, load_log
 from sysid.rosbag import Bag, find_bags, read_bag, stream_times
 from whill_mjx.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -321,14 +321,8 @@ def main(config: ConvertConfig) -> Log:
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import tyro
-
-    config = tyro.cli(ConvertConfig, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(config)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(ConvertConfig, main, __doc__)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ Residuals of driving logs are autocorrelated: information is divided by INFLATIO
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sysid import command_line
 from sysid.candidates import Candidate, Limits, as_trial, library, placement
 from sysid.log import Command
 from sysid.objective import DEFAULT_NOISE, Noise, Objective
@@ -347,14 +347,8 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import tyro
-
-    config = tyro.cli(DesignConfig, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(config)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(DesignConfig, main, __doc__)
 
 
 if __name__ == "__main__":

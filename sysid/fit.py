@@ -7,7 +7,6 @@ Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +14,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from sysid import gradient, tpe, uncertainty
+from sysid import command_line, gradient, tpe, uncertainty
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -284,19 +283,6 @@ def _keep_channels(trial: Trial, channels: str) -> Trial:
     return trial
 
 
-def progress_bar(total: int) -> tuple[Progress, Callable[[], None]]:
-    """A bar with rate and remaining time, and the function that closes it."""
-    from tqdm import tqdm
-
-    bar: Any = tqdm(total=total, desc="fit", unit="eval")
-
-    def advance(count: int, remark: str) -> None:
-        bar.set_postfix_str(remark, refresh=False)
-        bar.update(min(count, max(bar.total - bar.n, 0)))
-
-    return advance, bar.close
-
-
 def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes at most."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
@@ -334,7 +320,7 @@ def main(arguments: Arguments) -> None:
     log = load_any(dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
     for note in log.notes:
         print(note)
-    progress, close = progress_bar(expected_steps(settings))
+    progress, close = command_line.progress_bar(expected_steps(settings))
     try:
         report = fit_dataset(dataset, arguments.out, config=settings, log=log, progress=progress,
                              source={"train": arguments.train, "held_out_selection": arguments.held_out})
@@ -353,16 +339,8 @@ def main(arguments: Arguments) -> None:
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import sys
-
-    import tyro
-
-    arguments = tyro.cli(Arguments, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(arguments)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(Arguments, main, __doc__)
 
 
 if __name__ == "__main__":

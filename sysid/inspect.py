@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sysid import command_line
 from sysid.coverage import blind_spots, excitation, replicate_spread, sanity
 from sysid.log import Log, load_log
 from sysid.measured import detect_format, drive_spec, load_drive, load_mrclam, split
@@ -235,14 +236,8 @@ def main(config: InspectConfig) -> dict[str, Any]:
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import tyro
-
-    config = tyro.cli(InspectConfig, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(config)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(InspectConfig, main, __doc__)
 
 
 if __name__ == "__main__":

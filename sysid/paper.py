@@ -9,7 +9,6 @@ simulator's jitter.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sysid.fit import FitConfig, fit_log, predict, progress_bar
+from sysid import command_line
+from sysid.fit import FitConfig, fit_log, predict
 from sysid.html import Cell, Section, charts, html_page, legend, paragraph, png, table
 from sysid.log import Log
 from sysid.measured import load_any
@@ -250,7 +250,7 @@ def _p(value: float | None) -> str:
 def main(config: PaperConfig) -> dict[str, Any]:
     """Load, fit, write and print the table."""
     log = load_any(config.dataset)
-    progress, close = progress_bar(config.trials)
+    progress, close = command_line.progress_bar(config.trials)
     try:
         content, (fit, series) = run(log, config, progress)
     finally:
@@ -263,14 +263,8 @@ def main(config: PaperConfig) -> dict[str, Any]:
 
 
 def cli() -> None:
-    """Command line: errors in the input end with one line, not a traceback."""
-    import tyro
-
-    config = tyro.cli(PaperConfig, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(config)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(PaperConfig, main, __doc__)
 
 
 if __name__ == "__main__":

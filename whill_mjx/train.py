@@ -180,7 +180,8 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
-    from sysid.fit import FitConfig, expected_steps, fit_dataset, progress_bar
+    from sysid.command_line import progress_bar
+    from sysid.fit import FitConfig, expected_steps, fit_dataset
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
