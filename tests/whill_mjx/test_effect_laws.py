@@ -1,0 +1,375 @@
+"""The law of each effect of the catalogue: its own equation, in hand-made motions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from effects_in_hand import DT, WEIGHT, chair, motion_at, path, quick, reading, run, signal, step_command, still
+
+from whill_mjx.effects import make_effect
+from whill_mjx.effects.command_quantisation import MAKER
+from whill_mjx.effects.gyro_range import MAKER as GYRO
+from whill_mjx.specs import HUSKY
+from whill_mjx.types import Drive, Payload
+from whill_mjx.vehicle import add_payload, measure, nominal_world, place
+
+# Commands
+
+
+@quick
+@pytest.mark.parametrize(("sent", "heard"), [(0.03, 0.0), (-0.03, 0.0), (0.061, 0.061), (-0.5, -0.5), (0.0, 0.0)])
+def test_a_dead_zone_loses_small_commands_and_leaves_large_ones(sent, heard):
+    _, command = make_effect("command_dead_zone", linear=0.05).command((), jnp.array([sent, 0.02]), still())
+    np.testing.assert_array_equal(command, np.float32([heard, 0.02]))
+
+
+@quick
+def test_a_jerk_limit_makes_an_s_shaped_ramp_of_the_expected_time():
+    """From 0 to 1 m/s at 10 m/s^3: 2 sqrt(1 / 10) = 0.63 s, with at most sqrt(10) m/s^2 halfway."""
+    v = np.asarray(run(make_effect("jerk_limit", linear=10.0), step_command(1.0)))[:, 0]
+    acceleration = np.diff(v, prepend=0.0) / DT
+    assert abs(np.argmax(v > 0.999) * DT - 0.63) < 0.05
+    assert v.max() < 1.002 and v[-1] == 1.0
+    np.testing.assert_allclose(acceleration.max(), np.sqrt(10), rtol=0.05)
+    assert np.abs(np.diff(acceleration)).max() / DT < 10.1
+    np.testing.assert_allclose(v[np.argmax(acceleration)], 0.5, atol=0.05)
+
+
+@quick
+def test_command_scale_multiplies_each_component():
+    _, command = make_effect("command_scale", linear=1.1, angular=0.8).command((), jnp.array([0.5, -0.5]), still())
+    np.testing.assert_allclose(command, [0.55, -0.4], rtol=1e-6)
+
+
+@quick
+@pytest.mark.parametrize(
+    ("sent", "words"), [((0.0123, 0.0123), (11, 5)), ((-0.0123, -0.0123), (-11, -5)), ((0.0011, -0.0022), (0, 0))]
+)
+def test_quantisation_truncates_towards_zero(sent, words):
+    effect = make_effect("command_quantisation", **MAKER)
+    _, command = effect.command((), jnp.array(sent), still())
+    np.testing.assert_allclose(command, np.array(words) * [1.1111e-3, 2.2401e-3], rtol=1e-4, atol=1e-9)
+
+
+@quick
+def test_quantisation_clamps_at_the_limits_of_the_chair():
+    effect = make_effect("command_quantisation", **MAKER)
+    fast, slow = (effect.command((), jnp.array(sent), still())[1] for sent in ((2.0, 2.0), (-2.0, -2.0)))
+    np.testing.assert_allclose(fast, [1.667, 1.68], atol=2.3e-3)
+    np.testing.assert_allclose(slow, [-0.556, -1.68], atol=2.3e-3)
+
+
+def expiry(commands, **values):
+    return np.asarray(run(make_effect("command_expiry", **values), jnp.asarray(commands)))[:, 0]
+
+
+@quick
+def test_a_command_lapses_200_ms_after_the_last_packet():
+    """A sender that repeats itself every 0.5 s moves the vehicle for 0.2 s of each; a new command starts at once."""
+    heard = expiry(step_command(1.0, steps=260).at[210:].set(0.5), validity=0.2, resend=0.5)
+    on = np.flatnonzero(heard)
+    np.testing.assert_allclose([on[0], on[40], on[80]], [0, 100, 200])
+    assert (heard[:100] > 0).sum() * DT == 0.2
+    np.testing.assert_array_equal(heard[210:250], 0.5)
+
+
+@quick
+def test_a_command_that_is_repeated_in_time_never_lapses():
+    np.testing.assert_array_equal(expiry(step_command(1.0, steps=400), validity=0.2, resend=0.1), 1.0)
+
+
+@quick
+def test_lost_packets_leave_gaps_and_the_expected_share():
+    """Packets 0.1 s apart, valid for 0.05 s: each lost one is a gap, the same ones every time."""
+    commands = step_command(1.0, steps=20 * 2000)
+    heard = expiry(commands, validity=0.09, resend=0.1, loss=0.3)
+    lost = (heard.reshape(2000, 20)[:, 1] == 0).mean()
+    assert 0.27 < lost < 0.33
+    np.testing.assert_array_equal(heard, expiry(commands, validity=0.09, resend=0.1, loss=0.3))
+
+
+# Drive; each law holds for the force of the paper's drive and for the torque of the physical one
+
+
+def both(effect, force, motion=None):
+    """What comes out for a force, and for the torque of that force at the wheel, as a force again."""
+    motion = motion or still()
+    radius = motion.wheel_radius
+    force = np.asarray(force)
+    _, pushed = effect.actuation(effect.init(), signal(force=force), motion)
+    _, turned = effect.actuation(effect.init(), signal(torque=force * radius), motion)
+    np.testing.assert_allclose(turned.torque / radius, pushed.force, rtol=1e-4)
+    return np.asarray(pushed.force)
+
+
+@quick
+def test_actuator_lag_reaches_63_percent_after_its_time_constant():
+    drives = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (40, 2)), signal((100.0, -50.0), (10.0, 5.0)))
+    lagged = run(make_effect("actuator_lag", time_constant=0.1), drives)
+    np.testing.assert_allclose(lagged.force[19] / drives.force[19], 1 - np.exp(-1), atol=0.02)
+    np.testing.assert_allclose(lagged.torque[19] / drives.torque[19], 1 - np.exp(-1), atol=0.02)
+
+
+@quick
+def test_saturation_limits_each_side():
+    effect = make_effect("torque_saturation", limit=80.0)
+    np.testing.assert_allclose(both(effect, [1000.0, -1000.0]), [80.0, -80.0], rtol=1e-3)
+    np.testing.assert_allclose(both(effect, [20.0, -10.0]), [20.0, -10.0], rtol=2e-3)
+
+
+@quick
+def test_traction_limit_is_the_grip_of_the_driven_wheels():
+    motion = still()
+    load = float(motion.normal_force[:2].sum())
+    effect = make_effect("traction_limit", mu=0.3)
+    np.testing.assert_allclose(both(effect, [5e3, 5e3]).sum(), 0.3 * load, rtol=1e-3)
+    np.testing.assert_allclose(both(effect, [5.0, -5.0]), [5.0, -5.0], rtol=2e-3)
+
+
+@quick
+def test_traction_limit_counts_all_wheels_of_a_skid_drive():
+    forces = both(make_effect("traction_limit", mu=0.3), [5e4, 5e4], motion_at(name="husky"))
+    np.testing.assert_allclose(forces.sum(), 0.3 * HUSKY.mass * 9.81, rtol=0.02)
+
+
+@quick
+def test_supply_sags_with_time():
+    drives = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2001, 2)), signal((100.0, -50.0), (10.0, 5.0)))
+    weak = run(make_effect("supply_sag", per_second=0.01), drives)
+    np.testing.assert_array_equal(weak.force[0], drives.force[0])
+    np.testing.assert_allclose(weak.force[-1], drives.force[-1] / 1.1, rtol=1e-3)
+    np.testing.assert_allclose(weak.torque[-1], drives.torque[-1] / 1.1, rtol=1e-3)
+
+
+@quick
+@pytest.mark.parametrize(("v", "gain"), [(1.0, 1 / 1.2), (-1.0, 1.0), (0.0, 1.0)])
+def test_supply_sags_with_the_power_drawn_and_not_with_power_fed_back(v, gain):
+    """Two sides of 100 N at 1 m/s are 200 W."""
+    forces = both(make_effect("supply_sag", per_watt=0.001), [100.0, 100.0], motion_at(v))
+    np.testing.assert_allclose(forces, 100.0 * gain, rtol=1e-3)
+
+
+@quick
+def test_a_gain_difference_strengthens_the_left_drive():
+    np.testing.assert_allclose(both(make_effect("drive_gain_difference", difference=0.1), [100.0, 100.0]), [105, 95])
+
+
+@quick
+def test_backlash_loses_a_reversal_for_the_time_to_cross_the_gap():
+    """sqrt(4 beta I / T): 0.05 rad, 0.02 kg m^2 and 4 N m give 32 ms."""
+    torque = jnp.concatenate([jnp.full((40, 2), 4.0), jnp.full((40, 2), -4.0)])
+    drives = Drive(jnp.zeros_like(torque), jnp.zeros_like(torque), torque)
+    passed = np.asarray(run(make_effect("backlash", play=0.05), drives).torque)[:, 0]
+    np.testing.assert_allclose(passed[39], 4.0, rtol=1e-3)
+    np.testing.assert_allclose(passed[-1], -4.0, rtol=1e-3)
+    lost = (1 - np.abs(passed[40:]) / 4.0).sum() * DT
+    assert abs(lost - np.sqrt(4 * 0.05 * 0.02 / 4)) < 2 * DT
+    assert passed[40:].max() == 0.0 and np.abs(passed[40:44]).max() == 0.0
+
+
+# World
+
+
+@quick
+def test_one_smaller_wheel_rolls_slower_and_the_nominal_radius_stays():
+    model, params = chair()
+    _, world = make_effect("wheel_radius_difference", difference=0.02, common=-0.01).world((), nominal_world(model))
+    np.testing.assert_allclose(world.geometry.wheel_radius, [0.1325, 0.1325 * 0.98], rtol=1e-6)
+    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, 0.5))
+    assert motion.wheel_radius == 0.1325
+    _, wrench = make_effect("rolling_contact", grip=1.0).force((), motion)
+    spin = motion.spin + wrench.spin_torque * DT / motion.wheel_inertia
+    np.testing.assert_allclose(spin, [0.5 / 0.1325, 0.5 / 0.1325 / 0.98], rtol=1e-4)
+
+
+@quick
+def test_a_wider_track_turns_the_wheels_faster_for_the_same_yaw_rate():
+    model, params = chair()
+    _, world = make_effect("track_width", error=0.05).world((), nominal_world(model))
+    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(motion.contact_vx[1] - motion.contact_vx[0], 0.496 * 1.05, rtol=1e-3)
+    assert motion.track == 0.496
+
+
+@quick
+@pytest.mark.parametrize(("name", "free"), [("whill_cr", 0.248), ("husky", 0.275 / 0.8)])
+def test_turn_efficiency_moves_the_driven_contacts_out(name, free):
+    model, _ = chair(name)
+    _, world = make_effect("turn_efficiency", efficiency=0.8).world((), nominal_world(model))
+    driven = model.spec.track / 2 / 0.8
+    np.testing.assert_allclose(world.geometry.contact_y, [driven, -driven, free, -free], rtol=1e-6)
+
+
+@quick
+def test_a_payload_adds_its_mass_and_inertia_about_the_common_centre():
+    """52 kg at the origin and 13 kg 0.5 m ahead: centre at 0.1 m; I_z grows by 52 x 0.1^2 + 13 x 0.4^2."""
+    payload = Payload(*(jnp.array(value) for value in (13.0, 0.5, 0.0, 0.0)))
+    mass, inertia, com = add_payload(jnp.array(52.0), jnp.array([5.0, 6.0, 7.0]), jnp.zeros(3), payload)
+    np.testing.assert_allclose(mass, 65.0)
+    np.testing.assert_allclose(com, [0.1, 0.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(inertia, [5.0, 6.0 + 2.6, 7.0 + 2.6], rtol=1e-6)
+
+
+@quick
+def test_a_slope_pulls_downhill_with_the_whole_weight():
+    _, world = make_effect("slope", along_x=0.05, along_y=-0.02).world((), nominal_world(chair()[0]))
+    np.testing.assert_allclose(np.linalg.norm(world.gravity), 9.81, rtol=1e-6)
+    np.testing.assert_allclose(world.gravity[:2], [-9.81 * np.sin(0.05), 9.81 * np.sin(0.02)], rtol=1e-5)
+
+
+# Forces
+
+
+@quick
+@pytest.mark.parametrize(("v", "expected"), [(0.5, -16.0), (-0.5, 16.0), (0.0, 0.0), (0.05, -(16 + 8 * np.exp(-1)))])
+def test_dry_friction_opposes_motion_and_is_larger_near_rest(v, expected):
+    effect = make_effect("dry_friction", coulomb=8.0, excess=4.0, stribeck_speed=0.05)
+    _, wrench = effect.force((), motion_at(v))
+    np.testing.assert_allclose(wrench.fx, expected, rtol=0.02, atol=1e-3)
+
+
+@quick
+def test_dry_friction_resists_turning_at_the_arm_of_the_driven_wheels():
+    _, wrench = make_effect("dry_friction", coulomb=8.0).force((), motion_at(omega=1.0))
+    np.testing.assert_allclose(wrench.tz, -2 * 8 * 0.248, rtol=1e-3)
+    np.testing.assert_allclose(wrench.fx, 0.0, atol=1e-3)
+
+
+@quick
+def test_omni_rollers_resist_sideways_motion_of_the_free_wheels_only():
+    motion = motion_at(sideways=0.3)
+    _, wrench = make_effect("omni_roller_friction", mu_t=0.05, viscous=10.0).force((), motion)
+    np.testing.assert_allclose(wrench.fy, -0.05 * motion.normal_force[2:].sum() - 2 * 10 * 0.3, rtol=1e-3)
+    _, none = make_effect("omni_roller_friction", mu_t=0.05).force((), motion_at(sideways=0.3, name="husky"))
+    np.testing.assert_allclose(none.fy, 0.0)
+
+
+def kick(v, path_length, **values):
+    """Swivel angle of a caster, and the sideways force, along a straight drive at v."""
+    effect, motion = make_effect("caster_kick", force_limit=10.0, trail=0.15, **values), motion_at(v)
+
+    def one(memory, _):
+        memory, wrench = effect.force(memory, motion)
+        return memory, (memory[2], wrench.fy)
+
+    return [np.asarray(out) for out in jax.lax.scan(one, effect.init(), None, int(path_length / abs(v) / DT))[1]]
+
+
+@quick
+def test_casters_that_trail_do_not_push():
+    angle, fy = kick(0.5, 1.5)
+    np.testing.assert_allclose(fy[-1], 0.0, atol=0.01)
+    assert np.abs(angle).max() < 0.05
+
+
+@quick
+def test_casters_kick_after_a_reversal_until_they_have_swivelled():
+    angle, fy = kick(-0.5, 2.5)
+    np.testing.assert_allclose(np.abs(fy).max(), 10.0, rtol=0.03)  # two casters; F_k sin cos is half of F_k at most
+    np.testing.assert_allclose(np.cos(angle[-1]), -1.0, atol=0.01)
+    np.testing.assert_allclose(fy[-1], 0.0, atol=0.05)
+
+
+@quick
+def test_casters_parked_across_swivel_over_a_few_trails():
+    """From 90 degrees, d(delta)/ds = -sin(delta) / L: tan(delta / 2) falls by e over each trail."""
+    angle, _ = kick(0.5, 0.30, start_angle=np.pi / 2)
+    np.testing.assert_allclose(np.tan(angle[-1] / 2), np.exp(-2), atol=0.04)
+
+
+@quick
+@pytest.mark.parametrize("v", [0.5, -1.0])
+def test_speed_dependent_losses_follow_their_power_law(v):
+    _, rolling = make_effect("rolling_resistance_speed", mu_1=0.01).force((), motion_at(v))
+    _, drag = make_effect("quadratic_drag", coefficient=2.0).force((), motion_at(v))
+    np.testing.assert_allclose(rolling.fx, -0.01 * v * WEIGHT, rtol=0.02)
+    np.testing.assert_allclose(drag.fx, -2.0 * abs(v) * v, rtol=1e-3)
+
+
+@quick
+@pytest.mark.parametrize(("yaw", "fx", "fy"), [(0.0, 5.0, 2.0), (np.pi / 2, 2.0, -5.0), (np.pi, -5.0, -2.0)])
+def test_wind_is_fixed_in_the_room_and_a_side_force_in_the_vehicle(yaw, fx, fy):
+    motion = motion_at(yaw=yaw)
+    _, blown = make_effect("wind", along_x=5.0, along_y=2.0).force((), motion)
+    _, pushed = make_effect("side_force", sideways=7.0).force((), motion)
+    np.testing.assert_allclose([blown.fx, blown.fy], [fx, fy], atol=1e-4)
+    assert (pushed.fx, pushed.fy) == (0.0, 7.0)
+
+
+# Sensing
+
+TIMES = np.arange(400) * DT
+SPEEDS = 0.5 + 0.3 * np.sin(2 * TIMES), 0.8 * np.sin(1.5 * TIMES)
+
+
+@quick
+def test_odometry_scale_reports_the_path_that_the_scaled_speeds_add_up_to():
+    v, omega = SPEEDS
+    scaled = run(make_effect("odometry_scale", linear=1.02, angular=0.9), path(v, omega))
+    expected = path(1.02 * v, 0.9 * omega)
+    for field in ("x", "y", "yaw", "v", "omega"):
+        np.testing.assert_allclose(getattr(scaled, field), getattr(expected, field), atol=2e-4, err_msg=field)
+
+
+@quick
+@pytest.mark.parametrize("delay", [0.012, 0.1, 0.3])
+def test_a_late_reading_is_that_of_an_earlier_time(delay):
+    true = path(*SPEEDS)
+    late = run(make_effect("sensor_delay", delay=delay), true)
+    for field in ("x", "y", "yaw", "v", "omega"):
+        expected = np.interp(TIMES[100:] - delay, TIMES, np.asarray(getattr(true, field)))
+        np.testing.assert_allclose(getattr(late, field)[100:], expected, atol=1e-3, err_msg=field)
+    np.testing.assert_array_equal(late.gyro, true.gyro)  # another sensor
+
+
+@quick
+@pytest.mark.parametrize("offset", [-0.04, 0.04])
+def test_a_clock_offset_shifts_the_odometry_either_way(offset):
+    true = path(*SPEEDS)
+    shifted = run(make_effect("clock_offset", offset=offset), true)
+    for field in ("x", "y", "yaw", "v", "omega"):
+        expected = np.interp(TIMES[100:-20] - offset, TIMES, np.asarray(getattr(true, field)))
+        np.testing.assert_allclose(getattr(shifted, field)[100:-20], expected, atol=4e-3, err_msg=field)
+
+
+@quick
+def test_a_gyro_bias_shows_in_the_gyro_alone():
+    given = reading(1.0, 2.0, 3.0, 0.5, 0.4, 0.4)
+    _, wrong = make_effect("gyro_bias", bias=0.01, scale=1.1).sensing((), given, still())
+    np.testing.assert_allclose(wrong.gyro, 0.45, rtol=1e-6)
+    assert replace(wrong, gyro=given.gyro) == given
+
+
+@quick
+def test_encoder_steps_never_add_up():
+    v, omega = SPEEDS
+    true = path(0.05 * v, 0.05 * omega)
+    stepped = run(make_effect("encoder_resolution", angle=0.01, speed=0.002), true)
+    step = 0.01 * 0.1325
+    assert np.abs(stepped.x - true.x).max() <= step / 2 + 1e-5
+    np.testing.assert_array_less(np.abs(stepped.yaw - true.yaw), step / 0.496 + 1e-5)
+    assert np.abs(stepped.yaw - true.yaw).max() > step / 0.496 / 2
+    wheels = (stepped.v - stepped.omega * 0.248) / 0.002
+    np.testing.assert_allclose(wheels, np.round(wheels), atol=2e-3)
+
+
+@quick
+def test_the_gyro_is_cut_off_at_its_range_and_comes_in_steps():
+    effect = make_effect("gyro_range", **GYRO)
+    for rate, expected in ((3.0, 2.1817), (-3.0, -2.1817), (1e-4, 7.636e-5), (0.0, 0.0)):
+        _, read = effect.sensing((), reading(omega=0.4, gyro=rate), still())
+        np.testing.assert_allclose(read.gyro, expected, rtol=1e-3)
+        assert read.omega == 0.4
+
+
+@quick
+def test_states_come_at_their_rate():
+    true = path(*SPEEDS)
+    seen = run(make_effect("state_rate", period=0.02), true)
+    np.testing.assert_array_equal(seen.v[::4], true.v[::4])
+    np.testing.assert_array_equal(seen.v[3::4], true.v[::4])
+    np.testing.assert_array_equal(seen.gyro, true.gyro)
