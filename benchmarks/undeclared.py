@@ -12,7 +12,6 @@ on where it was; the figures are written at the end from all verdicts there.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -250,12 +249,10 @@ def read_cases(work: Path) -> Iterable[tuple[dict[str, float], dict[str, Any], f
 
 def write_json(path: Path, content: Any) -> None:
     """Write whole or not at all."""
-    from sysid.report import plain
+    from sysid.report import write_report
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(plain(content), indent=1) + "\n")
-    os.replace(partial, path)
+    write_report(path, content)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ within their day-to-day spread, and the verdict is one of
 Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
 scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
 
-Writes RUN/report.json (`sysid.loop.report`), RUN/report.html, RUN/vehicle.toml with the effect in it, and where
-something is left undecided RUN/next_manoeuvre.csv.
+Writes RUN/report.json (`sysid.loop.report`), RUN/report.html and RUN/vehicle.toml with the effect in it.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -35,12 +34,11 @@ from sysid.loop.evidence import Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
+from sysid.result import Progress
 from sysid.rollout import Plant, vehicle_plant
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
-
-Progress = Callable[[int, str], None]
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.loop.drives import Drives
 from sysid.loop.noise import Whitener
+from sysid.result import Progress
 from sysid.space import Space
 
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 MAX_STEP = 0.3  # of the range, in one iteration
-Progress = Callable[[int, str], None]
 
 
 @dataclass(frozen=True)
@@ -23,8 +22,6 @@ class BaseFit:
     u: np.ndarray  # (P,) unit coordinates
     cost: float
     """Sum of squared white residuals and of the prior."""
-    count: int
-    """Number of white residuals."""
 
 
 def fit_base(
@@ -75,7 +72,7 @@ def fit_base(
             break
         else:
             damping = min(damping * 100.0, 1e4)
-    return BaseFit(u, cost, int((mask > 0).sum()))
+    return BaseFit(u, cost)
 
 
 def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float) -> np.ndarray:

@@ -7,7 +7,7 @@ thousands of simulated nulls are then algebra on these products.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,8 @@ from sysid.log import Trial
 from sysid.loop.catalogue import LEVELS, Hypothesis, base_values
 from sysid.loop.drives import CHUNK, Drives
 from sysid.loop.reference import Reference, alike, difference_sizes, expected_without
+from sysid.result import Progress
 from whill_mjx.types import VehicleParams
-
-Progress = Callable[[int, str], None]
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,9 @@ class Evidence:
     base_size: int
     columns: tuple[Columns, ...]
     precision: np.ndarray  # (P, P) of the base parameters, in unit coordinates
-    pool: tuple[np.ndarray, ...]  # per trial (J, n) white noise of drives like it
     products: np.ndarray  # (B, P + S, P + S)
     moments: np.ndarray  # (B, P + S)
-    pool_moments: tuple[np.ndarray, ...]  # per trial (J, P + S)
+    pool_moments: tuple[np.ndarray, ...]  # per trial (J, P + S) of white noise of J drives like it
     groups: tuple[tuple[int, ...], ...]  # trials of one manoeuvre
 
 
@@ -122,18 +120,16 @@ def gather(
     at = drives.simulate(values[None])[0]
     slopes = base_columns(drives, reference, values, names)
     signatures, columns = signature_columns(drives, hypotheses, values, names, at, progress)
-    bins = drives.target.shape[1]
-    expected = np.stack([reference.expected(trial, bins) for trial in drives.trials])
     white = reference.whitener
-    residual = white.apply(drives.target - expected - at, drives.mask)
+    residual = white.apply(reference.target_of(drives) - at, drives.mask)
     design = white.apply(np.concatenate([slopes, signatures], axis=-1), drives.mask)
     count, size = len(residual), residual[0].size
     residual, design = residual.reshape(count, size), design.reshape(count, size, -1)
-    pool = tuple(_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials))
+    pool = [_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials)]
     offset = reference.space.size
     placed = tuple(Columns(c.hypothesis, c.level, tuple(offset + i for i in c.index)) for c in columns)
     evidence = Evidence(
-        residual, design, offset, placed, np.linalg.inv(reference.spread), pool,
+        residual, design, offset, placed, np.linalg.inv(reference.spread),
         np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
         tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives))
     return evidence, slopes

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 from sysid.html import Section, bullets, charts, html_page, paragraph, table
 from sysid.metrics import METRICS, UNITS
 from sysid.svg import bar_chart
+from whill_mjx.dataset import write_text
 
 
 def write_page(out: Path, report: dict[str, Any]) -> Path:
@@ -22,10 +22,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
     page = html_page(f"{report['dataset']['name']}: {report['verdict']}", sections,
                      f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}")
-    path, partial = out / "report.html", out / "report.html.partial"
-    partial.write_text(page)
-    os.replace(partial, path)
-    return path
+    write_text(out / "report.html", page)
+    return out / "report.html"
 
 
 def verdict(report: dict[str, Any]) -> str:

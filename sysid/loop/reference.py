@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.log import Log, Trial
-from sysid.loop.base import Progress, fit_base
+from sysid.loop.base import fit_base
 from sysid.loop.drives import Drives, make_drives
 from sysid.loop.noise import Whitener, deviations, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.result import Progress
 from sysid.rollout import Plant
 from sysid.space import Space, make_space
 from whill_mjx.parameters import set_values
@@ -58,6 +59,11 @@ class Reference:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
         same = [one for one in self.leftovers if alike(one.trial, trial)]
         return mean_by_day(same, bins) if self.known else np.zeros((bins, self.leftovers[0].series.shape[1]))
+
+    def target_of(self, drives: Drives) -> np.ndarray:
+        """(B, K, C) measured features less what the model is known to leave of such drives."""
+        bins = drives.target.shape[1]
+        return drives.target - np.stack([self.expected(trial, bins) for trial in drives.trials])
 
 
 def alike(a: Trial, b: Trial) -> bool:

@@ -46,9 +46,7 @@ class Refitter:
         """`values` (all parameters) at the reference; `slopes` (B, K, C, P) there."""
         self.drives, self.reference, self.values = drives, reference, values
         self.names = list(drives.names)
-        bins = drives.target.shape[1]
-        expected = np.stack([reference.expected(trial, bins) for trial in drives.trials])
-        self.target = drives.target - expected
+        self.target = self._white(reference.target_of(drives))
         self.white_slopes = self._white(slopes)
         self.precision = np.linalg.inv(reference.spread)
         away = REACH * np.sqrt(np.diag(reference.spread))
@@ -75,7 +73,7 @@ class Refitter:
                               self._within(hypotheses, q + share * step[len(u) :])))
                 promised.append(promise * share * (2 - share))
             white = self._white(self.drives.simulate(np.stack([self._set(hypotheses, *each) for each in tried])))
-            left = [self._white_target() - one for one in white]
+            left = [self.target - one for one in white]
             costs = np.array([np.square(left[i]).sum() + self._prior(tried[i][0]) for i in range(len(tried))])
             best = int(np.nanargmin(costs))
             gained = cost - float(costs[best])
@@ -101,7 +99,7 @@ class Refitter:
 
     def _cost(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
         at = self._white(self.drives.simulate(self._set(hypotheses, u, q)[None]))[0]
-        residual = self._white_target() - at
+        residual = self.target - at
         return residual, float(np.square(residual).sum() + self._prior(u))
 
     def _coordinate_columns(
@@ -112,7 +110,7 @@ class Refitter:
             return np.zeros((*residual.shape, 0))
         sets, steps = self._differences(hypotheses, u, q)
         seen = self._white(self.drives.simulate(np.stack(sets[1:])))
-        at = self._white_target() - residual
+        at = self.target - residual
         return np.stack([(seen[i] - at) / steps[i] for i in range(len(q))], axis=-1)
 
     def _base_columns(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -132,11 +130,6 @@ class Refitter:
             return white.reshape(mask.shape[0], -1, *series.shape[3:])
         moved = filt.apply(np.moveaxis(series, 0, -1), mask)
         return np.moveaxis(moved.reshape(mask.shape[0], -1, series.shape[0]), -1, 0)
-
-    def _white_target(self) -> np.ndarray:
-        if not hasattr(self, "_cached"):
-            self._cached = self._white(self.target)
-        return self._cached
 
     def _prior(self, u: np.ndarray) -> float:
         difference = u - self.reference.u

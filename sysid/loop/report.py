@@ -14,7 +14,7 @@
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
     detectable        per effect the smallest size that these drives would show with 80 % power
     lives_in          where the unexplained residual lives
-    next_manoeuvre    the drive that would decide what is left open
+    next_manoeuvre    null so far: `sysid.design` proposes a drive when asked, the loop does not call it
     base              base parameters: reference value, day-to-day spread, value on these drives
     manifest          everything fixed beforehand, and its SHA-256
 """
@@ -142,7 +142,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
         base[name] = float(result.reference.space.to_values(final.u)[index])
     kept = {one.hypothesis.key for one in found.accepted}
     out, start = [], 0
-    for number, one in enumerate(final.hypotheses):
+    for one in final.hypotheses:
         stop = start + len(one.axes)
         ends = [one.values(np.clip(edge, [-a.limit if a.signed else 0.0 for a in one.axes], None), base)
                 for edge in (low[start:stop], high[start:stop])]
@@ -155,7 +155,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
                     "interval": sorted(end[axis.parameter] for end in ends),
                     "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
                 "p_value": found.accepted[index].p, "equation": equation_of(one),
-                "evidence": evidence_for(result, number, slice(start, stop))})
+                "evidence": evidence_for(result, slice(start, stop))})
         start = stop
     return out
 
@@ -196,7 +196,7 @@ def information(final: Refit, result: Result) -> np.ndarray:
     return matrix
 
 
-def evidence_for(result: Result, number: int, part: slice) -> dict[str, Any]:
+def evidence_for(result: Result, part: slice) -> dict[str, Any]:
     """What each manoeuvre says of an effect by itself, and whether it predicts manoeuvres that were left out."""
     final, base, groups = result.search.final, result.search.base, result.evidence.groups
     size = len(final.u)
@@ -220,7 +220,6 @@ def evidence_for(result: Result, number: int, part: slice) -> dict[str, Any]:
         scales.append({"manoeuvre": result.log.training[group[0]].manoeuvre,
                        "factor": 1 + float(left @ residual) / max(strength, 1e-9),
                        "standard_error": 1 / np.sqrt(max(strength, 1e-9))})
-    del number
     seen = [one for one in scales if one["standard_error"] < 0.5]
     weight = np.array([one["standard_error"] ** -2.0 for one in seen])
     factor = np.array([one["factor"] for one in seen])

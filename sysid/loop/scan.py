@@ -30,10 +30,6 @@ class Scan:
     p: np.ndarray  # (H,) p-value of each by itself
     p_family: float
     """p-value of the smallest of them."""
-    null_family: np.ndarray  # (N,) smallest p of each simulated null
-    lack: float
-    """What is left of the systematic residual after the base's fit, in squared white units."""
-    lack_null: np.ndarray  # (N,)
 
 
 class Solver:
@@ -116,78 +112,46 @@ def run(
     rng = np.random.default_rng(seed)
     solver = Solver(evidence)
     gain, found = gains(solver, hypotheses)
-    moments, blocks = null_moments(evidence, spread, draws, rng)
-    null, _ = gains(solver, hypotheses, moments)
-    q = []
-    for number, one in enumerate(hypotheses):
-        levels = np.concatenate(found[number]) if found[number] else np.zeros((1, 1 + len(one.axes)))
-        q.append(levels[np.argmax(levels[:, 0]), 1:])
+    null, _ = gains(solver, hypotheses, null_moments(evidence, spread, draws, rng))
+    q = best_levels(found, hypotheses)
     p = np.array([tail(null[:, h], gain[h]) for h in range(len(hypotheses))])
     each = np.stack([tail(null[:, h], null[:, h]) for h in range(len(hypotheses))], axis=-1)
     smallest = each.min(1)
-    lack, lack_null = lack_of_fit(evidence, solver, blocks, moments)
-    return Scan(gain, tuple(q), null, p, family(smallest, float(p.min())), smallest, lack, lack_null)
+    return Scan(gain, tuple(q), null, p, family(smallest, float(p.min())))
+
+
+def best_levels(found: list[list[np.ndarray]], hypotheses: Sequence[Hypothesis]) -> list[np.ndarray]:
+    """Per hypothesis the coordinates (k,) of the level that gains most, of what `gains` found."""
+    best = []
+    for each, one in zip(found, hypotheses, strict=True):
+        levels = np.concatenate(each) if each else np.zeros((1, 1 + len(one.axes)))
+        best.append(levels[np.argmax(levels[:, 0]), 1:])
+    return best
 
 
 def null_moments(
     evidence: Evidence, spread: np.ndarray, draws: int, rng: np.random.Generator
-) -> tuple[np.ndarray, list[list[tuple[int, int, float]]]]:
-    """Moments (N, P + S) of simulated drives in which nothing is missing, and which noise each trial got."""
+) -> np.ndarray:
+    """Moments (N, P + S) of simulated drives in which nothing is missing."""
     size = evidence.base_size
     factor = np.linalg.cholesky(spread + 1e-14 * np.eye(size))
     products = evidence.products.sum(0)[:, :size]
     moments = np.zeros((draws, evidence.products.shape[1]))
-    blocks: list[list[tuple[int, int, float]]] = []
     for n in range(draws):
         # Student's t: the spread itself is known from a few days only.
         scale = np.sqrt(8 / rng.chisquare(8))
         moments[n] = products @ (scale * factor @ rng.standard_normal(size))
-        chosen: list[tuple[int, int, float]] = []
         for group in evidence.groups:
             sign = rng.choice((-1.0, 1.0))
-            order = rng.permutation(len(evidence.pool[group[0]]))
+            order = rng.permutation(len(evidence.pool_moments[group[0]]))
             for place, trial in enumerate(group):
-                pick = int(order[place % len(order)]) % len(evidence.pool[trial])
+                pick = int(order[place % len(order)]) % len(evidence.pool_moments[trial])
                 moments[n] += sign * evidence.pool_moments[trial][pick]
-                chosen.append((trial, pick, sign))
-        blocks.append(chosen)
-    return moments, blocks
-
-
-def lack_of_fit(
-    evidence: Evidence, solver: Solver, blocks: list[list[tuple[int, int, float]]], moments: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Energy of what replicates share after the base's fit, on the drives and on the nulls."""
-    size = evidence.base_size
-    _, coefficients = solver.fit(())
-    left = evidence.residual - evidence.design[:, :, :size] @ coefficients
-    value = shared_energy(left, evidence.groups)
-    _, null_coefficients = solver.fit((), moments)
-    null = []
-    for n, chosen in enumerate(blocks[:300]):
-        noise = np.zeros_like(evidence.residual)
-        for trial, pick, sign in chosen:
-            noise[trial] = sign * evidence.pool[trial][pick]
-        # The drawn day is taken up by the base's fit but for the prior's pull, which is small.
-        fit = null_coefficients[n] - _day_of(evidence, moments[n], chosen, solver)
-        null.append(shared_energy(noise - evidence.design[:, :, :size] @ fit, evidence.groups))
-    return value, np.array(null)
-
-
-def _day_of(evidence: Evidence, moments: np.ndarray, chosen: list, solver: Solver) -> np.ndarray:
-    """The drawn parameters of a null: what its moments hold beyond the noise."""
-    size = evidence.base_size
-    rest = moments[:size] - sum(sign * evidence.pool_moments[trial][pick][:size] for trial, pick, sign in chosen)
-    return np.linalg.lstsq(solver.products[:size, :size], rest, rcond=1e-10)[0]
-
-
-def shared_energy(left: np.ndarray, groups: Sequence[Sequence[int]]) -> float:
-    """Sum over manoeuvres of n |mean over n drives|^2."""
-    return float(sum(len(group) * np.square(left[list(group)].mean(0)).sum() for group in groups))
+    return moments
 
 
 def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:
-    """P(null >= value), beyond the draws by a gamma distribution through their mean and variance, upper half only."""
+    """P(null >= value), beyond the draws by an exponential tail through their upper tenth."""
     from scipy import stats
 
     value = np.asarray(value, float)

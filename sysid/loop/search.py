@@ -11,9 +11,9 @@ from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.scan import Scan, Solver, gains, run, tail
+from sysid.loop.scan import Scan, Solver, best_levels, gains, run, tail
+from sysid.result import Progress
 
-Progress = Callable[[int, str], None]
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the two best
 
 
@@ -179,11 +179,8 @@ def _rescan(
                     precision=precision, products=np.einsum("bni,bnj->bij", design, design, optimize=True),
                     moments=np.einsum("bni,bn->bi", design, residual), pool_moments=())
     gain, found = gains(Solver(later), hypotheses)
-    starts = []
-    for number, one in enumerate(hypotheses):
-        levels = np.concatenate(found[number]) if found[number] else np.zeros((1, 1 + len(one.axes)))
-        starts.append(levels[np.argmax(levels[:, 0]), 1:])
-    return gain, starts, np.array([tail(first.null[:, h], gain[h]) for h in range(len(hypotheses))])
+    p = np.array([tail(first.null[:, h], gain[h]) for h in range(len(hypotheses))])
+    return gain, best_levels(found, hypotheses), p
 
 
 def _distinct(

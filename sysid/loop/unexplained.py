@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.log import Trial
+from sysid.loop.features import BIN, CHANNELS
 from sysid.metrics import command_in_force
 
 if TYPE_CHECKING:
@@ -26,9 +27,10 @@ REST = 0.02  # m/s and rad/s below which a vehicle rests
 def where_it_lives(result: Result) -> list[dict[str, Any]]:
     """Quantities by the share of the systematic residual that they predict on other drives, best first."""
     trials = result.log.training
-    width, bins = 0.25, result.evidence.residual.shape[1] // 5
-    residual = result.search.final.residual.reshape(len(trials), bins, 5)
-    found = [quantities(trial, bins, width, result.log.spec) for trial in trials]
+    channels = len(CHANNELS)
+    bins = result.evidence.residual.shape[1] // channels
+    residual = result.search.final.residual.reshape(len(trials), bins, channels)
+    found = [quantities(trial, bins, BIN, result.log.spec) for trial in trials]
     count = np.square(result.search.final.residual).sum() / (1 + result.search.excess[1])
     excess = max(result.search.excess[1] * count, 1.0)
     fold = np.arange(len(trials)) % 3
@@ -40,7 +42,7 @@ def where_it_lives(result: Result) -> list[dict[str, Any]]:
         gain = 0.0
         for part in range(3):
             fit, test = fold != part, fold == part
-            x, y = design[fit].reshape(-1, design.shape[-1]), residual[fit].reshape(-1, 5)
+            x, y = design[fit].reshape(-1, design.shape[-1]), residual[fit].reshape(-1, channels)
             solution = np.linalg.solve(x.T @ x + RIDGE * np.eye(x.shape[1]), x.T @ y)
             left = residual[test] - design[test] @ solution
             gain += float(np.square(residual[test]).sum() - np.square(left).sum())
