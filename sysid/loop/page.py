@@ -5,16 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sysid.html import Section, bullets, charts, html_page, paragraph, table
-from sysid.metrics import METRICS, UNITS
-from sysid.svg import bar_chart
+from sysid.log import Start
+from sysid.loop.next_manoeuvre import command_of, sentence
+from sysid.metrics import METRICS, UNITS, integrate
+from sysid.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.dataset import write_text
 
 
 def write_page(out: Path, report: dict[str, Any]) -> Path:
     """Write the page of a report into a folder."""
-    sections = [Section("Verdict", verdict(report)), Section("Error before and after", errors(report)),
-                Section("What was tried", candidates(report))]
+    sections = [Section("Verdict", verdict(report))]
+    if report["next_manoeuvre"] is not None:
+        sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
+    sections += [Section("Error before and after", errors(report)), Section("What was tried", candidates(report))]
     if report["lives_in"]:
         sections.append(Section("Where the unexplained residual lives", lives(report)))
     if report["verdict"] != "named":
@@ -51,6 +57,23 @@ def verdict(report: dict[str, Any]) -> str:
                   one["evidence"]["left_out_gain"].get(each["manoeuvre"])] for each in evidence],
                 f"{one['name']}: what each manoeuvre says by itself (1 agrees with the joint fit), and by how much the "
                 "effect fitted to the others lowers the squared residual there"))
+    return "".join(parts)
+
+
+def next_drive(proposal: dict[str, Any]) -> str:
+    """The drive that would tell the effects of a class apart."""
+    text = sentence(proposal)
+    parts = [paragraph(f"{text[0].upper()}{text[1:]}.")]
+    if proposal["name"] is not None:
+        command = command_of(proposal)
+        x, y, yaw = integrate(command, Start(**{key: proposal["start"][name] for key, name in
+                                                (("x", "x"), ("y", "y"), ("yaw", "heading"))}), command.t)
+        held = np.repeat(command.t, 2)[1:]
+        parts.append(charts([
+            line_chart([Line(held, np.repeat(command.v, 2)[:-1], "v [m/s]"),
+                        Line(held, np.repeat(command.omega, 2)[:-1], "omega [rad/s]", PALETTE[1])], "t [s]", "command"),
+            line_chart([Line(x, y), Line(x[:1], y[:1], "start", PALETTE[3], markers=True)], "x [m]", "y [m]",
+                       "path in the room, if commands were followed at once", equal=True)]))
     return "".join(parts)
 
 

@@ -14,7 +14,8 @@
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
     detectable        per effect the smallest size that these drives would show with 80 % power
     lives_in          where the unexplained residual lives
-    next_manoeuvre    null so far: `sysid.design` proposes a drive when asked, the loop does not call it
+    next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
+                      there is nothing to tell (keys: `sysid.loop.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
     manifest          everything fixed beforehand, and its SHA-256
 """
@@ -30,8 +31,9 @@ import numpy as np
 
 from sysid.log import Trial
 from sysid.loop.catalogue import Hypothesis, base_values
+from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.refit import Refit
-from sysid.loop.scan import Solver
+from sysid.loop.solver import Solver
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
 from sysid.rollout import Replay, make_batch, predictions
@@ -70,14 +72,14 @@ def make_report(result: Result) -> dict[str, Any]:
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
-        "missing": {"p_value": found.scan.p_family, "excess_before": found.excess[0],
+        "missing": {"p_value": found.p_value, "excess_before": found.excess[0],
                     "excess_after": found.excess[1], "explained": found.share},
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
                        for each in found.rounds],
         "detectable": detectable(result), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
-        "next_manoeuvre": None, "base": base_table(result), "seconds": result.seconds,
+        "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
 
@@ -241,18 +243,15 @@ def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
 def detectable(result: Result) -> list[dict[str, Any]]:
     """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units."""
     found = result.search
-    limit = result.config.thresholds.margin * float(np.quantile(found.scan.null.max(1), 0.99))
+    limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
     solver = Solver(result.evidence)
-    size, precision = result.evidence.base_size, result.evidence.precision
     base = base_values(result.full)
-    inner = np.linalg.inv(solver.products[:size, :size] + precision)
     out, done = [], set()
-    for columns in result.evidence.columns:
+    for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
         one = result.hypotheses[columns.hypothesis]
-        for axis, index in zip(one.axes, columns.index, strict=True):
-            cross = solver.products[:size, index]
-            strength = solver.products[index, index] - cross @ inner @ cross
-            q = (np.sqrt(limit) + 0.84) / np.sqrt(max(strength, 1e-12))
+        for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
+            variance = 1 / float(solver.information((index,))[0, 0]) + wander[position, position]
+            q = (np.sqrt(limit) + 0.84) * np.sqrt(variance)
             usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
             if (one.key, axis.parameter) in done or not usable:
                 continue
@@ -293,6 +292,8 @@ def summary(report: dict[str, Any]) -> str:
         values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
                            for name, p in one["parameters"].items())
         lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
+    if report["next_manoeuvre"] is not None:
+        lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
     for part in ("training", "held_out"):
         for channel, metrics in report["before"][part].items():
             if "trajectory" in metrics:
@@ -304,7 +305,7 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
-    """Write report.json, report.html and vehicle.toml into a folder."""
+    """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
     from sysid.loop.page import write_page
     from sysid.report import write_report
     from whill_mjx.vehicle_file import save_vehicle
@@ -319,6 +320,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
                  {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
                   "effects_added": [one["name"] for one in report["effects"]]})
+    write_next_command(out, report["next_manoeuvre"])
     write_report(out / "report.json", report)
     write_page(out, report)
 

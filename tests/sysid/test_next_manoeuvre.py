@@ -1,0 +1,161 @@
+"""The next drive on rivals with a known answer: alike on what was driven, apart on another heading or never."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
+from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
+from sysid.loop.drives import make_drives
+from sysid.loop.next_manoeuvre import (
+    FILE,
+    LEAST,
+    absorbed,
+    command_of,
+    drives_of,
+    next_manoeuvre,
+    plan_drives,
+    sentence,
+    write_next_command,
+)
+from sysid.loop.noise import Whitener
+from sysid.loop.refit import Refit
+from sysid.rollout import vehicle_plant
+from sysid.space import make_space
+from whill_mjx.config import VehicleConfig
+from whill_mjx.presets import preset
+
+quick = pytest.mark.quick
+EFFECTS = ("slope", "side_force", "command_scale", "odometry_scale")
+SPEED, TIME = 0.5, 8.0
+
+
+def straight_trial(pose=True):
+    """A straight drive at heading 0, with the samples of its sensors still to come."""
+    t = np.arange(0.0, TIME, 0.1)
+    moving = (t >= 1.0) & (t < TIME - 1.0)
+    s = np.arange(0.0, TIME + 1e-9, 0.05)
+    truth = PoseStream(s, SPEED * np.clip(s - 1.0, 0.0, TIME - 2.0), 0.8 * np.sin(s), 0 * s)
+    return Trial("straight_1", "straight", Command(t, SPEED * moving, 0.4 * (t > 99)),
+                 OdometryStream(s, None, None, None, 0 * s, 0 * s), truth if pose else None, Start())
+
+
+@pytest.fixture(scope="module")
+def subject():
+    """A vehicle with four effects, its reference, and its replay."""
+    spec, params = preset("whill_cr_physical")
+    found = tuple(one for one in hypotheses(spec, params) if one.effect in EFFECTS)
+    full = with_catalogue(params, found)
+    names = tuple(base_values(full))
+    space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
+    whitener = Whitener(np.array([0.005, 0.01, 0.01, 0.01, 0.01]), np.zeros((1, 5, 5)), np.eye(5))
+    reference = SimpleNamespace(params=params, space=space, u=space.to_unit(space.initial), spread=1e-4 * np.eye(2),
+                                whitener=whitener, factors=np.ones((4, 5)))
+    plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
+    log = SimpleNamespace(spec=spec, training=(straight_trial(),), name="drives")
+    values = np.array([base_values(full)[name] for name in names])
+    drives = make_drives(plant, full, names, log.training)
+    return SimpleNamespace(log=log, reference=reference, hypotheses=found, full=full, names=names, plant=plant,
+                           refitter=SimpleNamespace(drives=drives, values=values))
+
+
+def fitted(subject, effect, **changes):
+    """A candidate of this effect at these values; its coordinates are known from nowhere else."""
+    one = next(each for each in subject.hypotheses if each.effect == effect)
+    values, names = subject.refitter.values.copy(), subject.names
+    for field, value in changes.items():
+        values[names.index(f"{effect}.{field}")] = value
+    base = base_values(subject.full)
+    q = np.array([(values[names.index(axis.parameter)] - base[axis.parameter]) / axis.unit for axis in one.axes])
+    bins = subject.refitter.drives.target.shape[1]
+    jacobian = np.zeros((1, 5 * bins, 2 + len(q)))
+    fit = Refit((one,), subject.reference.u, q, 0.0, np.zeros((1, 5 * bins)), jacobian, values)
+    return SimpleNamespace(hypothesis=one, gain=100.0, refit=fit)
+
+
+def with_rivals(subject, best, other, verdict="named"):
+    """The result of a loop that accepted the first and took the second for alike."""
+    search = SimpleNamespace(verdict=verdict, accepted=[best], rounds=[[best, other]], excess=(1.0, 0.0),
+                             classes=[[best.hypothesis.effect, other.hypothesis.effect]])
+    return SimpleNamespace(**{**vars(subject), "search": search, "evidence": SimpleNamespace(
+        precision=np.linalg.inv(subject.reference.spread))})
+
+
+@pytest.fixture(scope="module")
+def sloping(subject):
+    """A cross slope, and the side force that does the same at heading 0."""
+    pull = 0.02 * 9.81 * float(subject.full.body.mass)
+    return with_rivals(subject, fitted(subject, "slope", along_y=0.02), fitted(subject, "side_force", sideways=-pull))
+
+
+def test_a_cross_slope_is_told_from_a_side_force_by_another_heading(sloping, tmp_path):
+    proposal = next_manoeuvre(sloping)
+    assert proposal["splits"] == ["slope", "side_force"] and not proposal["not_split"]
+    assert proposal["expected_separation"] > LEAST and proposal["replicates"] >= 1
+    command = command_of(proposal)
+    heading = proposal["start"]["heading"] + np.cumsum(command.omega) * 0.1
+    assert np.ptp(heading) > 0.5 or abs(proposal["start"]["heading"]) > 0.5
+    path = write_next_command(tmp_path, proposal)
+    columns = read_csv(path, ("t", "v", "omega"))
+    assert path.name == FILE
+    np.testing.assert_allclose(columns["v"], command.v, atol=1e-6)
+    assert columns["v"].max() <= SPEED + 1e-6 and columns["t"][-1] <= TIME
+    assert "slope" in sentence(proposal)
+
+
+def test_the_drive_already_made_would_not_tell_them(sloping):
+    rivals = [one.refit.values for one in sloping.search.rounds[0]]
+    again = [one for one in drives_of(sloping, (0.0, 90.0)) if one.manoeuvre == "straight" and one.v == SPEED]
+    seen = plan_drives(sloping, sloping.refitter.drives, again).simulate(np.stack(rivals))  # (2, D, K, 5)
+    apart = np.linalg.norm(((seen[0] - seen[1]) / sloping.reference.whitener.scale).reshape(2, -1), axis=-1)
+    ahead, across = (apart[[one.start[2] < 0.1 for one in again].index(which)] for which in (True, False))
+    assert ahead < 0.6 * across  # the centre of mass is not the point that a side force acts at
+
+
+def test_scales_that_odometry_alone_shows_need_another_sensor(subject):
+    blind = replace(straight_trial(), ground_truth=None)
+    log = SimpleNamespace(**{**vars(subject.log), "training": (blind,)})
+    drives = subject.refitter.drives.of(log.training, subject.plant.dt)
+    result = with_rivals(SimpleNamespace(**{**vars(subject), "log": log, "refitter": SimpleNamespace(
+        drives=drives, values=subject.refitter.values)}),
+        fitted(subject, "command_scale", linear=1.02, angular=1.02),
+        fitted(subject, "odometry_scale", linear=1.02, angular=1.02))
+    proposal = next_manoeuvre(result)
+    assert proposal["name"] is None and proposal["file"] is None
+    assert proposal["not_split"][0]["effects"] == ["command_scale", "odometry_scale"]
+    assert "commands" in proposal["not_split"][0]["sensor"] and "no drive" in sentence(proposal)
+
+
+@quick
+def test_nothing_is_proposed_where_nothing_is_named(subject):
+    best, other = fitted(subject, "slope", along_x=0.01), fitted(subject, "side_force", sideways=5.0)
+    assert next_manoeuvre(with_rivals(subject, best, other, "none")) is None
+    alone = with_rivals(subject, best, other)
+    alone.search.classes, alone.search.rounds = [["slope"]], [[best]]
+    assert next_manoeuvre(alone) is None
+    assert write_next_command("unused", None) is None
+
+
+@quick
+def test_the_library_keeps_to_the_speeds_and_the_space_of_the_log(subject):
+    library = drives_of(subject)
+    truth = subject.log.training[0].ground_truth
+    low, high = (getattr(np, side)([truth.x, truth.y], 1) for side in ("min", "max"))
+    assert len(library) > 20 and len({one.manoeuvre for one in library}) > 8
+    for one in library:
+        command = one.command
+        assert np.abs(command.v).max() <= SPEED + 1e-9 and command.t[-1] <= TIME
+        assert (low <= one.start[:2]).all() and (np.array(one.start[:2]) <= high).all()
+
+
+@quick
+def test_what_another_coordinate_can_absorb_does_not_count():
+    random = np.random.default_rng(0)
+    columns = random.standard_normal((50, 3))
+    inside, outside = columns @ [1.0, -2.0, 0.5], random.standard_normal(50)
+    outside -= columns @ np.linalg.lstsq(columns, outside, rcond=None)[0]
+    assert absorbed(inside, columns, np.zeros((3, 3))) < 1e-3
+    assert abs(absorbed(inside + outside, columns, np.zeros((3, 3))) - np.linalg.norm(outside)) < 1e-3
+    assert absorbed(inside, columns, 1e9 * np.eye(3)) > 0.99 * np.linalg.norm(inside)
