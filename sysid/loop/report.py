@@ -33,7 +33,7 @@ from sysid.log import Trial
 from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.refit import Refit
-from sysid.loop.solver import Solver
+from sysid.loop.scan import Solver
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
 from sysid.rollout import Replay, make_batch, predictions
@@ -72,7 +72,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
-        "missing": {"p_value": found.p_value, "excess_before": found.excess[0],
+        "missing": {"p_value": found.scan.p_family, "excess_before": found.excess[0],
                     "excess_after": found.excess[1], "explained": found.share},
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
@@ -243,15 +243,18 @@ def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
 def detectable(result: Result) -> list[dict[str, Any]]:
     """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units."""
     found = result.search
-    limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
+    limit = result.config.thresholds.margin * float(np.quantile(found.scan.null.max(1), 0.99))
     solver = Solver(result.evidence)
+    size, precision = result.evidence.base_size, result.evidence.precision
     base = base_values(result.full)
+    inner = np.linalg.inv(solver.products[:size, :size] + precision)
     out, done = [], set()
-    for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
+    for columns in result.evidence.columns:
         one = result.hypotheses[columns.hypothesis]
-        for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
-            variance = 1 / float(solver.information((index,))[0, 0]) + wander[position, position]
-            q = (np.sqrt(limit) + 0.84) * np.sqrt(variance)
+        for axis, index in zip(one.axes, columns.index, strict=True):
+            cross = solver.products[:size, index]
+            strength = solver.products[index, index] - cross @ inner @ cross
+            q = (np.sqrt(limit) + 0.84) / np.sqrt(max(strength, 1e-12))
             usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
             if (one.key, axis.parameter) in done or not usable:
                 continue
