@@ -30,7 +30,7 @@ NAMED = {
     "wheel_radius_difference", "track_width", "payload_shift", "yaw_scrub", "omni_roller_friction", "caster_kick",
     "traction_limit", "turn_efficiency", "rolling_resistance_speed", "quadratic_drag", "side_force", "slope", "wind",
     "backlash", "odometry_scale", "sensor_delay", "clock_offset", "gyro_bias", "command_expiry", "encoder_resolution",
-    "gyro_range", "state_rate", "incline", "ramp", "bump",
+    "gyro_range", "state_rate", "incline", "ramp", "bump", "unnamed",
 }  # fmt: skip
 
 

@@ -46,6 +46,7 @@ from whill_mjx.effects.torque_saturation import TorqueSaturation
 from whill_mjx.effects.track_width import TrackWidth
 from whill_mjx.effects.traction_limit import TractionLimit
 from whill_mjx.effects.turn_efficiency import TurnEfficiency
+from whill_mjx.effects.unnamed import Unnamed
 from whill_mjx.effects.wheel_radius_difference import WheelRadiusDifference
 from whill_mjx.effects.wind import Wind
 from whill_mjx.effects.yaw_scrub import YawScrub
@@ -96,6 +97,7 @@ EFFECTS: dict[str, type[Effect]] = {
         TrackWidth,
         TractionLimit,
         TurnEfficiency,
+        Unnamed,
         WheelRadiusDifference,
         Wind,
         YawScrub,

@@ -1,0 +1,131 @@
+"""A wrench without a name: what a fit found and no effect of the catalogue explains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.effects.smooth import soft_sign
+from whill_mjx.types import Motion, Wrench, parameter
+
+KNOTS = 12
+QUANTITIES = {
+    "time in the drive": "s", "speed": "m/s", "yaw rate": "rad/s", "left wheel's angle": "rad",
+    "right wheel's angle": "rad", "heading in the room": "rad", "time since rest": "s", "distance since rest": "m",
+}  # fmt: skip
+"""What the wrench may depend on, by number from 1, and its unit. Angles repeat after a full turn."""
+PERIODIC = ("left wheel's angle", "right wheel's angle", "heading in the room")
+REST_SPEED = 0.02  # [m/s] below which a vehicle rests, and that smooths the change of sign at rest
+REST_RATE = 0.05  # [rad/s] likewise
+TURN = 2 * jnp.pi
+
+
+@struct.dataclass
+class UnnamedMemory:
+    """Quantities that add up over a drive."""
+
+    time: jax.Array  # () s
+    angle: jax.Array  # (2,) rad, of the left and the right driven wheel
+    moving: jax.Array  # () s since the vehicle rested
+    distance: jax.Array  # () m that the driven wheels rolled since then, their mean
+
+
+def quantities(memory: UnnamedMemory, motion: Motion) -> jax.Array:
+    """Values (8,) of `QUANTITIES`."""
+    speed = motion.spin.mean() * motion.wheel_radius
+    rate = (motion.ground_axes[2] * motion.angular_velocity).sum()
+    return jnp.stack([memory.time, speed, rate, memory.angle[0], memory.angle[1], motion.heading, memory.moving,
+                      memory.distance])
+
+
+def hats(position: jax.Array, periodic: jax.Array) -> jax.Array:
+    """Weights (KNOTS,) of linear interpolation at a position () counted in knots; constant beyond the ends."""
+    knot = jnp.arange(KNOTS, dtype=position.dtype)
+    inside = jnp.clip(position, 0.0, KNOTS - 1.0)
+    turned = position - KNOTS * jnp.floor(position / KNOTS)
+    away = jnp.abs(turned - knot)
+    around = jnp.minimum(away, KNOTS - away)
+    return jnp.maximum(1 - jnp.where(periodic, around, jnp.abs(inside - knot)), 0.0)
+
+
+@struct.dataclass
+class Unnamed(Effect):
+    """F_x = f(z) and T_z = g(z): tables over one quantity z of the motion, interpolated linearly.
+
+    z is chosen by `quantity`: 1 time in the drive, 2 speed, 3 yaw rate, 4 and 5 angle of the left and the right wheel,
+    6 heading in the room, 7 time and 8 distance since rest. The knots lie evenly from `low` to `high`, and the ends
+    hold beyond; angles repeat, with knots every 30 degrees from 0 on. A wheel stands at `start_angle` when a drive
+    begins, which nobody knows: it is another one in every drive. With `with_motion` = 1 the force
+    turns with the direction in which each side rolls and the torque with that of the turn, as friction does (negative
+    values brake); with 0 they push whatever the motion. `sysid.close_loop` writes it where something is missing that
+    the catalogue does not have; it names nothing.
+    """
+
+    name = "unnamed"
+    room_fixed = True
+    typical = {"quantity": (2.0, 2.0), "low": (-1.0, -1.0), "high": (1.0, 1.0), "with_motion": (0.0, 1.0),
+               **{f"force_{k}": (-10.0, 10.0) for k in range(1, KNOTS + 1)},
+               **{f"torque_{k}": (-5.0, 5.0) for k in range(1, KNOTS + 1)}}
+    source = "fitted by `sysid.close_loop`; sizes are estimates"
+    quantity: jax.Array = parameter("-", 1.0, 8.0, 1.0, "which quantity, 1 to 8")
+    low: jax.Array = parameter("SI", -1000.0, 1000.0, 0.0, "value of it at the first knot")
+    high: jax.Array = parameter("SI", -1000.0, 1000.0, 1.0, "value of it at the last knot")
+    with_motion: jax.Array = parameter("-", 0.0, 1.0, 0.0, "1 where the wrench turns with the motion")
+    start_angle: jax.Array = parameter("rad", -6.3, 6.3, 0.0, "angle of the wheels at the start of the drive")
+    force_1: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 1")
+    force_2: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 2")
+    force_3: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 3")
+    force_4: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 4")
+    force_5: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 5")
+    force_6: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 6")
+    force_7: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 7")
+    force_8: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 8")
+    force_9: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 9")
+    force_10: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 10")
+    force_11: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 11")
+    force_12: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 12")
+    torque_1: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 1")
+    torque_2: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 2")
+    torque_3: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 3")
+    torque_4: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 4")
+    torque_5: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 5")
+    torque_6: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 6")
+    torque_7: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 7")
+    torque_8: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 8")
+    torque_9: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 9")
+    torque_10: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 10")
+    torque_11: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 11")
+    torque_12: jax.Array = parameter("N m", -200.0, 200.0, 0.0, "torque to the left at knot 12")
+
+    def init(self) -> UnnamedMemory:
+        return UnnamedMemory(jnp.zeros(()), self.start_angle + jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
+
+    def force(self, memory: UnnamedMemory, motion: Motion) -> tuple[UnnamedMemory, Wrench]:
+        """Wrench along and about the chassis, and the quantities one step on."""
+        seen = quantities(memory, motion)
+        number = jnp.round(self.quantity) - 1
+        periodic = (number >= 3) & (number <= 5)
+        value = jnp.where(jnp.arange(len(QUANTITIES)) == number, seen, 0.0).sum()
+        span = jnp.where(self.high == self.low, 1.0, self.high - self.low)
+        position = jnp.where(periodic, value * (KNOTS / TURN), (value - self.low) * ((KNOTS - 1) / span))
+        weights = hats(position, periodic)
+        forces = jnp.stack([getattr(self, f"force_{k}") for k in range(1, KNOTS + 1)])
+        torques = jnp.stack([getattr(self, f"torque_{k}") for k in range(1, KNOTS + 1)])
+        force, torque = (weights * forces).sum(), (weights * torques).sum()
+        sides = 1 + self.with_motion * (soft_sign(driven_mean(motion, motion.contact_vx), REST_SPEED) - 1)
+        turning = 1 + self.with_motion * (soft_sign(seen[2], REST_RATE) - 1)
+        wrench = replace(Wrench.zero(), fx=force * sides.mean(),
+                         tz=torque * turning + force * (sides[1] - sides[0]) * motion.track / 4)
+        return _advanced(memory, motion), wrench
+
+
+def _advanced(memory: UnnamedMemory, motion: Motion) -> UnnamedMemory:
+    """Memory one physics step on."""
+    rolling = jnp.abs(motion.spin).mean() * motion.wheel_radius
+    moves = jnp.where(rolling < REST_SPEED, 0.0, 1.0)
+    return UnnamedMemory(memory.time + motion.dt, memory.angle + motion.spin * motion.dt,
+                         moves * (memory.moving + motion.dt), moves * (memory.distance + rolling * motion.dt))
