@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import RESULTS, device_name, figure, provenance, record
-from sysid.close_loop import LoopConfig, Result, close_loop
+from sysid.close_loop import LoopConfig, Result, close_loop, prepare
 from sysid.log import Log, load_log
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.report import effects as named_effects
@@ -80,7 +80,7 @@ def shared(settings: Benchmark) -> None:
     """One command, the same settings for all sets."""
     references = [load_log(settings.data / "plant" / name) for name in REFERENCES]
     config = LoopConfig()
-    reference = reference_of(references, config)
+    ready = prepare(reference_of(references, config), references[0].spec, config)
     path = RESULTS / "undeclared_shared.json"
     content = json.loads(path.read_text()) if path.exists() else {"sets": {}}
     content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
@@ -88,7 +88,7 @@ def shared(settings: Benchmark) -> None:
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
-        result = replace(close_loop(log, (), config, reference=reference), references=tuple(references))
+        result = replace(close_loop(log, (), config, reference=ready), references=tuple(references))
         report = make_report(result)
         write_run(settings.work / "shared" / name, result, report)
         content["sets"][name] = {
@@ -126,19 +126,19 @@ def plant(settings: Benchmark) -> None:
     first, count = (int(one) for one in settings.part.split("/"))
     jobs = [job for number, job in enumerate(jobs) if number % count == first - 1]
     config = LoopConfig()
-    reference = None
+    ready = None
     for label, content, seed in jobs:
         verdict = work / "verdicts" / f"{label}.json"
         if verdict.exists():
             continue
-        if reference is None:
-            reference = reference_of(days, config)
+        if ready is None:
+            ready = prepare(reference_of(days, config), days[0].spec, config)
         folder = work / "logs" / label
         if not folder.exists():
             make_log(folder, effects=content, seed=seed)
         write_json(work / "truth" / f"{label}.json", content)
         began = time.perf_counter()
-        result = close_loop(load_log(folder), (), config, reference=reference)
+        result = close_loop(load_log(folder), (), config, reference=ready)
         write_json(verdict, {**brief(result), "seconds": time.perf_counter() - began})
         print(label, result.search.verdict, [one.hypothesis.key for one in result.search.accepted],
               f"{result.search.share:.2f}", flush=True)
@@ -188,7 +188,7 @@ def brief(result: Result) -> dict[str, Any]:
     """A verdict without its report; held-out trials stay closed."""
     found = result.search
     return {"verdict": found.verdict, "share": found.share, "excess": list(found.excess),
-            "p_value": found.scan.p_family, "gain": float(found.scan.gain.max()),
+            "p_value": found.p_value, "gain": float(found.scan.gain.max()),
             "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
                         for one in named_effects(result)] if found.verdict == "named" else [],
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.refit.q.tolist()] for one in each]

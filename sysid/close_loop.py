@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -29,16 +29,18 @@ import numpy as np
 from sysid import command_line
 from sysid.log import Log
 from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.loop.drives import make_drives
+from sysid.loop.drives import CHUNK, make_drives
 from sysid.loop.evidence import Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
+from sysid.loop.wander import Wander, estimate
 from sysid.result import Progress
-from sysid.rollout import Plant, vehicle_plant
+from sysid.rollout import PathReplay, Plant, vehicle_plant
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
+from whill_mjx.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -64,21 +66,55 @@ class LoopConfig:
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """All of a vehicle that does not depend on the drives in question; its compiled replay serves many logs."""
+
+    reference: Reference
+    plant: Plant
+    hypotheses: tuple[Hypothesis, ...]
+    full: Any
+    """The vehicle with the whole catalogue at neutral."""
+    names: tuple[str, ...]
+    paths: PathReplay
+    wander: Wander
+
+
+@dataclass(frozen=True)
 class Result:
     """A closed loop before the held-out trials are opened."""
 
     log: Log
     references: tuple[Log, ...]
     config: LoopConfig
-    reference: Reference
-    hypotheses: tuple[Hypothesis, ...]
-    full: Any
-    """The vehicle with the whole catalogue at neutral."""
-    names: tuple[str, ...]
+    prepared: Prepared
     search: Search
     evidence: Evidence
-    plant: Plant
     seconds: dict[str, float]
+
+    @property
+    def reference(self) -> Reference:
+        """The vehicle as it was."""
+        return self.prepared.reference
+
+    @property
+    def plant(self) -> Plant:
+        """What replays it."""
+        return self.prepared.plant
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """What was tried."""
+        return self.prepared.hypotheses
+
+    @property
+    def full(self) -> Any:
+        """The vehicle with the whole catalogue at neutral."""
+        return self.prepared.full
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its parameters."""
+        return self.prepared.names
 
     @cached_property
     def before(self) -> Any:
@@ -95,7 +131,7 @@ class Result:
 
 def close_loop(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
-    progress: Progress | None = None, reference: Reference | None = None,
+    progress: Progress | None = None, reference: Reference | Prepared | None = None,
 ) -> Result:
     """Verdict on the training trials of a log; its held-out trials are not looked at.
 
@@ -103,35 +139,51 @@ def close_loop(
         log: the drives in question.
         references: drives of the same vehicle on other days.
         vehicle: `VehicleParams` fitted before, kept as the reference.
-        reference: a reference made before, for many logs of one vehicle.
+        reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
     _check(log, references)
     began = time.perf_counter()
-    plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     if reference is None:
         known = bool(references) or vehicle is not None
         start = preset_params(log.spec, config.preset) if vehicle is None else vehicle
-        logs = tuple(references) or (log,)
-        reference = make_reference(plant, start, logs, known, iterations, progress=progress,
-                                   fitted=vehicle is not None)
+        iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+        reference = make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations,
+                                   progress=progress, fitted=vehicle is not None)
+    ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
+    reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
-    found = hypotheses(log.spec, reference.params)
-    full = with_catalogue(reference.params, found)
     base = base_values(full)
-    names = tuple(base)
-    drives = make_drives(plant, full, names, log.training)
+    drives = make_drives(ready.plant, full, names, log.training, paths=ready.paths)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
     evidence, slopes = gather(drives, reference, found, full, progress)
     gathered = time.perf_counter()
     refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
     draws = min(config.draws, 300) if config.quick else config.draws
-    outcome = search(evidence, found, refitter, config.thresholds, draws, config.seed, progress)
+    outcome = search(evidence, found, refitter, ready.wander, config.thresholds, draws, config.seed, progress)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted,
                "search": time.perf_counter() - gathered}
-    return Result(log, tuple(references), config, reference, found, full, names, outcome, evidence, plant, seconds)
+    return Result(log, tuple(references), config, ready, outcome, evidence, seconds)
+
+
+def prepare(
+    reference: Reference, spec: VehicleSpec, config: LoopConfig | None = None, progress: Progress | None = None
+) -> Prepared:
+    """A vehicle with the catalogue, ready for `close_loop` on one log after the other."""
+    plant = _plant(spec, config or LoopConfig())
+    found = hypotheses(spec, reference.params)
+    full = with_catalogue(reference.params, found)
+    base = base_values(full)
+    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), CHUNK)
+    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), paths=paths)
+    drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
+    wander = estimate(drives, reference, found, full, progress)
+    return Prepared(reference, plant, found, full, tuple(base), paths, wander)
+
+
+def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
+    return vehicle_plant(spec, VehicleConfig(physics_dt=config.physics_dt))
 
 
 def vehicle_before(result: Result) -> Any:

@@ -221,7 +221,14 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
     return results
 
 
-def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
+def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0) -> jax.Array:
+    """States (R + 1, 9) at the records, as `Plant.observe` tells them, of one drive.
+
+    Args:
+        command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].
+        start: (5,) x, y, yaw, v, omega.
+        warm_up: physics steps at the start's speeds before it.
+    """
     def physics(state: Any, command: jax.Array) -> tuple[Any, None]:
         return plant.substep(params, state, command), None
 
@@ -232,16 +239,48 @@ def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
             state = plant.substeps(params, state, commands)
         return state, plant.observe(state)
 
-    state = plant.place(params, one.start)
-    if one.warm_up:
-        state = plant.move(_settle(plant, params, state, one.start[3:], one.warm_up), one.start)
+    state = plant.place(params, start)
+    if warm_up:
+        state = plant.move(_settle(plant, params, state, start[3:], warm_up), start)
     first = plant.observe(state)
-    _, later = jax.lax.scan(record, state, one.command)
-    path = jnp.concatenate([first[None], later])  # (R + 1, 9)
+    _, later = jax.lax.scan(record, state, command)
+    path = jnp.concatenate([first[None], later])
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     # The measured yaw may count full turns from another origin than the simulated one.
-    path = path.at[:, 2].add(jax.lax.stop_gradient(_turns(one.start[2] - first[2])))
+    return path.at[:, 2].add(jax.lax.stop_gradient(_turns(start[2] - first[2])))
+
+
+class PathReplay:
+    """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
+
+    It is compiled once for all batches of the same length, whatever their trials.
+    """
+
+    def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
+        def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> jax.Array:
+            return path_of(plant, set_values(values), command, start, warm_up)
+
+        self.rows = rows
+        self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), static_argnums=3)
+
+    def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
+        """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""
+        count = len(values)
+        spare = -count % self.rows
+        values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)])
+        trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
+        command, start = np.asarray(batch.command), np.asarray(batch.start)
+        parts = []
+        for i in range(0, len(values), self.rows):
+            chosen = trials[i : i + self.rows]
+            parts.append(np.asarray(self._run(jnp.asarray(values[i : i + self.rows], jnp.result_type(float)),
+                                              command[chosen], start[chosen], batch.warm_up)))
+        return np.concatenate(parts)[:count]
+
+
+def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
+    path = path_of(plant, params, one.command, one.start, one.warm_up)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]

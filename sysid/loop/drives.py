@@ -11,10 +11,31 @@ import numpy as np
 from sysid.log import Trial
 from sysid.loop.features import BIN, Features, make_features
 from sysid.loop.noise import roughness
-from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
-from whill_mjx.parameters import set_values
+from sysid.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Replay, Simulated, make_batch
+from whill_mjx.parameters import get_values, set_values
+from whill_mjx.types import parameters_of
 
-CHUNK = 80  # instances of one replay call: one compilation, and a working set that fits the cache
+CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow the cache
+
+
+@dataclass(frozen=True)
+class Courses:
+    """Which trials repeat one another's motion: same commands, same start at rest or in motion.
+
+    Where they start and which way they face does not matter to a vehicle in its own frame, unless something in the
+    room does: replicates are simulated once.
+    """
+
+    first: np.ndarray  # (U,) one trial of each course
+    of_trial: np.ndarray  # (B,) course of each trial
+    room: tuple[tuple[int, float], ...]
+    """Free parameters that tie the motion to the room: index and neutral value."""
+    shared: bool
+    """False where a parameter that is not free does so."""
+
+    def repeat(self, values: np.ndarray) -> bool:
+        """Whether trials of one course repeat one another with these values (P,)."""
+        return self.shared and all(values[index] == neutral for index, neutral in self.room)
 
 
 @dataclass(frozen=True)
@@ -24,6 +45,9 @@ class Drives:
     trials: tuple[Trial, ...]
     names: tuple[str, ...]
     replay: Replay
+    paths: PathReplay
+    batch: Batch
+    courses: Courses
     measured: Measured
     features: Features
     target: np.ndarray  # (B, K, 5) measured features
@@ -42,11 +66,31 @@ class Drives:
 
     def simulate(self, values: np.ndarray) -> np.ndarray:
         """Features (N, B, K, 5) of replays with values (N, P)."""
-        rows = max(CHUNK // len(self.trials), 1)
-        count = len(values)
-        padded = np.concatenate([values, np.repeat(values[-1:], -count % rows, axis=0)])
-        parts = [self.features.of(self.replay.simulate(padded[i : i + rows])) for i in range(0, count, rows)]
-        return np.concatenate(parts)[:count]
+        every = np.arange(len(self.trials))
+        once = [self.courses.repeat(row) for row in values]
+        rows = [self.courses.first if shared else every for shared in once]
+        sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
+        paths = self.paths(values[sets], self.batch, np.concatenate(rows))
+        out, start = [], 0
+        for shared, each in zip(once, rows, strict=True):
+            mine = paths[start : start + len(each)]
+            start += len(each)
+            out.append(self.features.of(self._sampled(mine[self.courses.of_trial] if shared else mine)))
+        return np.stack(out)
+
+    def _sampled(self, paths: np.ndarray) -> Simulated:
+        """Paths (B, R + 1, 9) at the measurements' times."""
+        row = np.arange(len(paths))[:, None]
+
+        def at(index: Any, weight: Any, columns: slice) -> np.ndarray:
+            index, seen = np.asarray(index), paths[:, :, columns].astype(float)
+            before, after = seen[row, index], seen[row, index + 1]
+            return before + np.asarray(weight)[..., None] * (after - before)
+
+        one = self.batch
+        pose = at(one.pose_index, one.pose_weight, POSE)
+        odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
+        return Simulated(pose, odometry, paths[:, -1, 8])  # type: ignore[arg-type]
 
     def jacobian(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Features (B, K, 5) and their derivatives (B, K, 5, P) at values (P,): exact, from one forward-mode replay."""
@@ -69,31 +113,70 @@ class Drives:
         Skidding wheels make the motion rough in its parameters: over the size of a day's change the mean slope counts.
         `sets` turns unit coordinates (P,) into values of all replayed parameters.
         """
-        ends, rows = [], []
-        for p in range(len(u)):
-            for sign in (1, -1):
-                point = u.copy()
-                point[p] = np.clip(point[p] + sign * sizes[p], 0.0, 1.0)
-                ends.append(float(point[p]))
-                rows.append(sets(point))
-        seen = self.simulate(np.stack(rows))
-        return np.stack([(seen[2 * p] - seen[2 * p + 1]) / (ends[2 * p] - ends[2 * p + 1]) for p in range(len(u))],
-                        axis=-1)
+        points, spans = quotients(u, sizes)
+        seen = self.simulate(np.stack([sets(point) for point in points]))
+        return np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
         batch, measured = make_batch(trials, dt)
         features = make_features(trials, self.features.width)
-        return Drives(trials, self.names, self.replay.on(batch), measured, features, features.of(measured))
+        courses = _courses(batch, self.courses.room, self.courses.shared)
+        return Drives(trials, self.names, self.replay.on(batch), self.paths, batch, courses, measured, features,
+                      features.of(measured))
+
+
+def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
+    """Points (2 P of (P,)), above and below u in each of its P coordinates in turn, and how far each pair is apart."""
+    points, spans = [], []
+    for p in range(len(u)):
+        pair = []
+        for sign in (1, -1):
+            point = u.copy()
+            point[p] = np.clip(point[p] + sign * sizes[p], 0.0, 1.0)
+            pair.append(point)
+        points += pair
+        spans.append(float(pair[0][p] - pair[1][p]))
+    return points, spans
 
 
 def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],
-                width: float = BIN) -> Drives:
-    """Drives of trials, replayed with the named parameters of `params` free."""
+                width: float = BIN, paths: PathReplay | None = None) -> Drives:
+    """Drives of trials, replayed with the named parameters of `params` free.
+
+    `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
+    """
     batch, measured = make_batch(trials, plant.dt)
-    replay = Replay(plant, batch, lambda values: set_values(params, names, values))
+    names = tuple(names)
+
+    def vehicle(values: Any) -> Any:
+        return set_values(params, names, values)
+
+    neutral = {f"{effect.name}.{field}": about.neutral for effect in getattr(params, "effects", ())
+               if effect.room_fixed for field, about in parameters_of(effect).items()}
+    held = [name for name in neutral if name not in names]
+    shared = all(float(get_values(params, [name])[0]) == neutral[name] for name in held)
+    room = tuple((names.index(name), neutral[name]) for name in neutral if name in names)
+    courses = _courses(batch, room, shared)
     features = make_features(trials, width)
-    return Drives(trials, tuple(names), replay, measured, features, features.of(measured))
+    paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))
+    return Drives(trials, names, Replay(plant, batch, vehicle), paths, batch, courses, measured, features,
+                  features.of(measured))
+
+
+def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:
+    """Trials of a batch with the same commands and the same speeds at the start."""
+    command, start = np.asarray(batch.command), np.asarray(batch.start)
+    seen: dict[bytes, int] = {}
+    first: list[int] = []
+    of_trial = []
+    for i in range(len(command)):
+        key = command[i].tobytes() + start[i, 3:].tobytes()
+        if key not in seen:
+            seen[key] = len(first)
+            first.append(i)
+        of_trial.append(seen[key])
+    return Courses(np.array(first), np.array(of_trial), room, shared)
 
 
 def _first(simulated: Simulated) -> Simulated:

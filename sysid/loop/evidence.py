@@ -8,14 +8,14 @@ thousands of simulated nulls are then algebra on these products.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.log import Trial
 from sysid.loop.catalogue import LEVELS, Hypothesis, base_values
 from sysid.loop.drives import CHUNK, Drives
-from sysid.loop.reference import Reference, alike, difference_sizes, expected_without
+from sysid.loop.reference import Reference, alike, difference_sizes
 from sysid.result import Progress
 from whill_mjx.types import VehicleParams
 
@@ -108,11 +108,11 @@ def with_values(values: np.ndarray, names: Sequence[str], changes: dict[str, flo
 
 def gather(
     drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams,
-    progress: Progress | None = None,
+    progress: Progress | None = None, pools: bool = True,
 ) -> tuple[Evidence, np.ndarray]:
     """Simulate and multiply out; also returns the base's derivatives (B, K, C, P).
 
-    `full` is the vehicle with the catalogue; `drives` free all its parameters.
+    `full` is the vehicle with the catalogue; `drives` free all its parameters. `pools`: with noise for simulated nulls.
     """
     base = base_values(full)
     names = list(drives.names)
@@ -125,7 +125,7 @@ def gather(
     design = white.apply(np.concatenate([slopes, signatures], axis=-1), drives.mask)
     count, size = len(residual), residual[0].size
     residual, design = residual.reshape(count, size), design.reshape(count, size, -1)
-    pool = [_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials)]
+    pool = [_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials)] if pools else []
     offset = reference.space.size
     placed = tuple(Columns(c.hypothesis, c.level, tuple(offset + i for i in c.index)) for c in columns)
     evidence = Evidence(
@@ -133,6 +133,25 @@ def gather(
         np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
         tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives))
     return evidence, slopes
+
+
+def at_fit(evidence: Evidence, residual: np.ndarray, jacobian: np.ndarray, moved: np.ndarray) -> Evidence:
+    """The evidence after a fit of the base and of some coordinates, which join the base.
+
+    Args:
+        residual: (B, n) white residual there.
+        jacobian: (B, n, P + k) of the white features there.
+        moved: (P,) how far the base parameters are from the reference.
+    """
+    size, extra = evidence.base_size, jacobian.shape[-1] - evidence.base_size
+    residual = residual + jacobian[..., :size] @ moved
+    design = np.concatenate([jacobian, evidence.design[..., size:]], axis=-1)
+    precision = np.zeros((size + extra, size + extra))
+    precision[:size, :size] = evidence.precision
+    columns = tuple(replace(c, index=tuple(i + extra for i in c.index)) for c in evidence.columns)
+    return replace(evidence, residual=residual, design=design, base_size=size + extra, columns=columns,
+                   precision=precision, products=np.einsum("bni,bnj->bij", design, design, optimize=True),
+                   moments=np.einsum("bni,bn->bi", design, residual))
 
 
 def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
@@ -155,7 +174,7 @@ def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
     bins, channels = mask.shape
     rows = []
     for one in like:
-        series = (one.series - (expected_without(reference.leftovers, one) if reference.known else 0.0)) * one.mask
+        series = (one.series - (reference.expected_on_others(one))) * one.mask
         inside = np.flatnonzero(one.mask.prod(-1) > 0)
         last = inside[-1] + 1 if len(inside) else len(series)
         fitted = np.resize(series[:last], (bins, channels))  # a longer drive repeats a shorter one's noise

@@ -60,6 +60,10 @@ class Reference:
         same = [one for one in self.leftovers if alike(one.trial, trial)]
         return mean_by_day(same, bins) if self.known else np.zeros((bins, self.leftovers[0].series.shape[1]))
 
+    def expected_on_others(self, one: Leftover) -> np.ndarray:
+        """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
+        return expected_without(self.leftovers, one) if self.known else np.zeros_like(one.series)
+
     def target_of(self, drives: Drives) -> np.ndarray:
         """(B, K, C) measured features less what the model is known to leave of such drives."""
         bins = drives.target.shape[1]

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.loop.catalogue import Hypothesis
-from sysid.loop.drives import Drives
+from sysid.loop.drives import Drives, quotients
 from sysid.loop.evidence import with_values
 from sysid.loop.reference import Reference, difference_sizes
 
 TRIES = ((1.0, 1.0), (1.0, 0.3), (30.0, 1.0))
 """Factors on the damping and shares of the step that are tried in one iteration."""
+TOLERANCE = 2e-3
+"""Share of what is left above the noise that a step must bring to go on."""
 REACH = 4.0
 """Standard deviations of the day-to-day spread that a base parameter may be off. What lies further is an effect."""
 STEP_Q = 0.08
@@ -39,6 +41,21 @@ class Refit:
         return list(np.split(self.q, np.cumsum([len(one.axes) for one in self.hypotheses])[:-1]))
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    u: np.ndarray  # (P,)
+    q: np.ndarray  # (k,)
+    slopes: np.ndarray | None = None  # (B, n, P) of the white features by u there, if known
+
+    @classmethod
+    def at(cls, refit: Refit) -> Start:
+        """Where a fit ended."""
+        return cls(refit.hypotheses, refit.u, refit.q, refit.jacobian[..., : len(refit.u)])
+
+
 class Refitter:
     """Refits on one set of drives. The base Jacobian is kept from the reference: a day moves it by percents."""
 
@@ -53,71 +70,86 @@ class Refitter:
         self.low, self.high = np.maximum(reference.u - away, 0.0), np.minimum(reference.u + away, 1.0)
         self.base_index = [self.names.index(name) for name in reference.space.names]
 
-    def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = 12,
-            u: np.ndarray | None = None, tolerance: float = 2e-3) -> Refit:
-        """Minimise over (u, q) from a start by damped Gauss-Newton.
+    def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = 12) -> Refit:
+        """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
+        return self.fit_all([Start(tuple(hypotheses), self.reference.u, q)], iterations)[0]
+
+    def fit_all(self, starts: Sequence[Start], iterations: int) -> list[Refit]:
+        """Fits from several starts, side by side: what they ask of the simulator at one time goes into one call."""
+        runs = [self._run(start, iterations) for start in starts]
+        asked = {number: next(run) for number, run in enumerate(runs)}
+        done: dict[int, Refit] = {}
+        while asked:
+            white = self._white(self.drives.simulate(np.concatenate(list(asked.values()))))
+            place, following = 0, {}
+            for number, sets in asked.items():
+                try:
+                    following[number] = runs[number].send(white[place : place + len(sets)])
+                except StopIteration as end:
+                    done[number] = end.value
+                place += len(sets)
+            asked = following
+        return [done[number] for number in range(len(starts))]
+
+    def _run(self, start: Start, iterations: int) -> Generator[np.ndarray, np.ndarray, Refit]:
+        """One fit: yields parameter sets (N, all), is sent their white features (N, B, n).
 
         The coordinates' columns are renewed in every iteration, those of the base parameters only where a step did not
         bring what they promised: a day moves them by percents, and they are the dearer ones.
         """
-        u = self.reference.u.copy() if u is None else u.copy()
-        q = self._within(hypotheses, np.array(q, float))
-        slopes, fresh, damping, calm = self.white_slopes, bool(np.allclose(u, self.reference.u)), 1e-3, 0
-        residual, cost = self._cost(hypotheses, u, q)
-        for iteration in range(iterations):
-            jacobian = np.concatenate([slopes, self._coordinate_columns(hypotheses, u, q, residual)], axis=-1)
+        found, u = start.hypotheses, start.u.copy()
+        q = self._within(found, np.array(start.q, float))
+        slopes = self.white_slopes if start.slopes is None else start.slopes
+        fresh = start.slopes is not None or bool(np.allclose(u, self.reference.u))
+        damping, calm, stale = 1e-3, 0, False
+        white = yield self._set(found, u, q)[None]
+        residual, cost = self._left(white[0], u)
+        for iteration in range(iterations + 1):
+            sets, steps = self._differences(found, u, q)
+            points, spans = quotients(u, difference_sizes(self.reference.spread)) if stale else ([], [])
+            sets += [self._set(found, point, q) for point in points]
+            columns = np.zeros((*residual.shape, 0))
+            if sets:
+                white = yield np.stack(sets)
+                at = self.target - residual
+                columns = np.stack([(white[i] - at) / steps[i] for i in range(len(q))], axis=-1) if len(q) else columns
+                if stale:
+                    pairs = white[len(q) :]
+                    slopes = np.stack([(pairs[2 * p] - pairs[2 * p + 1]) / span for p, span in enumerate(spans)], -1)
+                    fresh, stale = True, False
+            jacobian = np.concatenate([slopes, columns], axis=-1)
+            if iteration == iterations:
+                break
             tried, promised = [], []
             for factor, share in TRIES:
-                step, promise = self._step(hypotheses, u, q, residual, jacobian, damping * factor)
+                step, promise = self._step(found, u, q, residual, jacobian, damping * factor)
                 tried.append((np.clip(u + share * step[: len(u)], self.low, self.high),
-                              self._within(hypotheses, q + share * step[len(u) :])))
+                              self._within(found, q + share * step[len(u) :])))
                 promised.append(promise * share * (2 - share))
-            white = self._white(self.drives.simulate(np.stack([self._set(hypotheses, *each) for each in tried])))
-            left = [self.target - one for one in white]
-            costs = np.array([np.square(left[i]).sum() + self._prior(tried[i][0]) for i in range(len(tried))])
-            best = int(np.nanargmin(costs))
-            gained = cost - float(costs[best])
+            white = yield np.stack([self._set(found, *each) for each in tried])
+            left = [self._left(one, tried[i][0]) for i, one in enumerate(white)]
+            best = int(np.nanargmin([each[1] for each in left]))
+            gained = cost - left[best][1]
             kept = gained > 0.6 * promised[best]
             if gained > 0:
-                (u, q), residual, cost = tried[best], left[best], float(costs[best])
+                (u, q), (residual, cost) = tried[best], left[best]
                 damping = max(damping * (0.2 if TRIES[best][0] == 1.0 else 6.0), 1e-6)
             elif fresh:
                 damping *= 1e3
-            small = gained < tolerance * max(cost - self._floor(), 1.0)
-            if small and fresh:
-                calm += 1
-                if calm == 2 or damping > 1e4:
-                    break
-            else:
-                calm = 0
+            small = gained < TOLERANCE * max(cost - self._floor(), 1.0)
+            calm = calm + 1 if small and fresh else 0
+            if calm == 2 or (calm and damping > 1e4):
+                break
             if kept and not small:
                 fresh = False
             elif iteration < iterations - 1:
-                slopes, fresh = self._base_columns(hypotheses, u, q), True
-        jacobian = np.concatenate([slopes, self._coordinate_columns(hypotheses, u, q, residual)], axis=-1)
-        return Refit(tuple(hypotheses), u, q, cost, residual, jacobian, self._set(hypotheses, u, q))
+                stale = True
+        return Refit(found, u, q, cost, residual, jacobian, self._set(found, u, q))
 
-    def _cost(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-        at = self._white(self.drives.simulate(self._set(hypotheses, u, q)[None]))[0]
-        residual = self.target - at
+    def _left(self, white: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
+        """White residual (B, n) and cost."""
+        residual = self.target - white
         return residual, float(np.square(residual).sum() + self._prior(u))
-
-    def _coordinate_columns(
-        self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray, residual: np.ndarray
-    ) -> np.ndarray:
-        """(B, n, k) derivative of the white features by the coordinates, by differences."""
-        if len(q) == 0:
-            return np.zeros((*residual.shape, 0))
-        sets, steps = self._differences(hypotheses, u, q)
-        seen = self._white(self.drives.simulate(np.stack(sets[1:])))
-        at = self.target - residual
-        return np.stack([(seen[i] - at) / steps[i] for i in range(len(q))], axis=-1)
-
-    def _base_columns(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """(B, n, P) derivative by the base parameters at (u, q)."""
-        slopes = self.drives.differences(lambda point: self._set(hypotheses, point, q), u,
-                                         difference_sizes(self.reference.spread))
-        return self._white(slopes)
 
     def _floor(self) -> float:
         return 0.5 * float((self.drives.mask > 0).sum())
@@ -148,7 +180,8 @@ class Refitter:
 
     def _differences(self, hypotheses: Sequence[Hypothesis], u: np.ndarray,
                      q: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
-        sets, steps = [self._set(hypotheses, u, q)], []
+        sets: list[np.ndarray] = []
+        steps: list[float] = []
         for i in range(len(q)):
             step = STEP_Q * max(abs(q[i]), 1.0)
             moved = q.copy()

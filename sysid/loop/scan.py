@@ -1,8 +1,10 @@
 """How much each hypothesis explains, and how much it would explain if nothing were missing.
 
 The gain of a hypothesis is by how much its columns lower the sum of squares below what base parameters, held by their
-day-to-day spread, can reach. Its null distribution is that of the same number on simulated days: parameters drawn from
-the spread, noise drawn as whole drives from what the reference leaves.
+day-to-day spread, can reach. Its worth is that gain in units in which days without the effect count too: a coordinate
+that wanders from day to day must be found larger than it wanders. The null distribution of the worth is that of
+simulated days: parameters drawn from the spread, noise drawn as whole drives from what the reference leaves, and the
+reference days' own apparent effects in random proportion.
 """
 
 from __future__ import annotations
@@ -12,91 +14,84 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.loop.catalogue import Hypothesis
+from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import Columns, Evidence
+from sysid.loop.solver import Solver
+from sysid.loop.wander import Wander
 
-RIDGE = 1e-6
 REACH = 1.6
 """How far beyond a level its columns are trusted, as a factor on the level."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Gains of H hypotheses."""
+    """Gains of H hypotheses, each at the level of its highest worth."""
 
-    gain: np.ndarray  # (H,) best over levels
-    q: tuple[np.ndarray, ...]  # per hypothesis the coordinates of that best
-    null: np.ndarray  # (N, H) gains on simulated nulls
+    gain: np.ndarray  # (H,)
+    worth: np.ndarray  # (H,)
+    q: tuple[np.ndarray, ...]  # (k,) per hypothesis
+    null: np.ndarray  # (N, H) worth on simulated nulls
     p: np.ndarray  # (H,) p-value of each by itself
-    p_family: float
-    """p-value of the smallest of them."""
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return family(self.smallest, float(self.p.min()))
+
+    def p_of(self, h: int, worth: float) -> float:
+        """Family-wise p-value of hypothesis h if this is its worth."""
+        return family(self.smallest, float(tail(self.null[:, h], worth)))
 
 
-class Solver:
-    """Ridge fits of base and chosen columns over chosen trials."""
+@dataclass(frozen=True)
+class Found:
+    """One hypothesis at one level; leading axes are those of the moments."""
 
-    def __init__(self, evidence: Evidence, trials: Sequence[int] | None = None):
-        chosen = list(range(len(evidence.residual))) if trials is None else list(trials)
-        self.evidence, self.trials = evidence, chosen
-        self.products = evidence.products[chosen].sum(0)
-        self.moments = evidence.moments[chosen].sum(0)
-
-    def fit(self, index: Sequence[int], moments: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Explained sum of squares (...,) and coefficients (..., P + k) for moments (..., all)."""
-        size = self.evidence.base_size
-        order = [*range(size), *index]
-        matrix = self.products[np.ix_(order, order)].copy()
-        matrix[:size, :size] += self.evidence.precision
-        diagonal = np.diag(matrix).copy()
-        matrix[np.diag_indices(len(order))] += RIDGE * np.maximum(diagonal, 1e-12)
-        right = (self.moments if moments is None else moments)[..., order]
-        solution = np.linalg.solve(matrix, right.T).T if right.ndim > 1 else np.linalg.solve(matrix, right)
-        return (right * solution).sum(-1), solution
+    gain: np.ndarray  # (...,)
+    worth: np.ndarray  # (...,)
+    q: np.ndarray  # (..., k)
 
 
-def gains(
-    solver: Solver, hypotheses: Sequence[Hypothesis], moments: np.ndarray | None = None
-) -> tuple[np.ndarray, list[list[np.ndarray]]]:
-    """Gain (..., H) of each hypothesis, best over its levels, and the coordinates found at each level."""
-    size = solver.evidence.base_size
-    base, _ = solver.fit((), moments)
-    best = np.zeros((*base.shape, len(hypotheses)))
-    found: list[list[np.ndarray]] = [[] for _ in hypotheses]
-    for columns in solver.evidence.columns:
-        one = hypotheses[columns.hypothesis]
-        gain, q = _one_gain(solver, columns, one, moments, base, size)
-        best[..., columns.hypothesis] = np.maximum(best[..., columns.hypothesis], gain)
-        found[columns.hypothesis].append(np.concatenate([np.atleast_1d(gain)[..., None], np.atleast_2d(q)], axis=-1))
-    return best, found
+def look(
+    solver: Solver, columns: Columns, axes: Sequence[Axis], wander: np.ndarray, moments: np.ndarray | None = None,
+    away: np.ndarray | float = 0.0,
+) -> Found:
+    """Fit of one hypothesis at one level; axes that would go below 0 where only more is possible are left out.
 
-
-def _one_gain(
-    solver: Solver, columns: Columns, one: Hypothesis, moments: np.ndarray | None, base: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gain (...,) and coordinates (..., k); axes that would go below 0 where only more is possible are left out."""
-    explained, solution = solver.fit(columns.index, moments)
-    q = solution[..., size:].copy()
-    gain = explained - base
-    one_sided = np.array([not axis.signed for axis in one.axes])
-    upper = np.array([axis.limit if axis.signed else REACH * columns.level for axis in one.axes])
-    low = np.array([-axis.limit if axis.signed else 0.0 for axis in one.axes])
-    wrong = ((q < low) & one_sided).any(-1)
+    Args:
+        wander: (k, k) covariance of the coordinates from day to day.
+        moments: (..., P + S); the evidence's own if not given.
+        away: (..., k) by how much to shift the coordinates.
+    """
+    low = np.array([-axis.limit if axis.signed else 0.0 for axis in axes])
+    upper = np.array([axis.limit if axis.signed else REACH * columns.level for axis in axes])
+    one_sided = np.array([not axis.signed for axis in axes])
+    found = _fit(solver, columns.index, wander, moments, away)
+    wrong = ((found.q < low) & one_sided).any(-1)
     if np.any(wrong):
-        if len(columns.index) == 1:
-            return np.where(wrong, 0.0, gain * _kept(q, upper)), np.where(wrong[..., None], 0.0, q)
-        best, best_q = np.zeros_like(gain), np.zeros_like(q)
-        for position in range(len(columns.index)):
-            explained, solution = solver.fit((columns.index[position],), moments)
-            single = solution[..., size]
-            right = single >= low[position]
-            part = np.where(right, explained - base, 0.0)
-            better = part > best
-            best = np.where(better, part, best)
+        gain, worth, q = (np.where(wrong if leaf.ndim == wrong.ndim else wrong[..., None], 0.0, leaf)
+                          for leaf in (found.gain, found.worth, found.q))
+        for position in range(len(axes)) if len(axes) > 1 else ():
+            part = [position]
+            shift = away[..., part] if isinstance(away, np.ndarray) else away
+            alone = _fit(solver, (columns.index[position],), wander[np.ix_(part, part)], moments, shift)
+            better = wrong & (alone.q[..., 0] >= low[position]) & (alone.worth > worth)
+            gain, worth = np.where(better, alone.gain, gain), np.where(better, alone.worth, worth)
             row = np.zeros_like(q)
-            row[..., position] = single
-            best_q = np.where(better[..., None], row, best_q)
-        gain, q = np.where(wrong, best, gain), np.where(wrong[..., None], best_q, q)
-    return gain * _kept(q, upper), q
+            row[..., position] = alone.q[..., 0]
+            q = np.where(better[..., None], row, q)
+        found = Found(gain, worth, q)
+    kept = _kept(found.q, upper)
+    return Found(found.gain * kept, found.worth * kept, found.q)
+
+
+def _fit(solver: Solver, index: Sequence[int], wander: np.ndarray, moments: np.ndarray | None,
+         away: np.ndarray | float) -> Found:
+    information = solver.information(index)
+    q = np.linalg.solve(information, solver.score(index, moments)[..., None])[..., 0] + away
+    whole = np.linalg.inv(np.linalg.inv(information) + wander)
+    return Found(np.einsum("...i,ij,...j->...", q, information, q), np.einsum("...i,ij,...j->...", q, whole, q), q)
 
 
 def _kept(q: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -105,28 +100,40 @@ def _kept(q: np.ndarray, upper: np.ndarray) -> np.ndarray:
     return np.where(over <= 1.0, 1.0, np.maximum(0.0, 1.0 - (1.0 - 1.0 / np.maximum(over, 1.0)) ** 2))
 
 
+def best(
+    solver: Solver, hypotheses: Sequence[Hypothesis], wander: Wander
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """Gain (H,), worth (H,) and coordinates of each hypothesis at the level of its highest worth."""
+    top: list[Found | None] = [None] * len(hypotheses)
+    for columns, covariance in zip(solver.evidence.columns, wander.covariance, strict=True):
+        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance)
+        so_far = top[columns.hypothesis]
+        if so_far is None or found.worth > so_far.worth:
+            top[columns.hypothesis] = found
+    chosen = [one or Found(np.zeros(()), np.zeros(()), np.zeros(len(hypotheses[h].axes))) for h, one in enumerate(top)]
+    return (np.array([float(one.gain) for one in chosen]), np.array([float(one.worth) for one in chosen]),
+            tuple(one.q for one in chosen))
+
+
 def run(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, draws: int = 1000, seed: int = 0
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, draws: int = 1000,
+    seed: int = 0,
 ) -> Scan:
     """Scan all hypotheses and calibrate on simulated nulls."""
     rng = np.random.default_rng(seed)
     solver = Solver(evidence)
-    gain, found = gains(solver, hypotheses)
-    null, _ = gains(solver, hypotheses, null_moments(evidence, spread, draws, rng))
-    q = best_levels(found, hypotheses)
-    p = np.array([tail(null[:, h], gain[h]) for h in range(len(hypotheses))])
+    gain, worth, q = best(solver, hypotheses, wander)
+    moments = null_moments(evidence, spread, draws, rng)
+    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
+    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    null = np.zeros((draws, len(hypotheses)))
+    for columns, covariance, shapes in zip(evidence.columns, wander.covariance, wander.shapes, strict=True):
+        away = share @ shapes * np.sqrt(np.diag(covariance))
+        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, moments, away)
+        null[:, columns.hypothesis] = np.maximum(null[:, columns.hypothesis], found.worth)
+    p = np.array([tail(null[:, h], worth[h]) for h in range(len(hypotheses))])
     each = np.stack([tail(null[:, h], null[:, h]) for h in range(len(hypotheses))], axis=-1)
-    smallest = each.min(1)
-    return Scan(gain, tuple(q), null, p, family(smallest, float(p.min())))
-
-
-def best_levels(found: list[list[np.ndarray]], hypotheses: Sequence[Hypothesis]) -> list[np.ndarray]:
-    """Per hypothesis the coordinates (k,) of the level that gains most, of what `gains` found."""
-    best = []
-    for each, one in zip(found, hypotheses, strict=True):
-        levels = np.concatenate(each) if each else np.zeros((1, 1 + len(one.axes)))
-        best.append(levels[np.argmax(levels[:, 0]), 1:])
-    return best
+    return Scan(gain, worth, q, null, p, each.min(1))
 
 
 def null_moments(

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
-from sysid.loop.evidence import Evidence
-from sysid.loop.refit import Refit, Refitter
-from sysid.loop.scan import Scan, Solver, best_levels, gains, run, tail
+from sysid.loop.evidence import Evidence, at_fit
+from sysid.loop.refit import Refit, Refitter, Start
+from sysid.loop.scan import Scan, best, run
+from sysid.loop.solver import Solver
+from sysid.loop.wander import Wander
 from sysid.result import Progress
 
-FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the two best
+FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
 
 
 @dataclass(frozen=True)
 class Thresholds:
     """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
 
-    alpha: float = 1e-3
-    """Family-wise p-value below which something is missing."""
-    margin: float = 2.0
-    """Least gain of the best hypothesis, as a multiple of the largest gains of simulated nulls (their 99 % point): days
-    differ in more than the spread of base parameters."""
+    alpha: float = 0.01
+    """Family-wise p-value below which something is missing, and below which an effect is it."""
     share: float = 0.6
     """Least share of the excess residual that named effects explain together."""
     excess: float = 0.06
-    """Excess of the squared residual over the noise, as a share of the noise, that counts as nothing: what reference
-    days differ by among themselves."""
-    missing: float = 0.15
-    """Excess above which something is missing even where no hypothesis gains."""
+    """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
+    quiet: float = 0.05
+    """p-value of the excess that is left from which it passes for a day's own."""
     second: float = 0.25
     """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
     step: float = 0.15
@@ -41,7 +39,11 @@ class Thresholds:
     worthwhile: float = 0.15
     """Least scanned gain of an effect that is refitted, as a share of the best one's."""
     candidates: int = 4
-    """Effects refitted in a round."""
+    """Effects refitted in a round, of each scan."""
+    close: float = 0.5
+    """Share of the best refit's gain from which another one is polished too."""
+    rival: float = 0.5
+    """|cos| of two effects' signatures above which one is not named before the other was refitted."""
     alike: float = 0.9
     """|cos| of two effects' signatures above which they are not told apart."""
 
@@ -54,6 +56,7 @@ class Candidate:
     gain: float
     """By how much it lowers the cost, refitted."""
     p: float
+    """Family-wise, of that gain."""
     share: float
     refit: Refit
 
@@ -74,9 +77,15 @@ class Search:
     """Squared white residual over its number, less 1: before and after."""
     reason: str = ""
 
+    @property
+    def p_value(self) -> float:
+        """Of "nothing is missing": that of the scan and, where refits were tried, of the best of them."""
+        refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
+        return max(self.scan.p_family, refitted)
+
 
 def search(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, thresholds: Thresholds,
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
     draws: int = 1000, seed: int = 0, progress: Progress | None = None,
 ) -> Search:
     """The verdict on one set of drives."""
@@ -84,10 +93,12 @@ def search(
         if progress is not None:
             progress(1, text)
 
-    first = run(evidence, hypotheses, refitter.reference.spread, draws, seed)
-    report("scan")
     base = refitter.fit((), np.zeros(0))
     report("base refit")
+    far = best(Solver(evidence), hypotheses, wander)
+    evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
+    first = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
+    report("scan")
     count = float((refitter.drives.mask > 0).sum())
 
     def excess(fit: Refit) -> float:
@@ -98,48 +109,47 @@ def search(
         return (excess(base) - max(excess(fit), 0.0)) / max(excess(base), thresholds.excess)
 
     found = Search("none", base, base, first, excess=(excess(base), excess(base)))
-    limit = thresholds.margin * float(np.quantile(first.null.max(1), 0.99))
-    missing_gain = first.p_family < thresholds.alpha and float(first.gain.max()) > limit
-    if not (missing_gain or excess(base) > thresholds.missing):
+    if first.p_family >= thresholds.alpha and wander.p_excess(excess(base)) >= thresholds.alpha:
         found.reason = "nothing stands out of the noise and the day-to-day spread"
         return found
     current = base
     similar = imitation(evidence, hypotheses)
     for number in range(thresholds.rounds):
-        scan_gain, starts, p = _rescan(evidence, hypotheses, current, refitter, first)
-        order = _distinct(hypotheses, scan_gain, [one.hypothesis for one in found.accepted], thresholds.candidates)
-        candidates: list[Candidate] = []
-        for h in order:
-            if candidates and scan_gain[h] < max(0.3 * limit, thresholds.worthwhile * scan_gain[order[0]]):
-                continue
-            fit = refitter.fit((*current.hypotheses, hypotheses[h]), np.concatenate([current.q, starts[h]]),
-                               FIRST_LOOK, current.u)
-            candidates.append(Candidate(hypotheses[h], current.cost - fit.cost, float(p[h]), explained(fit), fit))
-            report(f"refit {hypotheses[h].key}")
-        candidates.sort(key=lambda one: -one.gain)
-        for place, one in enumerate(candidates[:2]):
-            if one.gain > max(0.3 * limit, 0.5 * candidates[0].gain):
-                fit = refitter.fit(one.refit.hypotheses, one.refit.q, POLISH, one.refit.u)
-                candidates[place] = Candidate(one.hypothesis, current.cost - fit.cost, one.p, explained(fit), fit)
-                report(f"polish {one.hypothesis.key}")
+        scans = [far, (first.gain, first.worth, first.q)] if number == 0 else [
+            _rescan(evidence, hypotheses, current, refitter, wander)]
+        taken = {one.hypothesis.effect for one in found.accepted}
+        chosen = _starts(hypotheses, scans, first, taken, thresholds)
+        at = Start.at(current)
+        fits = refitter.fit_all([Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
+                                 for h, q in chosen], FIRST_LOOK)
+        report(f"refits, round {number + 1}")
+        least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
+        best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
+        for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
+            fits[i] = fit
+        report(f"polish, round {number + 1}")
+        rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
+        chosen += [(h, _best_start(scans, h)) for h in rivals]
+        fits += refitter.fit_all([Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
+                                  for h, q in chosen[len(fits) :]], POLISH)
+        report(f"rivals, round {number + 1}")
+        candidates = [_candidate(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
+                      for (h, _), fit in zip(chosen, fits, strict=True)]
         candidates.sort(key=lambda one: -one.gain)
         found.rounds.append(candidates)
-        if not candidates:
+        likely = [one for one in candidates if one.p < thresholds.alpha]
+        if not likely or (found.accepted and likely[0].gain < thresholds.second * found.accepted[0].gain):
             break
-        best = candidates[0]
-        needed = limit if number == 0 else max(limit, thresholds.second * found.accepted[0].gain)
-        if best.gain < needed:
+        found.accepted.append(likely[0])
+        found.classes.append(_class_of(likely[0], candidates, hypotheses, similar, thresholds))
+        current = likely[0].refit
+        if wander.p_excess(excess(current)) > thresholds.quiet:
             break
-        found.accepted.append(best)
-        found.classes.append(_class_of(best, candidates, hypotheses, similar, thresholds))
-        current = best.refit
-        if excess(current) < thresholds.excess:
-            break
-    _decide(found, thresholds, excess)
+    _decide(found, thresholds, wander, excess)
     return found
 
 
-def _decide(found: Search, thresholds: Thresholds, excess: Callable[[Refit], float]) -> None:
+def _decide(found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float]) -> None:
     """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one."""
     keep = found.accepted[:1]
     for one in found.accepted[1:]:
@@ -151,9 +161,9 @@ def _decide(found: Search, thresholds: Thresholds, excess: Callable[[Refit], flo
         found.final, found.share = keep[-1].refit, keep[-1].share
     before, after = excess(found.base), excess(found.final)
     found.excess = (before, after)
-    if not keep and before < thresholds.missing:
+    if not keep and wander.p_excess(before) >= thresholds.alpha:
         found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif keep and (found.share >= thresholds.share or after < thresholds.excess):
+    elif keep and (found.share >= thresholds.share or wander.p_excess(after) > thresholds.quiet):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
     else:
@@ -162,40 +172,103 @@ def _decide(found: Search, thresholds: Thresholds, excess: Callable[[Refit], flo
                         f"{after:.0%} above the noise is left")
 
 
+Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
+"""Gain (H,), worth (H,) and coordinates of every hypothesis."""
+
+
 def _rescan(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], current: Refit, refitter: Refitter, first: Scan
-) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Gains, starting coordinates and p-values given what is accepted so far."""
-    if not current.hypotheses:
-        return first.gain, list(first.q), first.p
-    size, extra = evidence.base_size, len(current.q)
-    moved = current.u - refitter.reference.u
-    residual = current.residual + current.jacobian[..., :size] @ moved
-    design = np.concatenate([current.jacobian, evidence.design[..., size:]], axis=-1)
-    precision = np.zeros((size + extra, size + extra))
-    precision[:size, :size] = evidence.precision
-    columns = tuple(replace(c, index=tuple(i + extra for i in c.index)) for c in evidence.columns)
-    later = replace(evidence, residual=residual, design=design, base_size=size + extra, columns=columns,
-                    precision=precision, products=np.einsum("bni,bnj->bij", design, design, optimize=True),
-                    moments=np.einsum("bni,bn->bi", design, residual), pool_moments=())
-    gain, found = gains(Solver(later), hypotheses)
-    p = np.array([tail(first.null[:, h], gain[h]) for h in range(len(hypotheses))])
-    return gain, best_levels(found, hypotheses), p
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], current: Refit, refitter: Refitter, wander: Wander
+) -> Looked:
+    """Of every hypothesis given what is accepted so far."""
+    return best(Solver(at_fit(evidence, current.residual, current.jacobian, current.u - refitter.reference.u)),
+                hypotheses, wander)
 
 
-def _distinct(
-    hypotheses: Sequence[Hypothesis], gain: np.ndarray, taken: Sequence[Hypothesis], count: int
+def _starts(
+    hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, taken: set[str], thresholds: Thresholds
+) -> list[tuple[int, np.ndarray]]:
+    """Hypotheses to refit and where to start, one per effect.
+
+    Of each scan those that gain most, and of the last the one that stands out most. A large effect shows best in the
+    scan around the reference, a small one in that around the base refitted to these drives.
+    """
+    left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
+    order: dict[str, tuple[int, np.ndarray]] = {}
+    for number, (gain, worth, q) in enumerate(scans):
+        standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
+        chosen = sorted(standing, key=lambda h: -gain[h])
+        chosen = [h for h in chosen if gain[h] >= thresholds.worthwhile * gain[chosen[0]]]
+        if number == len(scans) - 1:
+            chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
+        new = 0
+        for h in chosen:
+            if hypotheses[h].effect not in order and new < thresholds.candidates:
+                order[hypotheses[h].effect] = _widest(hypotheses, h, q, standing)
+                new += 1
+    return list(order.values())
+
+
+def _rivals(
+    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
+    thresholds: Thresholds,
 ) -> list[int]:
-    """The best hypotheses by scanned gain, one per effect."""
-    names = {one.effect for one in taken}
-    order = []
-    for h in np.argsort(-gain):
-        if hypotheses[h].effect not in names and gain[h] > 0:
-            names.add(hypotheses[h].effect)
-            order.append(int(h))
-        if len(order) == count:
-            break
-    return order
+    """What might imitate the best fit and was not tried: it must have had its chance before another is named."""
+    if not fits:
+        return []
+    winner = tried[int(np.argmin([fit.cost for fit in fits]))]
+    done = {hypotheses[h].effect for h in tried} | taken
+    out: list[int] = []
+    for h in np.argsort(-similar[winner]):
+        if similar[winner, h] > thresholds.rival and hypotheses[h].effect not in done:
+            done.add(hypotheses[h].effect)
+            out.append(int(h))
+    return out[: thresholds.candidates]
+
+
+def _best_start(scans: Sequence[Looked], h: int) -> np.ndarray:
+    """Coordinates from the scan in which a hypothesis gains most; a small size where it gains nothing."""
+    gain, _, q = max(scans, key=lambda scan: scan[0][h])
+    return q[h] if gain[h] > 0 else np.full(len(q[h]), 0.5)
+
+
+def _widest(
+    hypotheses: Sequence[Hypothesis], h: int, q: Sequence[np.ndarray], standing: Sequence[int]
+) -> tuple[int, np.ndarray]:
+    """The hypothesis of the same effect that has all axes of h and more, started where those alone were found."""
+    mine = {axis.parameter for axis in hypotheses[h].axes}
+    wider = [i for i, one in enumerate(hypotheses) if one.effect == hypotheses[h].effect
+             and mine < {axis.parameter for axis in one.axes}]
+    if not wider:
+        return h, q[h]
+    alone = {hypotheses[i].axes[0].parameter: float(q[i][0]) for i in standing
+             if hypotheses[i].effect == hypotheses[h].effect and len(hypotheses[i].axes) == 1}
+    return wider[0], np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[wider[0]].axes])
+
+
+def _candidate(
+    h: int, fit: Refit, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
+    first: Scan, share: float,
+) -> Candidate:
+    """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
+    one = hypotheses[h]
+    gain = max(current.cost - fit.cost, 0.0)
+    q = fit.q[-len(one.axes) :]
+    size = fit.jacobian.shape[-1] - len(q)
+    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
+    products = flat.T @ flat
+    known = products[:size, :size].copy()
+    extra = evidence.precision.shape[0]
+    known[:extra, :extra] += evidence.precision
+    cross = products[:size, size:]
+    inside = products[size:, size:] - cross.T @ np.linalg.lstsq(known, cross, rcond=None)[0]
+    place = min((i for i, c in enumerate(evidence.columns) if c.hypothesis == h),
+                key=lambda i: abs(evidence.columns[i].level - np.abs(q).max()))
+    moved = np.abs(q) > 1e-9
+    inside, wide = inside[np.ix_(moved, moved)], wander.covariance[place][np.ix_(moved, moved)]
+    alone = float(q[moved] @ inside @ q[moved])
+    whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
+    worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
+    return Candidate(one, gain, first.p_of(h, worth), share, fit)
 
 
 def _class_of(

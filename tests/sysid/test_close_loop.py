@@ -9,6 +9,7 @@ import pytest
 from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after, vehicle_before
 from sysid.log import load_log
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
+from sysid.loop.drives import make_drives
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_whitener, replicate_groups
 from sysid.loop.report import make_report, replay, write_run
@@ -121,6 +122,34 @@ def test_vehicle_after_has_only_the_accepted_effect(sloping):
     names = [effect.name for effect in vehicle_after(sloping).effects]
     extra = set(names) - {effect.name for effect in sloping.reference.params.effects}
     assert extra == {sloping.search.accepted[0].hypothesis.effect}
+
+
+def test_replicates_move_alike_unless_the_room_does_something(drives, sloping):
+    """For every hypothesis: simulating one trial of a course for all gives what each trial by itself gives."""
+    ready = sloping.prepared
+    base = base_values(ready.full)
+    values = [list(base.values())]
+    for one in ready.hypotheses:
+        row = {**base, **one.values(np.ones(len(one.axes)), base)}
+        values.append([row[name] for name in base])
+    made = make_drives(ready.plant, ready.full, ready.names, drives["plain"].training, paths=ready.paths)
+    once = made.simulate(np.array(values))
+    every = replace(made, courses=replace(made.courses, shared=False)).simulate(np.array(values))
+    assert len(made.courses.first) == 3 < len(made.trials)
+    assert np.abs(once - every).max() < 2e-3
+    assert np.sqrt(np.square(once - every).mean()) < 1e-4
+
+
+def test_wander_is_what_days_show(sloping):
+    """Days that differ in gains and friction alone make no effect wander by much, and gains by something."""
+    sizes = {}
+    columns = zip(sloping.evidence.columns, sloping.prepared.wander.covariance, strict=True)
+    for one, covariance in columns:
+        hypothesis = sloping.hypotheses[one.hypothesis]
+        sizes[hypothesis.key, one.level] = float(np.sqrt(np.diag(covariance).max()))
+    assert sizes["track_width", 1.0] < 0.5
+    assert sizes["slope", 1.0] < 0.5
+    assert max(sizes.values()) > 0
 
 
 @pytest.mark.quick

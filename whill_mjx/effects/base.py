@@ -32,6 +32,8 @@ class Effect:
     """Usual values on a real vehicle by parameter, lowest and highest."""
     source: ClassVar[str] = ""
     """Where equation and usual values come from; "estimate" where no source is known."""
+    room_fixed: ClassVar[bool] = False
+    """Whether the motion depends on where in the room the vehicle starts and which way it faces."""
 
     def init(self) -> Any:
         """Memory at the start of a drive."""

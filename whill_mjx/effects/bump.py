@@ -20,6 +20,7 @@ class Bump(Effect):
     """
 
     name = "bump"
+    room_fixed = True
     typical = {"rise": (-0.03, 0.03), "width": (0.2, 0.5), "x": (0.5, 2.0), "y": (-0.5, 0.5)}
     source = "estimate: door sills, cable covers, worn floors"
     rise: jax.Array = parameter("m", -0.2, 0.2, 0.0, "height, H; negative for a hollow")

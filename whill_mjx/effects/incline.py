@@ -21,6 +21,7 @@ class Incline(Effect):
     """
 
     name = "incline"
+    room_fixed = True
     typical = {"along_x": (-0.08, 0.08), "along_y": (-0.05, 0.05)}
     source = "estimate: wheelchair ramps to 1:12 (0.083 rad), cross slopes to 1:20"
     along_x: jax.Array = parameter("rad", -0.3, 0.3, 0.0, "rise of the ground towards +x of the room, a")

@@ -21,6 +21,7 @@ class Ramp(Effect):
     """
 
     name = "ramp"
+    room_fixed = True
     typical = {"rise": (-0.15, 0.15), "length": (1.0, 3.0), "distance": (0.5, 3.0), "direction": (0.0, 0.0)}
     source = "estimate: ramps of buildings to 1:12"
     rise: jax.Array = parameter("m", -1.0, 1.0, 0.0, "height gained, H")

@@ -21,6 +21,7 @@ class Slope(Effect):
     """
 
     name = "slope"
+    room_fixed = True
     typical = {"along_x": (-0.05, 0.05), "along_y": (-0.05, 0.05)}
     source = "estimate: floors to 1 degree, ramps to 3"
     along_x: jax.Array = parameter("rad", -0.2, 0.2, 0.0, "rise of the ground towards +x of the room, a")

@@ -20,6 +20,7 @@ class Wind(Effect):
     """
 
     name = "wind"
+    room_fixed = True
     typical = {"along_x": (-10.0, 10.0), "along_y": (-10.0, 10.0)}
     source = "estimate: 5 N is about 3 m/s on 0.8 m^2"
     along_x: jax.Array = parameter("N", -200.0, 200.0, 0.0, "force towards +x of the room")

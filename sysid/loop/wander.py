@@ -1,0 +1,119 @@
+"""How far each effect seems to wander from day to day on reference drives in which nothing is missing.
+
+A day differs from the next in more than the base parameters: what the model gets wrong changes with them, and an effect
+of the catalogue fits a part of it. Estimated on every reference day by itself, the coordinates of each hypothesis show
+how large that part is. Drives in question must show more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.loop.catalogue import Hypothesis
+from sysid.loop.drives import Drives
+from sysid.loop.evidence import Columns, Evidence, gather
+from sysid.loop.reference import Reference
+from sysid.loop.solver import Solver
+from sysid.result import Progress
+from whill_mjx.types import VehicleParams
+
+ASSUMED = 0.3
+"""Standard deviation of a coordinate from day to day where reference days do not tell."""
+ASSUMED_DAYS = 4.0
+"""How many days the mean over all hypotheses counts as, beside what the days tell of one."""
+EXCESS = 0.06
+"""Standard deviation of a day's excess where reference days do not tell."""
+
+
+@dataclass(frozen=True)
+class Wander:
+    """Day-to-day covariance of the coordinates, in the order of `Evidence.columns`."""
+
+    covariance: tuple[np.ndarray, ...]  # (k, k) each
+    shapes: tuple[np.ndarray, ...]  # (D, k) each: root mean square 1 in units of that covariance
+    freedom: float
+    """Degrees of freedom that the covariances rest on."""
+    excess: float = EXCESS
+    """Standard deviation from day to day of the squared residual over the noise, less 1."""
+
+    def p_excess(self, excess: float) -> float:
+        """Probability of so much excess on a day with nothing in it."""
+        from scipy import stats
+
+        return float(stats.t.sf(excess / self.excess, self.freedom))
+
+
+def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:
+    """Coordinates that wander by themselves with a given standard deviation."""
+    width = max((c.index[-1] for c in columns), default=0) + 1
+    shapes = []
+    for one in columns:
+        shape = np.zeros((width, len(one.index)))
+        shape[one.index, range(len(one.index))] = np.sqrt(width)
+        shapes.append(shape)
+    return Wander(tuple(size**2 * np.eye(len(c.index)) for c in columns), tuple(shapes), ASSUMED_DAYS)
+
+
+def estimate(
+    drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams,
+    progress: Progress | None = None,
+) -> Wander:
+    """Wander on the reference days.
+
+    Args:
+        drives: all training trials of all reference days, in the order of `reference.leftovers`.
+        full: the vehicle with the catalogue; `drives` free all its parameters.
+    """
+    evidence, _ = gather(drives, reference, hypotheses, full, progress, pools=False)
+    day = np.array([one.day for one in reference.leftovers])
+    count = int(day.max()) + 1
+    if not reference.known or count < 2:
+        return no_wander(evidence.columns, ASSUMED if reference.known else 0.0)
+    white = reference.whitener
+    series = np.stack([one.series - reference.expected_on_others(one) for one in reference.leftovers])
+    left = white.apply(series, drives.mask).reshape(len(day), -1)
+    moved = evidence.design[..., : evidence.base_size] @ reference.days.T  # (B, n, D)
+    residual = left + np.take_along_axis(moved, day[:, None, None], axis=-1)[..., 0]
+    evidence = replace(evidence, residual=residual, moments=np.einsum("bni,bn->bi", evidence.design, residual))
+    measured = (drives.mask > 0).reshape(len(day), -1)
+    excess = [np.square(left[day == number]).sum() / measured[day == number].sum() - 1 for number in range(count)]
+    estimates = [coordinates(evidence, np.flatnonzero(day == number)) for number in range(count)]
+    return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)))
+
+
+def _spread(excess: np.ndarray) -> float:
+    """Standard deviation of a new day's excess, drawn towards the assumed one."""
+    count = len(excess)
+    variance = (np.square(excess).sum() + ASSUMED_DAYS * EXCESS**2) / (count + ASSUMED_DAYS)
+    return float(np.sqrt(variance * (1 + 1 / count)))
+
+
+def coordinates(evidence: Evidence, trials: Sequence[int] | np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Coordinates (k,) and their information (k, k) beside the base, for each of the evidence's columns."""
+    solver = Solver(evidence, list(trials))
+    found = []
+    for columns in evidence.columns:
+        information = solver.information(columns.index)
+        found.append((np.linalg.solve(information, solver.score(columns.index)), information))
+    return found
+
+
+def _pooled(columns: Sequence[Columns], days: Sequence[list[tuple[np.ndarray, np.ndarray]]]) -> Wander:
+    """Covariances beyond the noise, each drawn towards what all hypotheses have in common."""
+    count = len(days)
+    ratios = [float(q @ information @ q) / len(q) for day in days for q, information in day]
+    common = max(float(np.median(ratios)) / 0.455, 1.0)  # 0.455: median of chi squared with one degree of freedom
+    covariance, shapes = [], []
+    for position in range(len(columns)):
+        each = np.stack([day[position][0] for day in days])  # (D, k)
+        noise = np.mean([np.linalg.inv(day[position][1]) for day in days], axis=0)
+        seen = (each.T @ each + ASSUMED_DAYS * common * noise) / (count + ASSUMED_DAYS)
+        value, vector = np.linalg.eigh(seen - noise)
+        beyond = (vector * np.maximum(value, 0.0)) @ vector.T
+        covariance.append(beyond)
+        total = np.sqrt(np.maximum(np.diag(each.T @ each) / count, 1e-30))
+        shapes.append(each / total)
+    return Wander(tuple(covariance), tuple(shapes), count + ASSUMED_DAYS)
