@@ -1,30 +1,29 @@
 """Effects that nobody declared: what the closed loop says of logs whose contents it is not told.
 
     python -m benchmarks.undeclared --shared            the sets of ../shared/data/undeclared against plant/plain*
-    python -m benchmarks.undeclared --nulls 20 --effects --scales 1 2 --seeds 1
+    python -m benchmarks.undeclared --nulls 200 --base --scales 2 4 --pairs 10
 
-The second form drives logs with the contact plant (`benchmarks/plant`): reference days, days with nothing in them, each
-catalogue effect at multiples of its base size, and effects that the catalogue does not have. What a log contains goes
-into a file beside it that the loop never reads. Verdicts are kept in `runs/undeclared` and a run that was stopped goes
-on where it was; the figures are written at the end from all verdicts there.
+The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`). Verdicts are kept in
+`runs/undeclared` and a run that was stopped goes on where it was; the figures are written at the end from all verdicts
+there.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, device_name, figure, provenance, record
-from sysid.close_loop import LoopConfig, Result, close_loop, prepare
+from benchmarks import undeclared_plant as contact
+from benchmarks.harness import RESULTS, device_name, provenance
+from sysid.close_loop import LoopConfig, close_loop, prepare
 from sysid.log import Log, load_log
 from sysid.loop.reference import Reference, make_reference
-from sysid.loop.report import effects as named_effects
 from sysid.loop.report import make_report, write_run
 from sysid.rollout import vehicle_plant
 from whill_mjx.config import VehicleConfig
@@ -46,14 +45,16 @@ class Benchmark:
     """Folder with `plant` and `undeclared`."""
     nulls: int = 0
     """Logs of the contact plant with nothing in them."""
-    effects: bool = False
-    """Logs of the contact plant with one effect each, of the catalogue and beyond it."""
-    only: tuple[str, ...] = ()
-    """Only these effects."""
-    scales: tuple[float, ...] = (1.0,)
-    """Multiples of each effect's base size."""
+    base: bool = False
+    """Logs of the contact plant with one effect each at its base size, of the catalogue and beyond it."""
+    scales: tuple[float, ...] = ()
+    """The same at multiples of the size that is noticed with 80 % power, which the base sizes tell."""
     seeds: int = 1
-    """Logs of each effect and size."""
+    """Logs of each effect and multiple."""
+    pairs: int = 0
+    """Logs with two effects of 4 times that size."""
+    full: int = 4
+    """Every how many-th named log also has its held-out trials opened."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     collect: bool = False
@@ -68,12 +69,12 @@ def main(settings: Benchmark) -> None:
     """Run what was asked for."""
     if settings.shared:
         shared(settings)
-    if settings.nulls or settings.effects:
+    if settings.nulls or settings.base or settings.scales or settings.pairs:
         plant(settings)
     if settings.classes:
         look_alikes(settings)
     if settings.collect:
-        figures(settings.work / "plant")
+        contact.figures(settings.work / "plant")
 
 
 def shared(settings: Benchmark) -> None:
@@ -110,52 +111,22 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 
 def plant(settings: Benchmark) -> None:
     """Logs of the contact plant."""
-    from benchmarks.plant.effects import EFFECTS
-    from benchmarks.plant.make import make_log
-
-    work = settings.work / "plant"
-    days = reference_days(work)
-    jobs: list[tuple[str, dict[str, float], int]] = [(f"null_{n:03d}", {}, 2000 + n) for n in range(settings.nulls)]
-    if settings.effects:
-        for index, (name, effect) in enumerate(sorted(EFFECTS.items())):
-            if settings.only and name not in settings.only:
-                continue
-            for scale in settings.scales:
-                for seed in range(settings.seeds):
-                    jobs.append((f"{name}_x{scale:g}_{seed}", {name: scale * effect.base}, 3000 + 50 * index + seed))
+    work, config = settings.work / "plant", LoopConfig()
+    days = contact.reference_days(work)
     first, count = (int(one) for one in settings.part.split("/"))
-    jobs = [job for number, job in enumerate(jobs) if number % count == first - 1]
-    config = LoopConfig()
     ready = None
-    for label, content, seed in jobs:
-        verdict = work / "verdicts" / f"{label}.json"
-        if verdict.exists():
-            continue
-        if ready is None:
-            ready = prepare(reference_of(days, config), days[0].spec, config)
-        folder = work / "logs" / label
-        if not folder.exists():
-            make_log(folder, effects=content, seed=seed)
-        write_json(work / "truth" / f"{label}.json", content)
-        began = time.perf_counter()
-        result = close_loop(load_log(folder), (), config, reference=ready)
-        write_json(verdict, {**brief(result), "seconds": time.perf_counter() - began})
-        print(label, result.search.verdict, [one.hypothesis.key for one in result.search.accepted],
-              f"{result.search.share:.2f}", flush=True)
-    figures(work)
-
-
-def reference_days(work: Path) -> list[Log]:
-    """Six days of the contact plant with nothing in them: one with three replicates, five with one."""
-    from benchmarks.plant.make import make_log
-
-    days = []
-    for number in range(6):
-        path = work / "reference" / f"day_{number + 1}"
-        if not path.exists():
-            make_log(path, seed=1001 + number, replicates=3 if number == 0 else 1)
-        days.append(load_log(path))
-    return days
+    for later in (False, True):  # sizes of the later ones follow from the earlier ones
+        listed = (contact.jobs(work, 0, False, settings.scales, settings.seeds, settings.pairs) if later else
+                  contact.jobs(work, settings.nulls, settings.base, (), 0, 0))
+        for number, job in enumerate(listed):
+            if number % count != first - 1 or (work / "verdicts" / f"{job.label}.json").exists():
+                continue
+            if ready is None:
+                ready = prepare(reference_of(days, config), days[0].spec, config)
+            one = contact.judge(job, ready, work, config, bool(job.effects) and number % settings.full == 0)
+            print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
+                  f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
+    contact.figures(work)
 
 
 def look_alikes(settings: Benchmark) -> None:
@@ -165,7 +136,7 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.loop.drives import make_drives
     from sysid.loop.evidence import gather
 
-    days = reference_days(settings.work / "plant")
+    days = contact.reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
     for sensors, keep in (("odometry", False), ("odometry and outside pose", True)):
         logs = [log if keep else replace(log, trials=tuple(replace(t, ground_truth=None) for t in log.trials))
@@ -182,69 +153,6 @@ def look_alikes(settings: Benchmark) -> None:
         content["sensors"][sensors] = {"classes": members,
                                        "mean_size": float(np.mean([len(each) for each in members.values()]))}
     write_json(Path("sysid/data/classes.json"), content)
-
-
-def brief(result: Result) -> dict[str, Any]:
-    """A verdict without its report; held-out trials stay closed."""
-    found = result.search
-    return {"verdict": found.verdict, "share": found.share, "excess": list(found.excess),
-            "p_value": found.p_value, "gain": float(found.scan.gain.max()),
-            "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
-                        for one in named_effects(result)] if found.verdict == "named" else [],
-            "candidates": [[[one.hypothesis.key, one.gain, one.share, one.refit.q.tolist()] for one in each]
-                           for each in found.rounds]}
-
-
-def figures(work: Path) -> None:
-    """Write benchmarks/results/undeclared.json from all verdicts in the work folder."""
-    from scipy import stats
-
-    from benchmarks.plant.effects import EFFECTS
-
-    cases = list(read_cases(work))
-    nulls = [one for truth, one, _ in cases if not truth]
-    found: dict[str, Any] = {}
-    if nulls:
-        false = sum(one["verdict"] != "none" for one in nulls)
-        found["false_alarms"] = figure([float(false)], f"of {len(nulls)} logs with nothing in them")
-        found["false_alarm_upper"] = figure([float(stats.beta.ppf(0.95, false + 1, len(nulls) - false))], "share")
-        found["null_ks_p"] = figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)], "-")
-    for scale in sorted({scale for truth, _, scale in cases if truth}):
-        inside = [(next(iter(truth)), one) for truth, one, s in cases if truth and s == scale]
-        known = [(name, one) for name, one in inside if EFFECTS[name].known]
-        beyond = [one for name, one in inside if not EFFECTS[name].known]
-        tag = f"x{scale:g}_base"
-        if known:
-            right = [any(name == e["name"] or name in e["class"] for e in one["effects"]) for name, one in known]
-            sizes = [len(e["class"]) for _, one in known for e in one["effects"]]
-            found[f"class_accuracy_{tag}"] = figure([float(np.mean(right))], f"share of {len(known)} logs")
-            wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
-            found[f"wrong_name_{tag}"] = figure([float(np.mean(wrong))], f"share of {len(known)} logs")
-            if sizes:
-                found[f"mean_class_size_{tag}"] = figure([float(np.mean(sizes))], "effects")
-        if beyond:
-            found[f"out_of_catalogue_{tag}"] = figure(
-                [float(np.mean([one["verdict"] == "unexplained" for one in beyond]))], f"share of {len(beyond)} logs")
-    seconds = [one["seconds"] for _, one, _ in cases]
-    found["seconds_per_log"] = figure(seconds, "s, reference fit apart")
-    path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
-    content = json.loads(path.read_text())
-    content["confusion"] = [{"truth": truth, "verdict": one["verdict"], "named": [e["name"] for e in one["effects"]],
-                             "classes": [e["class"] for e in one["effects"]], "explained": one["share"]}
-                            for truth, one, _ in cases]
-    write_json(path, content)
-
-
-def read_cases(work: Path) -> Iterable[tuple[dict[str, float], dict[str, Any], float]]:
-    """Truth, verdict and scale of every log that has a verdict."""
-    from benchmarks.plant.effects import EFFECTS
-
-    for path in sorted((work / "verdicts").glob("*.json")):
-        truth = json.loads((work / "truth" / path.name).read_text())
-        scale = 0.0
-        for name, size in truth.items():
-            scale = round(size / EFFECTS[name].base, 6)
-        yield truth, json.loads(path.read_text()), scale
 
 
 def write_json(path: Path, content: Any) -> None:

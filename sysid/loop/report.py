@@ -33,7 +33,7 @@ from sysid.log import Trial
 from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.refit import Refit
-from sysid.loop.scan import Solver
+from sysid.loop.solver import Solver
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
 from sysid.rollout import Replay, make_batch, predictions
@@ -72,7 +72,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
-        "missing": {"p_value": found.scan.p_family, "excess_before": found.excess[0],
+        "missing": {"p_value": found.p_value, "excess_before": found.excess[0],
                     "excess_after": found.excess[1], "explained": found.share},
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
@@ -174,7 +174,8 @@ def equation_of(one: Hypothesis) -> str:
 
 
 def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (k,), (k,) of the coordinates' confidence intervals; blocks are whole manoeuvres."""
+    """Ends (k,), (k,) of the coordinates' confidence intervals: blocks are whole manoeuvres, and what the coordinates
+    seem to be on days without the effect adds to their variance."""
     from scipy import stats
 
     covariance = np.linalg.inv(information(final, result))
@@ -183,7 +184,9 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     groups = result.evidence.groups
     summed = np.stack([scores[list(group)].sum(0) for group in groups])
     robust = covariance @ (summed.T @ summed) @ covariance * len(groups) / max(len(groups) - 1, 1)
-    deviation = np.sqrt(np.maximum(np.diag(covariance), np.diag(robust)))[size:]
+    wander = [np.diag(result.prepared.wander.at(result.evidence.columns, list(result.hypotheses).index(one), q))
+              for one, q in zip(final.hypotheses, final.split, strict=True)]
+    deviation = np.sqrt(np.maximum(np.diag(covariance), np.diag(robust))[size:] + np.concatenate([[], *wander]))
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(groups) - 1, 1))
     return final.q - quantile * deviation, final.q + quantile * deviation
 
@@ -243,18 +246,15 @@ def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
 def detectable(result: Result) -> list[dict[str, Any]]:
     """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units."""
     found = result.search
-    limit = result.config.thresholds.margin * float(np.quantile(found.scan.null.max(1), 0.99))
+    limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
     solver = Solver(result.evidence)
-    size, precision = result.evidence.base_size, result.evidence.precision
     base = base_values(result.full)
-    inner = np.linalg.inv(solver.products[:size, :size] + precision)
     out, done = [], set()
-    for columns in result.evidence.columns:
+    for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
         one = result.hypotheses[columns.hypothesis]
-        for axis, index in zip(one.axes, columns.index, strict=True):
-            cross = solver.products[:size, index]
-            strength = solver.products[index, index] - cross @ inner @ cross
-            q = (np.sqrt(limit) + 0.84) / np.sqrt(max(strength, 1e-12))
+        for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
+            variance = 1 / float(solver.information((index,))[0, 0]) + wander[position, position]
+            q = (np.sqrt(limit) + 0.84) * np.sqrt(variance)
             usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
             if (one.key, axis.parameter) in done or not usable:
                 continue

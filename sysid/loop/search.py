@@ -261,10 +261,8 @@ def _candidate(
     known[:extra, :extra] += evidence.precision
     cross = products[:size, size:]
     inside = products[size:, size:] - cross.T @ np.linalg.lstsq(known, cross, rcond=None)[0]
-    place = min((i for i, c in enumerate(evidence.columns) if c.hypothesis == h),
-                key=lambda i: abs(evidence.columns[i].level - np.abs(q).max()))
     moved = np.abs(q) > 1e-9
-    inside, wide = inside[np.ix_(moved, moved)], wander.covariance[place][np.ix_(moved, moved)]
+    inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])
     whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
     worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0

@@ -39,11 +39,22 @@ class Wander:
     excess: float = EXCESS
     """Standard deviation from day to day of the squared residual over the noise, less 1."""
 
+    def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
+        """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""
+        mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
+        return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
+
     def p_excess(self, excess: float) -> float:
         """Probability of so much excess on a day with nothing in it."""
         from scipy import stats
 
         return float(stats.t.sf(excess / self.excess, self.freedom))
+
+    def excess_limit(self, alpha: float) -> float:
+        """Excess that a day with nothing in it has with probability alpha."""
+        from scipy import stats
+
+        return float(stats.t.isf(alpha, self.freedom)) * self.excess
 
 
 def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:

@@ -1,0 +1,246 @@
+"""Verdicts of the closed loop on logs of the contact plant: which logs are driven, and what is counted.
+
+First every effect is driven at its base size; how far it stands out there gives the size at which it would be noticed
+with 80 % power. Logs at 2 and 4 times that size, and with pairs of effects, follow. What a log contains is written into
+a file beside it that the loop never reads.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.make import make_log
+from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
+from sysid.log import Log, load_log
+from sysid.loop.report import effects as named_effects
+from sysid.loop.report import make_report, write_run
+from sysid.report import write_report
+
+DAYS = 6
+POWER = 0.84
+"""Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
+SMALLEST = 0.05
+"""Of the base size, below which no size goes."""
+PAIRS = 10
+SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
+    "command_scale": ("command_scale.linear", 1.0, 1.0),
+    "drive_gain_difference": ("drive_gain_difference.difference", 0.0, 1.0),
+    "wheel_radius_difference": ("wheel_radius_difference.difference", 0.0, 1.0),
+    "track_width": ("track_width.error", 0.0, 1.0),
+    "payload_shift": ("payload_shift.mass", 0.0, 1.0),
+    "quadratic_drag": ("quadratic_drag.coefficient", 0.0, 1.0),
+    "side_force": ("side_force.sideways", 0.0, 1.0),
+    "slope": ("slope.along_x", 0.0, 1.0),
+    "sensor_delay": ("sensor_delay.delay", 0.0, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log to drive and to judge."""
+
+    label: str
+    effects: Mapping[str, float]
+    seed: int
+    scale: float = 0.0
+    """Multiple of the 80 %-power size; 0 at base size and where there is nothing."""
+    stage: str = "null"
+    """null, base, scaled or pair."""
+
+
+def reference_days(work: Path) -> list[Log]:
+    """Days of the contact plant with nothing in them: one with three replicates, the others with one."""
+    days = []
+    for number in range(DAYS):
+        path = work / "reference" / f"day_{number + 1}"
+        if not path.exists():
+            make_log(path, seed=11001 + number, replicates=3 if number == 0 else 1)
+        days.append(load_log(path))
+    return days
+
+
+def jobs(work: Path, nulls: int, base: bool, scales: Sequence[float], seeds: int, pairs: int) -> list[Job]:
+    """All logs of a benchmark; those that are scaled need the verdicts at base size."""
+    out = [Job(f"null_{n:03d}", {}, 20000 + n) for n in range(nulls)]
+    names = sorted(EFFECTS)
+    if base:
+        out += [Job(f"{name}_base", {name: EFFECTS[name].base}, 30000 + 50 * i, stage="base")
+                for i, name in enumerate(names)]
+    sizes = power_sizes(work) if scales or pairs else {}
+    for i, name in enumerate(names):
+        for j, scale in enumerate(scales):
+            for seed in range(seeds):
+                if name in sizes:
+                    out.append(Job(f"{name}_x{scale:g}_{seed}", {name: scale * sizes[name]},
+                                   30001 + 50 * i + 10 * j + seed, scale, "scaled"))
+    known = [name for name in names if EFFECTS[name].known and name in sizes]
+    random = np.random.default_rng(7)
+    for n in range(pairs if len(known) > 1 else 0):
+        first, second = random.choice(known, 2, replace=False)
+        out.append(Job(f"pair_{n:02d}", {str(first): 4 * sizes[first], str(second): 4 * sizes[second]}, 60000 + n, 4.0,
+                       "pair"))
+    return out
+
+
+def power_sizes(work: Path) -> dict[str, float]:
+    """Size of each effect that would be noticed with 80 % power, from how it stands out at its base size.
+
+    What stands out grows with the square of a small effect.
+    """
+    sizes = {}
+    for name, entry in EFFECTS.items():
+        path = work / "verdicts" / f"{name}_base.json"
+        if path.exists():
+            one = json.loads(path.read_text())
+            found = max(one["worth"] / one["worth_limit"], one["excess"][0] / one["excess_limit"], 1e-9)
+            needed = (1 + POWER / np.sqrt(one["worth_limit"])) / np.sqrt(found)
+            sizes[name] = entry.base * float(np.clip(needed, SMALLEST, 4.0))
+    return sizes
+
+
+def judge(job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool) -> dict[str, Any]:
+    """Drive a log, close the loop on it, and keep the verdict; `full` also opens its held-out trials."""
+    verdict = work / "verdicts" / f"{job.label}.json"
+    if verdict.exists():
+        return json.loads(verdict.read_text())
+    folder = work / "logs" / job.label
+    if not folder.exists():
+        make_log(folder, effects=job.effects, seed=job.seed)
+    began = time.perf_counter()
+    result = close_loop(load_log(folder), (), config, reference=ready)
+    content = {"stage": job.stage, "scale": job.scale, **brief(result), "seconds": time.perf_counter() - began}
+    if full and result.search.verdict == "named":
+        report = make_report(result)
+        write_run(work / "reports" / job.label, result, report)
+        after = report["after"]["held_out"]["ground_truth"]
+        content["heldout_ratio"] = after["trajectory"] / after["noise_floor"]["trajectory"]
+        content["full_seconds"] = time.perf_counter() - began
+    verdict.parent.mkdir(parents=True, exist_ok=True)
+    (work / "truth").mkdir(parents=True, exist_ok=True)
+    write_report(work / "truth" / f"{job.label}.json", dict(job.effects))
+    write_report(verdict, content)
+    return content
+
+
+def brief(result: Result) -> dict[str, Any]:
+    """A verdict without its report; held-out trials stay closed."""
+    found, alpha = result.search, result.config.thresholds.alpha
+    wander = result.prepared.wander
+    return {"verdict": found.verdict, "share": found.share, "excess": list(found.excess), "p_value": found.p_value,
+            "worth": float(found.scan.worth.max()),
+            "worth_limit": float(np.quantile(found.scan.null.max(1), 1 - alpha)),
+            "excess_limit": wander.excess_limit(alpha),
+            "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
+                        for one in named_effects(result)] if found.verdict == "named" else [],
+            "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
+                           for each in found.rounds]}
+
+
+def figures(work: Path) -> None:
+    """Write benchmarks/results/undeclared.json from all verdicts in the work folder."""
+    cases = list(read_cases(work))
+    found = {**of_nulls([one for truth, one in cases if not truth])}
+    for scale in sorted({one["scale"] for truth, one in cases if truth and one["stage"] != "pair"}):
+        inside = [(next(iter(truth)), one) for truth, one in cases
+                  if truth and one["stage"] != "pair" and one["scale"] == scale]
+        found.update(of_singles(inside, f"_{scale:g}x" if scale else "_base"))
+    found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
+    found.update(of_parameters(cases))
+    ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
+    if ratios:
+        found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
+    found["seconds_per_log"] = figure([one["seconds"] for _, one in cases], "s on one core, reference fit apart")
+    path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
+    content = json.loads(path.read_text())
+    content["sizes"] = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
+                        for name, size in power_sizes(work).items()}
+    content["confusion"] = [{"truth": truth, "stage": one["stage"], "scale": one["scale"], "verdict": one["verdict"],
+                             "named": [e["name"] for e in one["effects"]],
+                             "classes": [e["class"] for e in one["effects"]], "explained": one["share"]}
+                            for truth, one in cases]
+    write_report(path, content)
+
+
+Case = tuple[dict[str, float], dict[str, Any]]
+"""What was in a log, and what was said of it."""
+
+
+def read_cases(work: Path) -> Iterable[Case]:
+    """All logs that have a verdict."""
+    for path in sorted((work / "verdicts").glob("*.json")):
+        yield json.loads((work / "truth" / path.name).read_text()), json.loads(path.read_text())
+
+
+def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """False alarms and whether p-values are uniform."""
+    from scipy import stats
+
+    if not nulls:
+        return {}
+    false = sum(one["verdict"] != "none" for one in nulls)
+    return {
+        "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
+        "false_alarm_upper": figure([float(stats.beta.ppf(0.95, false + 1, len(nulls) - false))], "share"),
+        "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)], "-")}
+
+
+def said(truth: str, one: dict[str, Any]) -> bool:
+    """Whether a verdict names an effect or a class with it."""
+    return any(truth in effect["class"] for effect in one["effects"])
+
+
+def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[str, Any]:
+    """Right and wrong names of logs with one effect each."""
+    known = [(name, one) for name, one in inside if EFFECTS[name].known]
+    beyond = [one for name, one in inside if not EFFECTS[name].known]
+    found = {}
+    if known:
+        about = f"share of {len(known)} logs"
+        right = [said(name, one) for name, one in known]
+        wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
+        found[f"class_accuracy{tag}"] = figure([float(np.mean(right))], about)
+        found[f"wrong_name{tag}"] = figure([float(np.mean(wrong))], about)
+        found[f"noticed{tag}"] = figure([float(np.mean([one["verdict"] != "none" for _, one in known]))], about)
+        sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]
+        if sizes:
+            found[f"mean_class_size{tag}"] = figure([float(np.mean(sizes))], "effects")
+    if beyond:
+        found[f"out_of_catalogue{tag}"] = figure(
+            [float(np.mean([one["verdict"] == "unexplained" for one in beyond]))],
+            f"share of {len(beyond)} logs that are said to be unexplained")
+    return found
+
+
+def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
+    """Both named, and no wrong one, of logs with two effects."""
+    if not pairs:
+        return {}
+    both = [all(said(name, one) for name in truth) for truth, one in pairs]
+    clean = [all(set(effect["class"]) & set(truth) for effect in one["effects"]) for truth, one in pairs]
+    return {"pair_both": figure([float(np.mean(both))], f"share of {len(pairs)} logs"),
+            "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
+
+
+def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
+    """Intervals that cover the size driven, and relative errors, where plant and catalogue write an effect alike."""
+    inside, errors = [], []
+    for truth, one in cases:
+        for effect in one["effects"]:
+            if effect["name"] in truth and effect["name"] in SAME:
+                parameter, neutral, unit = SAME[effect["name"]]
+                driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
+                inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))
+                errors.append(abs(seen["value"] - driven) / abs(driven - neutral))
+    if not inside:
+        return {}
+    return {"interval_coverage": figure([float(np.mean(inside))], f"share of {len(inside)} 95 % intervals"),
+            "parameter_error": figure(errors, "of the size")}
