@@ -10,6 +10,7 @@ import numpy as np
 from sysid.html import Section, bullets, charts, html_page, paragraph, table
 from sysid.log import Start
 from sysid.loop.next_manoeuvre import command_of, sentence
+from sysid.loop.unnamed import describe_unnamed
 from sysid.metrics import METRICS, UNITS, integrate
 from sysid.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.dataset import write_text
@@ -23,6 +24,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections += [Section("Error before and after", errors(report)), Section("What was tried", candidates(report))]
     if report["lives_in"]:
         sections.append(Section("Where the unexplained residual lives", lives(report)))
+    if report["unnamed"] is not None:
+        sections.append(Section("A wrench without a name", wrench(report["unnamed"])))
     if report["verdict"] != "named":
         sections.append(Section("What these drives would have shown", detectable(report)))
     sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
@@ -113,6 +116,31 @@ def lives(report: dict[str, Any]) -> str:
     chart = bar_chart([one["quantity"] for one in rows], {"share": [one["share"] for one in rows]},
                       "share predicted on other drives", log_y=False)
     return charts([chart])
+
+
+def wrench(one: dict[str, Any]) -> str:
+    """The fitted tables, what they predict, and what else was tried."""
+    text = describe_unnamed(one)
+    z, units = np.asarray(one["knots"]), one["units"]
+    if one["periodic"]:
+        z = np.append(z, 2 * np.pi)
+    drawn = []
+    for name, title in (("force", "force forward"), ("torque", "torque to the left")):
+        values = np.asarray(one["values"][name])
+        line = Line(z, np.append(values, values[0]) if one["periodic"] else values, markers=True)
+        drawn.append(line_chart([line], f"{one['quantity']} [{units['quantity']}]", f"{name} [{units[name]}]",
+                                f"{title}{', times the direction of motion' if one['kind'] == 'brake' else ''}"))
+    gains = one["gain"]["by_manoeuvre"]
+    drawn.append(bar_chart(list(gains), {"gain": list(gains.values())}, "squared residual less, held back",
+                           log_y=False))
+    return "".join([
+        paragraph(f"{text[0].upper()}{text[1:]}."),
+        paragraph(f"Replayed, the squared residual of the training trials falls from {one['cost']['before']:.3f} to "
+                  f"{one['cost']['after']:.3f} of the noise."),
+        charts(drawn),
+        table(["quantity", "kind", "share of the excess, held back"],
+              [[each["quantity"], each["kind"], each["gain"]] for each in one["tried"]],
+              "All tables that were fitted, and what they predict on manoeuvres that were not")])
 
 
 def detectable(report: dict[str, Any]) -> str:

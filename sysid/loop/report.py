@@ -14,6 +14,8 @@
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
     detectable        per effect the smallest size that these drives would show with 80 % power
     lives_in          where the unexplained residual lives
+    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.loop.unnamed.as_report`); where
+                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
     next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
                       there is nothing to tell (keys: `sysid.loop.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
@@ -34,6 +36,7 @@ from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.refit import Refit
 from sysid.loop.solver import Solver
+from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
 from sysid.rollout import Replay, make_batch, predictions
@@ -58,7 +61,10 @@ def make_report(result: Result) -> dict[str, Any]:
     settings = manifest(result.config, result.hypotheses, result.reference)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
     trials = (*result.log.training, *result.log.held_out)
-    before, after = (replay(result, vehicle, trials) for vehicle in (result.before, result.after))
+    wrench = find_unnamed(result)
+    before = replay(result, result.before, trials)
+    after = replay(result, result.after, trials) if wrench is None or not wrench.kept else replay_unnamed(
+        result, wrench, trials)
     rows = error_rows(trials, before, after)
     about = [one.name for one in result.references]
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
@@ -79,6 +85,7 @@ def make_report(result: Result) -> dict[str, Any]:
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
                        for each in found.rounds],
         "detectable": detectable(result), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "unnamed": None if wrench is None else as_report(wrench),
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
@@ -304,6 +311,8 @@ def summary(report: dict[str, Any]) -> str:
                 lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} -> {after:.4f} m")
     for one in report["lives_in"][:4]:
         lines.append(f"  lives in {one['quantity']}: {one['share']:.0%} of what is left")
+    if report["unnamed"] is not None:
+        lines.append(f"  {describe_unnamed(report['unnamed'])}")
     return "\n".join(lines)
 
 
@@ -315,14 +324,16 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
 
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    vehicle = result.after
+    unnamed = report["unnamed"]
+    kept = unnamed is not None and unnamed["kept"]
+    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else result.after
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all()}
     save_vehicle(out / "vehicle.toml", result.log.spec, vehicle, bounds,
                  {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
-                  "effects_added": [one["name"] for one in report["effects"]]})
+                  "effects_added": [one["name"] for one in report["effects"]] + ["unnamed"] * kept})
     write_next_command(out, report["next_manoeuvre"])
     write_report(out / "report.json", report)
     write_page(out, report)

@@ -3,6 +3,7 @@
 For each quantity that a motion has (time, speed, place, heading, wheel angle, command, rest), smooth functions of it
 are fitted to the white residual of some drives and asked to predict that of the others. What predicts best tells where
 to look: a residual that repeats with the wheel's angle is something round, one that repeats with the place, the floor.
+How far a wheel is turned when a drive begins is not known: each drive may start at its own angle.
 """
 
 from __future__ import annotations
@@ -20,7 +21,11 @@ if TYPE_CHECKING:
 
 TERMS = 8  # smooth functions of one quantity
 LAGS = 3  # bins over which the motion answers
+WAVES = 2  # harmonics of an angle
+PHASES = np.arange(24) * 2 * np.pi / 24  # start angles of a wheel that are tried
+ALIGNINGS = 20  # rounds of fitting one shape and each drive's start angle to it
 RIDGE = 3.0
+WHEELS = ("left wheel's angle", "right wheel's angle")
 REST = 0.02  # m/s and rad/s below which a vehicle rests
 
 
@@ -42,10 +47,10 @@ def where_it_lives(result: Result) -> list[dict[str, Any]]:
         gain = 0.0
         for part in range(3):
             fit, test = fold != part, fold == part
-            x, y = design[fit].reshape(-1, design.shape[-1]), residual[fit].reshape(-1, channels)
-            solution = np.linalg.solve(x.T @ x + RIDGE * np.eye(x.shape[1]), x.T @ y)
-            left = residual[test] - design[test] @ solution
-            gain += float(np.square(residual[test]).sum() - np.square(left).sum())
+            x, y = (np.einsum("bkf,bkg->bfg", design, each, optimize=True) for each in (design, residual))
+            turns = np.kron(np.eye(LAGS), wave_turns(WAVES, False)) if name in WHEELS else np.eye(x.shape[1])[None]
+            solution, _ = align(x[fit], y[fit], turns, RIDGE * np.eye(x.shape[1]))
+            gain += float(gains_at(solution, x[test], y[test], turns).max(1).sum())
         out.append({"quantity": name, "share": float(np.clip(gain / excess, 0.0, 1.0))})
     return sorted(out, key=lambda one: -one["share"])
 
@@ -66,7 +71,7 @@ def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np
     for k in range(1, bins):
         since[k] = 0.0 if still[k] or turned[k] else since[k - 1] + width
     moving = (~still)[:, None]
-    wheel = np.cumsum(np.stack([v - omega * spec.track / 2, v + omega * spec.track / 2], axis=-1), axis=0) * width
+    wheel = _rolled(trial, t, spec.track)
     found = {
         "time in the drive": bumps(t, 0.0, 25.0),
         "time in the drive, while moving": bumps(t, 0.0, 25.0) * np.sign(v)[:, None] * moving,
@@ -91,6 +96,68 @@ def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np
     return {name: np.where(inside, each, 0.0) for name, each in found.items()}
 
 
+def _rolled(trial: Trial, t: np.ndarray, track: float) -> np.ndarray:
+    """(K, 2) m that the left and the right wheel rolled until times t (K,)."""
+    told = trial.odometry or trial.command
+    sides = np.stack([told.v - told.omega * track / 2, told.v + told.omega * track / 2], axis=-1)
+    rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(np.diff(told.t)[:, None] * sides[:-1], axis=0)])
+    return np.stack([np.interp(t, told.t, rolled[:, k]) for k in range(2)], axis=-1)
+
+
+def align(products: np.ndarray, moments: np.ndarray, turns: np.ndarray, penalty: np.ndarray
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """One shape for many drives, each of them turned by an angle of its own.
+
+    Args:
+        products: (B, F, F) of each drive's columns; moments: (B, F, C) of its columns with the residual.
+        turns: (G, F, F) what coefficients become when the angle starts elsewhere; one identity for no freedom.
+        penalty: (F, F) prior of the coefficients.
+
+    Returns:
+        Coefficients (F, C), and for each drive the number of its turn (B,).
+    """
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    alone = [np.linalg.solve(a + penalty, b) for a, b in zip(products, moments, strict=True)]
+    strength = [float((b * one).sum()) for b, one in zip(moments, alone, strict=True)]
+    for first in np.argsort(strength)[::-1][: 3 if len(turns) > 1 else 1]:
+        solution, chosen = alone[first], np.full(len(products), -1)
+        for _ in range(ALIGNINGS):
+            new = gains_at(solution, products, moments, turns).argmax(1)
+            if (new == chosen).all():
+                break
+            chosen = new
+            turn = turns[chosen]
+            matrix = np.einsum("bji,bjk,bkl->il", turn, products, turn, optimize=True) + penalty
+            right = np.einsum("bji,bjc->ic", turn, moments, optimize=True)
+            solution = np.linalg.solve(matrix, right)
+        explained = float(gains_at(solution, products, moments, turns).max(1).sum())
+        if best is None or explained > best[0]:
+            best = explained, solution, chosen
+    assert best is not None
+    return best[1], best[2]
+
+
+def gains_at(solution: np.ndarray, products: np.ndarray, moments: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """(B, G) by how much coefficients (F, C), turned each way, lower the squared residual of each drive."""
+    turned = turns @ solution  # (G, F, C)
+    cross = np.einsum("bfc,gfc->bg", moments, turned, optimize=True)
+    own = np.einsum("gfc,bfh,ghc->bg", turned, products, turned, optimize=True)
+    return np.asarray(2 * cross - own)
+
+
+def wave_turns(harmonics: int, constant: bool) -> np.ndarray:
+    """(G, F, F) coefficients of sin z, cos z, sin 2z, ... (after those of 1, if `constant`) when z starts at PHASES."""
+    size = 2 * harmonics + constant
+    out = np.zeros((len(PHASES), size, size))
+    out[:, :1, :1] = 1.0
+    for k in range(harmonics):
+        at = 2 * k + constant
+        cos, sin = np.cos((k + 1) * PHASES), np.sin((k + 1) * PHASES)
+        out[:, at, at], out[:, at, at + 1] = cos, -sin
+        out[:, at + 1, at], out[:, at + 1, at + 1] = sin, cos
+    return out
+
+
 def bumps(z: np.ndarray, low: float, high: float, terms: int = TERMS) -> np.ndarray:
     """(K, F) smooth bumps that cover a range."""
     centre = np.linspace(low, high, terms)
@@ -99,7 +166,7 @@ def bumps(z: np.ndarray, low: float, high: float, terms: int = TERMS) -> np.ndar
 
 def waves(angle: np.ndarray) -> np.ndarray:
     """(K, 4) first two harmonics of an angle."""
-    return np.stack([np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=-1)
+    return np.stack([wave(k * angle) for k in range(1, WAVES + 1) for wave in (np.sin, np.cos)], axis=-1)
 
 
 def with_lags(design: np.ndarray) -> np.ndarray:

@@ -1,0 +1,185 @@
+"""Unnamed wrenches: planted ones are found with their quantity and their few terms, and nothing is found in noise."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.candidates import make_command
+from sysid.log import OdometryStream, PoseStream, Start, Trial
+from sysid.loop.noise import Whitener
+from sysid.loop.page import wrench as wrench_section
+from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
+from sysid.loop.terms import Term, columns_of, in_words
+from sysid.loop.unexplained import PHASES, align, wave_turns
+from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, vehicle_of
+from sysid.rollout import vehicle_plant
+from sysid.space import make_space
+from whill_mjx.config import VehicleConfig
+from whill_mjx.effects.unnamed import KNOTS
+from whill_mjx.parameters import get_values
+from whill_mjx.presets import preset
+from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+
+quick = pytest.mark.quick
+TIME = 9.0
+DRIVES = ("straight", "turn", "circle", "s_curve", "reversal")
+ANGLES = np.arange(KNOTS) * 2 * np.pi / KNOTS
+
+
+def trial_of(name, heading):
+    t = np.arange(0.0, TIME + 1e-9, 0.05)
+    return Trial(f"{name}_1", name, make_command(name, 0.5, 0.8, TIME - 2.0), OdometryStream(t, None, None, None, t, t),
+                 PoseStream(t, t, t, t), Start(yaw=heading))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """Five manoeuvres of the chair, with a reference that knows their noise."""
+    spec, params = preset("whill_cr_physical")
+    space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
+    scale = np.array([0.004, 0.008, 0.01, 0.01, 0.01])
+    reference = SimpleNamespace(
+        params=params, space=space, u=space.to_unit(space.initial), factors=np.ones((4, 5)),
+        whitener=Whitener(scale, np.zeros((1, 5, 5)), np.eye(5)), target_of=lambda drives: drives.target)
+    trials = tuple(trial_of(name, heading) for heading, name in enumerate(DRIVES))
+    base = SimpleNamespace(u=reference.u, residual=None, jacobian=None)
+    result = SimpleNamespace(
+        log=SimpleNamespace(spec=spec, training=trials), reference=reference,
+        plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)),
+        search=SimpleNamespace(base=base, verdict="unexplained", excess=(0.0, 0.0)),
+        evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
+    made = Bench(result)
+    slopes = made.drives.differences(made.values, made.u, np.full(2, 0.02))
+    base.jacobian = made.white(made.drives, slopes)
+    return made
+
+
+def measure(bench, table=None, wrench=None, phases=None, seed=0):
+    """Let the drives show a wrench and noise of unit size, and nothing else."""
+    count = len(DRIVES)
+    table = table or Table("speed", "push", 0.0, 1.0)
+    wrench = np.zeros(2 * KNOTS) if wrench is None else wrench
+    nothing = np.zeros(2 * KNOTS)
+    phases, still = np.zeros(count, int) if phases is None else phases, np.zeros(count, int)
+    bench.target = np.zeros_like(bench.target)
+    seen = -bench.residual([(bench.u, wrench)], table, phases)[0]
+    noise = np.random.default_rng(seed).standard_normal(seen.shape)
+    bench.target = seen + noise
+    search = bench.result.search
+    search.base.residual = bench.residual([(bench.u, nothing)], table, still)[0]
+    search.excess = (float(np.square(search.base.residual).mean()) - 1, 0.0)
+
+
+def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
+    truth = Table("time in the drive", "brake", 0.0, TIME)
+    measure(bench, truth, np.concatenate([-40 * np.exp(-truth.knots / 2.5), np.zeros(KNOTS)]))
+    found = fit_unnamed(bench)
+    assert (found.table.quantity, found.table.kind) == ("time in the drive", "brake") and found.kept
+    assert [term.form for term in found.terms] == ["decay"]
+    at = np.interp([1.2, 2.0], found.table.knots, found.wrench[:KNOTS])
+    np.testing.assert_allclose(at, -40 * np.exp(-np.array([1.2, 2.0]) / 2.5), rtol=0.25)  # rolling takes a part of it
+    assert found.cost[1] < 1.1 < found.cost[0]
+    report = as_report(found)
+    assert "exp(-z" in report["symbolic"]["force"] and report["units"]["quantity"] == "s"
+    assert "time in the drive" in describe_unnamed(report) and "<svg" in wrench_section(report)
+    vehicle = vehicle_of(bench.result, report["parameters"])
+    save_vehicle(tmp_path / "vehicle.toml", bench.result.log.spec, vehicle)
+    _, read, _ = load_vehicle(tmp_path / "vehicle.toml")
+    for name, value in report["parameters"].items():
+        np.testing.assert_allclose(get_values(read, [name])[0], value, rtol=1e-6)
+
+
+def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_angle(bench):
+    truth = Table("left wheel's angle", "push", 0.0, 1.0)
+    force = 12 * np.sin(ANGLES)
+    measure(bench, truth, np.concatenate([force, -0.25 * force]), np.array([3, 17, 8, 22, 12]))
+    found = fit_unnamed(bench)
+    assert (found.table.quantity, found.table.kind) == ("left wheel's angle", "push") and found.kept
+    assert found.gain > 0.5
+    wave = np.fft.rfft(found.wrench[:KNOTS])[1] * 2 / KNOTS
+    np.testing.assert_allclose(abs(wave), 12, rtol=0.15)
+    text = as_report(found)["symbolic"]["force"]
+    assert "sin(z)" in text  # counted from where the wave rises through zero
+
+
+def test_nothing_is_kept_of_noise(bench):
+    measure(bench, seed=3)
+    found = fit_unnamed(bench)
+    assert not found.kept
+    assert describe_unnamed(as_report(found)).startswith("no wrench over one quantity explains it")
+
+
+def products_of(columns, residual, groups=4):
+    """Products of columns (B, n, S) with no base parameter but one that does nothing."""
+    design = np.concatenate([np.zeros((*columns.shape[:2], 1)), columns], axis=-1)
+    parts = np.array_split(np.arange(len(design)), groups)
+    flat = [design[part].reshape(-1, design.shape[-1]) for part in parts]
+    rest = [residual[part].reshape(-1) for part in parts]
+    return Products(np.stack([x.T @ x for x in flat]), np.stack([x.T @ r for x, r in zip(flat, rest, strict=True)]),
+                    np.array([r @ r for r in rest]))
+
+
+@quick
+def test_few_terms_stand_for_a_table_that_is_one_and_not_for_one_that_is_none():
+    random = np.random.default_rng(1)
+    table = Table("left wheel's angle", "push", 0.0, 1.0)
+    columns = random.standard_normal((8, 60, 2 * KNOTS))
+    planted = np.concatenate([3 * np.sin(2 * ANGLES + 0.4), np.zeros(KNOTS)])
+    rough = np.concatenate([random.choice([-3.0, 3.0], KNOTS), np.zeros(KNOTS)])
+    gains = {}
+    for name, wrench in (("planted", planted), ("rough", rough)):
+        residual = columns @ wrench + random.standard_normal((8, 60))
+        products = products_of(columns, residual)
+        short, terms = few_terms(products, np.eye(1), table)
+        whole = gains_without(products, 1e-3 * np.eye(1 + 2 * KNOTS), 1)
+        gains[name] = short.sum() / whole.sum()
+        if name == "planted":
+            assert terms == (Term("harmonic", 2.0),)
+    assert gains["planted"] > 0.95 and gains["rough"] < 0.75
+
+
+@quick
+def test_held_back_gains_of_noise_are_negative():
+    random = np.random.default_rng(2)
+    columns, residual = random.standard_normal((8, 60, 2 * KNOTS)), random.standard_normal((8, 60))
+    assert gains_without(products_of(columns, residual), 1e-3 * np.eye(1 + 2 * KNOTS), 1).sum() < 0
+
+
+@quick
+def test_the_angle_that_each_drive_starts_at_is_found_up_to_one_for_all():
+    random = np.random.default_rng(4)
+    turns, truth = wave_turns(2, False), random.integers(0, len(PHASES), 12)
+    shape, products, moments = np.array([1.0, 0.3, -0.5, 0.4]), [], []
+    for phase in truth:
+        angle = random.uniform(0, 20, 200)
+        columns = np.stack([np.sin(angle), np.cos(angle), np.sin(2 * angle), np.cos(2 * angle)], axis=-1)
+        start = angle + PHASES[phase]
+        seen = np.stack([np.sin(start), np.cos(start), np.sin(2 * start), np.cos(2 * start)], axis=-1) @ shape
+        products.append(columns.T @ columns)
+        moments.append(columns.T @ (seen + 0.3 * random.standard_normal(200)))
+    solution, found = align(np.stack(products), np.stack(moments)[..., None], turns, 1e-3 * np.eye(4))
+    away = (found - truth - found[0] + truth[0] + 12) % len(PHASES) - 12
+    assert np.abs(away).max() <= 1
+    np.testing.assert_allclose(np.hypot(*solution[:2, 0]), np.hypot(*shape[:2]), rtol=0.1)
+
+
+@quick
+def test_a_shifted_table_is_the_table_at_a_shifted_angle():
+    values = np.random.default_rng(5).standard_normal(KNOTS)
+    for knots in (0, 3, 11):
+        moved = shift(knots * 2 * np.pi / KNOTS) @ values
+        np.testing.assert_allclose(moved, np.roll(values, -knots), atol=1e-9)
+    half = shift(1.5 * 2 * np.pi / KNOTS) @ values
+    np.testing.assert_allclose(half, (np.roll(values, -1) + np.roll(values, -2)) / 2, atol=1e-9)
+
+
+@quick
+def test_sums_are_written_as_they_are_computed():
+    terms, knots = (Term("power", 0.0), Term("decay", 2.0), Term("sign", 0.1)), np.linspace(0.0, 3.0, KNOTS)
+    basis, parts = columns_of(terms, knots)
+    assert basis.shape == (2 * KNOTS, 6) and [len(part) for part in parts] == [2, 2, 2]
+    coefficients = [np.array([1.5, 0.0]), np.array([-4.0, 2.0]), np.array([0.25, 0.0])]
+    force = (basis @ np.concatenate(coefficients))[:KNOTS]
+    np.testing.assert_allclose(force, 1.5 - 4 * np.exp(-knots / 2) + 0.25 * np.tanh(knots / 0.1))
+    assert in_words(terms, coefficients, 0) == "1.5 - 4 exp(-z / 2) + 0.25 tanh(z / 0.1)"
