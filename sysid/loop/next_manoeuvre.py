@@ -24,6 +24,7 @@ from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.drives import Drives, make_drives
 from sysid.loop.evidence import base_columns, with_values
 from sysid.loop.refit import STEP_Q, Refit, Refitter
+from sysid.loop.refit import Start as FitStart
 from sysid.metrics import ideal_replay
 from whill_mjx.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.effects import EFFECTS
@@ -113,10 +114,9 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
     if not rounds:
         return None
     refitter = refitter_of(result)
-    groups = [[Rival(name, fit if fit is not None else _refit(result, refitter, number, name)) for name, fit in each]
-              for number, each in rounds]
+    groups = [_refitted(result, refitter, number, each) for number, each in rounds]
     pairs = [pair for group in groups for pair in combinations(group, 2)]
-    room_fixed = any(getattr(EFFECTS[one.effect], "room_fixed", True) for group in groups for one in group)
+    room_fixed = any(EFFECTS[one.effect].room_fixed for group in groups for one in group)
     library = drives_of(result, HEADINGS if room_fixed else HEADINGS[:1])
     separation, library = separations(result, refitter, groups, library)
     return _proposal(pairs, separation, library)
@@ -138,25 +138,26 @@ def rivals_of(result: Result) -> list[tuple[int, list[tuple[str, Refit | None]]]
 
 
 def refitter_of(result: Result) -> Refitter:
-    """The refitter of the search, with its compiled replay; made anew where the result does not carry it."""
-    kept: Refitter | None = getattr(result, "refitter", None)
-    if kept is not None:
-        return kept
+    """A refitter like that of the search, through the replay that it compiled."""
     base = base_values(result.full)
     values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.plant, result.full, result.names, result.log.training)
+    drives = make_drives(result.plant, result.full, result.names, result.log.training, paths=result.prepared.paths)
     drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 
 
-def _refit(result: Result, refitter: Refitter, number: int, effect: str) -> Refit:
-    """A rival of round `number` that the search took for alike without refitting it."""
-    found = result.search
-    before = found.accepted[number - 1].refit if number else found.base
-    mine = [i for i, one in enumerate(result.hypotheses) if one.effect == effect]
-    best = max(mine, key=lambda i: found.scan.gain[i])
-    start = np.concatenate([before.q, found.scan.q[best]])
-    return refitter.fit((*before.hypotheses, result.hypotheses[best]), start, POLISH, before.u)
+def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[tuple[str, Refit | None]]
+              ) -> list[Rival]:
+    """Rivals of round `number`; those that the search took for alike without refitting them are refitted now."""
+    found, starts = result.search, {}
+    for effect in (name for name, fit in rivals if fit is None):
+        before = found.accepted[number - 1].refit if number else found.base
+        mine = [i for i, one in enumerate(result.hypotheses) if one.effect == effect]
+        best = max(mine, key=lambda i: found.scan.gain[i])
+        starts[effect] = FitStart((*before.hypotheses, result.hypotheses[best]), before.u,
+                               np.concatenate([before.q, found.scan.q[best]]))
+    more = dict(zip(starts, refitter.fit_all(list(starts.values()), POLISH), strict=True)) if starts else {}
+    return [Rival(name, more[name] if fit is None else fit) for name, fit in rivals]
 
 
 def drives_of(result: Result, headings: Sequence[float] = HEADINGS) -> list[Drive]:
@@ -308,8 +309,8 @@ def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: 
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
-    """(P + k, P + k) precision of a rival on a new day: base parameters by the spread, its coordinates by these
-    drives."""
+    """(P + k, P + k) precision of a rival on a new day: base parameters by the spread, its coordinates by these drives
+    and by how far they seem to wander from day to day."""
     size = len(fit.u)
     flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
     matrix = flat.T @ flat
@@ -317,7 +318,14 @@ def _held(result: Result, fit: Refit) -> np.ndarray:
     cross = matrix[:size, size:]
     out = np.zeros_like(matrix)
     out[:size, :size] = result.evidence.precision
-    out[size:, size:] = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
+    told = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
+    covariance, start = np.linalg.inv(told + 1e-9 * np.eye(len(told))), 0
+    for one, q in zip(fit.hypotheses, fit.split, strict=True):
+        part = slice(start, start + len(q))
+        covariance[part, part] += result.prepared.wander.at(
+            result.evidence.columns, list(result.hypotheses).index(one), q)
+        start += len(q)
+    out[size:, size:] = np.linalg.inv(covariance)
     return out
 
 

@@ -52,24 +52,25 @@ def subject():
     space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
     whitener = Whitener(np.array([0.005, 0.01, 0.01, 0.01, 0.01]), np.zeros((1, 5, 5)), np.eye(5))
     reference = SimpleNamespace(params=params, space=space, u=space.to_unit(space.initial), spread=1e-4 * np.eye(2),
-                                whitener=whitener, factors=np.ones((4, 5)))
+                                whitener=whitener, factors=np.ones((4, 5)), target_of=lambda drives: drives.target)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
     log = SimpleNamespace(spec=spec, training=(straight_trial(),), name="drives")
-    values = np.array([base_values(full)[name] for name in names])
     drives = make_drives(plant, full, names, log.training)
+    wander = SimpleNamespace(at=lambda columns, hypothesis, q: np.zeros((len(q), len(q))))
     return SimpleNamespace(log=log, reference=reference, hypotheses=found, full=full, names=names, plant=plant,
-                           refitter=SimpleNamespace(drives=drives, values=values))
+                           drives=drives, prepared=SimpleNamespace(paths=drives.paths, wander=wander))
 
 
 def fitted(subject, effect, **changes):
     """A candidate of this effect at these values; its coordinates are known from nowhere else."""
     one = next(each for each in subject.hypotheses if each.effect == effect)
-    values, names = subject.refitter.values.copy(), subject.names
+    names = subject.names
+    values = np.array([base_values(subject.full)[name] for name in names])
     for field, value in changes.items():
         values[names.index(f"{effect}.{field}")] = value
     base = base_values(subject.full)
     q = np.array([(values[names.index(axis.parameter)] - base[axis.parameter]) / axis.unit for axis in one.axes])
-    bins = subject.refitter.drives.target.shape[1]
+    bins = subject.drives.target.shape[1]
     jacobian = np.zeros((1, 5 * bins, 2 + len(q)))
     fit = Refit((one,), subject.reference.u, q, 0.0, np.zeros((1, 5 * bins)), jacobian, values)
     return SimpleNamespace(hypothesis=one, gain=100.0, refit=fit)
@@ -80,7 +81,7 @@ def with_rivals(subject, best, other, verdict="named"):
     search = SimpleNamespace(verdict=verdict, accepted=[best], rounds=[[best, other]], excess=(1.0, 0.0),
                              classes=[[best.hypothesis.effect, other.hypothesis.effect]])
     return SimpleNamespace(**{**vars(subject), "search": search, "evidence": SimpleNamespace(
-        precision=np.linalg.inv(subject.reference.spread))})
+        precision=np.linalg.inv(subject.reference.spread), columns=())})
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def test_a_cross_slope_is_told_from_a_side_force_by_another_heading(sloping, tmp
 def test_the_drive_already_made_would_not_tell_them(sloping):
     rivals = [one.refit.values for one in sloping.search.rounds[0]]
     again = [one for one in drives_of(sloping, (0.0, 90.0)) if one.manoeuvre == "straight" and one.v == SPEED]
-    seen = plan_drives(sloping, sloping.refitter.drives, again).simulate(np.stack(rivals))  # (2, D, K, 5)
+    seen = plan_drives(sloping, sloping.drives, again).simulate(np.stack(rivals))  # (2, D, K, 5)
     apart = np.linalg.norm(((seen[0] - seen[1]) / sloping.reference.whitener.scale).reshape(2, -1), axis=-1)
     ahead, across = (apart[[one.start[2] < 0.1 for one in again].index(which)] for which in (True, False))
     assert ahead < 0.6 * across  # the centre of mass is not the point that a side force acts at
@@ -117,15 +118,23 @@ def test_the_drive_already_made_would_not_tell_them(sloping):
 def test_scales_that_odometry_alone_shows_need_another_sensor(subject):
     blind = replace(straight_trial(), ground_truth=None)
     log = SimpleNamespace(**{**vars(subject.log), "training": (blind,)})
-    drives = subject.refitter.drives.of(log.training, subject.plant.dt)
-    result = with_rivals(SimpleNamespace(**{**vars(subject), "log": log, "refitter": SimpleNamespace(
-        drives=drives, values=subject.refitter.values)}),
-        fitted(subject, "command_scale", linear=1.02, angular=1.02),
-        fitted(subject, "odometry_scale", linear=1.02, angular=1.02))
+    result = with_rivals(SimpleNamespace(**{**vars(subject), "log": log}),
+                         fitted(subject, "command_scale", linear=1.02, angular=1.02),
+                         fitted(subject, "odometry_scale", linear=1.02, angular=1.02))
     proposal = next_manoeuvre(result)
     assert proposal["name"] is None and proposal["file"] is None
     assert proposal["not_split"][0]["effects"] == ["command_scale", "odometry_scale"]
     assert "commands" in proposal["not_split"][0]["sensor"] and "no drive" in sentence(proposal)
+
+
+def test_a_rival_that_was_not_refitted_is_refitted(sloping):
+    search = SimpleNamespace(**vars(sloping.search))
+    best = search.accepted[0]
+    search.rounds, search.base = [[best]], SimpleNamespace(hypotheses=(), u=sloping.reference.u, q=np.zeros(0))
+    search.scan = SimpleNamespace(gain=np.zeros(len(sloping.hypotheses)),
+                                  q=[np.full(len(one.axes), 0.5) for one in sloping.hypotheses])
+    proposal = next_manoeuvre(SimpleNamespace(**{**vars(sloping), "search": search}))
+    assert "side_force" in [name for each in proposal["not_split"] for name in each["effects"]] + proposal["splits"]
 
 
 @quick
