@@ -7,6 +7,7 @@ Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,8 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from sysid import command_line, gradient, tpe, uncertainty
+from sysid import command_line, gradient, starts, tpe, uncertainty
+from sysid.courses import make_courses
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -31,16 +33,19 @@ from sysid.report import (
     write_report,
 )
 from sysid.result import FitResult, Progress
-from sysid.rollout import Plant, Replay, make_batch, predictions, vehicle_plant
+from sysid.rollout import Plant, predictions, vehicle_plant
 from sysid.series import collect, save
 from sysid.space import Space, make_space
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
+from whill_mjx.types import VehicleParams
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
+FEATURE_ITERATIONS = 15
+VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 
 
 @dataclass(frozen=True)
@@ -49,24 +54,28 @@ class FitConfig:
 
     preset: Literal["paper", "physical"] = "physical"
     """Base model whose parameters are fitted."""
-    method: Literal["tpe", "lm", "both"] = "both"
-    """Global search, gradient search, or a short global search that gives the gradient search its starts."""
+    method: Literal["features", "lm", "tpe", "both"] = "features"
+    """features: gradient search on motion in short bins, then on poses. lm: on poses at once. tpe: global search. both:
+    a short global search that gives the gradient search on poses its starts."""
     trials: int = 192
     """Parameter sets that the global search tries."""
-    starts: int = 4
-    """Starts of the gradient search: the initial values and the best of the global search."""
+    starts: int = 1
+    """Starts of the gradient search: the initial values, and random ones or the best of the global search (both: at
+    least one of them)."""
     iterations: int = 40
-    """Iterations of the gradient search."""
+    """Iterations of the gradient search on poses."""
     seed: int = 0
     """Seed of both searches."""
     quick: bool = False
     """Fewer trials, candidates and iterations: minutes on two cores."""
     channels: Literal["both", "ground_truth", "odometry"] = "both"
     """Which measurements are fitted; all are scored."""
-    robust: bool = False
-    """Count large residuals linearly (Huber)."""
+    robust: bool = True
+    """Count large residuals linearly (Huber): a model is least exact where wheels skid."""
     parameters: tuple[str, ...] = ()
     """Names to fit; by default all that a driving log can tell."""
+    effects: tuple[str, ...] = ()
+    """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
     physics_dt: float = 0.005
     """Physics step [s]."""
 
@@ -83,12 +92,14 @@ class Fit:
     noise: Noise
     scan: FitResult | None
     """Result of the global search."""
+    coarse: FitResult | None
+    """Result of the search on features, of all its starts."""
     search: FitResult | None
     """Result of the gradient search."""
     u: np.ndarray  # (P,) fitted unit coordinates
     initial_cost: float
     cost: float
-    """Mean squared residual in noise scales; J in metres where method is "tpe"."""
+    """Mean squared residual in noise scales (large ones counted linearly); J in metres where method is "tpe"."""
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
@@ -110,39 +121,62 @@ def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
     params = preset_params(log.spec, config.preset) if params is None else params
+    params = with_effects(params, config.effects)
     space = make_space(params, log.spec, config.parameters or None)
     objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
 
-    scan = search = None
-    starts = space.to_unit(space.initial)[None]
-    start_count = min(config.starts, 2) if config.quick else config.starts
+    scan = coarse = search = None
+    points = gradient.random_starts(space, config.starts, config.seed)
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
     if config.method in ("tpe", "both"):
         evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
         cost = "paper" if config.method == "tpe" else "weighted"
-        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost,
-                       best=max(start_count - 1, 1), progress=progress)
-        starts = np.concatenate([starts, scan.starts])[:max(start_count, 2)]
-    elif start_count > 1:
-        starts = gradient.random_starts(space, start_count, config.seed)
+        count = max(min(config.starts, 2) if config.quick else config.starts, 2)
+        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
+                       progress=progress)
+        points = np.concatenate([points[:1], scan.starts])[:count]
+    elif config.method == "features":
+        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
+        points = coarse.u[None]
     if config.method == "tpe":
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, objective, profiles = _gradient_search(objective, space, starts, iterations, config, progress)
+        search, objective, profiles = _gradient_search(objective, space, points, iterations, config, progress)
         u, final_cost = search.u, search.cost
-        initial_cost = float(objective.weighted_cost(space.to_unit(space.initial)[None])[0])
-    known = uncertainty.estimate(objective, u)
+        first = objective.residuals(space.to_unit(space.initial)[None])
+        initial_cost = float(gradient.robust_cost(first, config.robust)[0]) / objective.counted
+    known = uncertainty.estimate(objective, u, robust=config.robust and config.method != "tpe")
     fitted = set_values(params, space.names, jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float)))
-    return Fit(fitted, params, space, known, objective.noise, scan, search, u, initial_cost, final_cost, profiles,
-               time.perf_counter() - began, plant)
+    return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
+               profiles, time.perf_counter() - began, plant)
+
+
+def with_effects(params: Any, names: Sequence[str]) -> Any:
+    """The vehicle with more effects of the catalogue, where they do nothing or next to nothing."""
+    from whill_mjx.effects import EFFECTS, make_effect
+    from whill_mjx.effects.base import PLACES, place_of
+
+    have = {effect.name for effect in params.effects}
+    for name in names:
+        if name not in EFFECTS:
+            raise ValueError(f"no effect {name!r} (known: {', '.join(EFFECTS)}). Correct --effects.")
+    added = [make_effect(name) for name in dict.fromkeys(names) if name not in have]
+    order = list(EFFECTS)
+    added.sort(key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name)))
+    params = VehicleParams(params.body, (*params.effects, *added))
+    about = {name: one for name, one in describe(params).items() if name.partition(".")[0] not in have | {"body"}}
+    endless = [name for name, one in about.items() if not np.isfinite(one.neutral)]
+    if not endless:
+        return params
+    return set_values(params, endless, jax.numpy.asarray([about[name].high for name in endless],
+                                                         jax.numpy.result_type(float)))
 
 
 def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:
     """Objective over the space's parameters; the others keep their values in `params`."""
-    batch, measured = make_batch(trials, plant.dt)
-    replay = Replay(plant, batch, lambda values: set_values(params, space.names, values))
+    replay, measured = make_courses(plant, trials, lambda values: set_values(params, space.names, values), params)
     return Objective(replay, space, trials, measured, noise)
 
 
@@ -150,9 +184,8 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
     """Replays of trials with the initial and with the fitted vehicle."""
     if not trials:
         return [], []
-    batch, _ = make_batch(trials, fit.plant.dt)
     names = fit.space.names
-    replay = Replay(fit.plant, batch, lambda values: set_values(fit.params, names, values))
+    replay, _ = make_courses(fit.plant, trials, lambda values: set_values(fit.params, names, values), fit.params)
     values = np.stack([np.asarray(get_values(one, names)) for one in (fit.initial_params, fit.params)])
     simulated = replay.simulate(values)
     initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
@@ -211,7 +244,8 @@ def make_report(
         for i, one in enumerate(fit.uncertainty.estimates)]
     fixed = [{"name": name, "value": float(get_values(fit.params, [name])[0]), "reason": reason}
              for name, reason in fit.space.fixed]
-    searches = [result for result in (fit.scan, fit.search) if result is not None]
+    searches = [result for result in (fit.scan, fit.coarse, fit.search) if result is not None]
+    ends = fit.coarse if fit.coarse is not None and len(fit.coarse.start_costs) > 1 else fit.search
     return {
         "schema": SCHEMA, "kind": KIND,
         "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
@@ -225,7 +259,8 @@ def make_report(
         "weak_combinations": fit.uncertainty.weak_combinations(),
         "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
                    "cost_initial": fit.initial_cost, "cost": fit.cost,
-                   "start_costs": fit.search.start_costs if fit.search is not None else [],
+                   "start_costs": ends.start_costs if ends is not None else [],
+                   "starts_agreeing": starts.agreeing(ends.start_costs) if ends is not None else None,
                    "delay_profiles": [{"name": name, "values": grid, "cost": costs}
                                       for name, grid, costs in fit.profiles]},
         **summaries(rows, log.trials), "errors": rows,
@@ -248,7 +283,7 @@ def _gradient_search(
     objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
     progress: Progress | None,
 ) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
-    """LM from all starts; delays are then profiled on a grid, and where that is better LM continues from there. Noise
+    """LM from all starts; delays are then profiled on a grid, and LM tries another valley that is about as deep. Noise
     scales that are mere defaults are replaced by the size of the residual and LM continues."""
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
@@ -259,20 +294,15 @@ def _gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
-    profiles = gradient.profile_delays(objective, space, result.u)
-    better = []
-    for name, grid, costs in profiles:
-        if costs.min() < float(objective.weighted_cost(result.u[None])[0]):
-            point = result.u.copy()
-            index = space.names.index(name)
-            point[index] = space.subset([name]).to_unit(grid[[costs.argmin()]])[0]
-            better.append(point)
-    if better:
-        again = np.array([result.u, *better, *result.starts])[: len(starts)]
-        if len(again) == len(starts):  # the same shapes, so nothing is compiled again
-            new = search(objective, again, iterations)
+    found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
+    for name, _, costs, followed in found:
+        here = result.u[space.names.index(name)]
+        apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
+        other = followed[apart][costs[apart].argmin()]
+        if costs[apart].min() < result.cost * (1 + VALLEY):
+            new = search(objective, other[None], iterations)
             result = new if new.cost < result.cost else result
-    return result, objective, profiles
+    return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
 
 
 def _keep_channels(trial: Trial, channels: str) -> Trial:
@@ -287,7 +317,8 @@ def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes at most."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    return (scan if config.method != "lm" else 0) + (iterations if config.method != "tpe" else 0)
+    first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
+    return first + (iterations if config.method != "tpe" else 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,15 +1,16 @@
 """Bounded Levenberg-Marquardt from several starts at once, with forward-mode Jacobians.
 
 All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
-start, of which the best is taken. Steps are in unit coordinates; a step that leaves the box is cut at its wall and the
-parameters at a wall whose gradient points outwards are held.
+start, of which the best is taken; starts that have converged wait. Steps are in unit coordinates; a step that leaves
+the box is cut at its wall and the parameters at a wall whose gradient points outwards are held.
 """
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from sysid.objective import Objective
 from sysid.result import FitResult, Progress
 from sysid.space import Space, is_delay
 
@@ -20,8 +21,18 @@ MAX_STEP = 0.3  # of the range, in one iteration
 HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
 
 
+class Residuals(Protocol):
+    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P)."""
+
+    @property
+    def counted(self) -> int: ...
+
+    def residuals(self, u: np.ndarray) -> np.ndarray: ...
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
 def fit(
-    objective: Objective, space: Space, *, starts: np.ndarray | None = None, iterations: int = 30,
+    objective: Residuals, space: Space, *, starts: np.ndarray | None = None, iterations: int = 30,
     tolerance: float = 1e-4, robust: bool = False, frozen: tuple[str, ...] = (), progress: Progress | None = None,
 ) -> FitResult:
     """Minimise the weighted least squares over `space`.
@@ -37,29 +48,31 @@ def fit(
     free = np.array([name not in frozen for name in space.names])
     count, damping, calm = len(u), np.full(len(u), 1e-2), np.zeros(len(u), int)
     cost = np.full(count, np.inf)
-    initial = np.inf
+    initial, evaluations = np.inf, 0
     history: list[float] = []
     for iteration in range(iterations):
-        residual, jacobian = objective.jacobian(u)
+        going = np.flatnonzero(calm < 2)
+        residual, jacobian = objective.jacobian(u[going])
         weight = huber_weight(residual) if robust else np.ones_like(residual)
-        cost = robust_cost(residual, robust) / objective.counted
+        cost[going] = robust_cost(residual, robust) / objective.counted
         if iteration == 0:
             initial = float(cost[0])
         gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
         hessian = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
         candidates = np.stack([
-            np.stack([_step(u[n], gradient[n], hessian[n], damping[n] * factor, free) for factor in DAMPINGS])
-            for n in range(count)])  # (S, D, P)
+            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in DAMPINGS])
+            for i, n in enumerate(going)])  # (G, D, P)
         tried = objective.residuals(candidates.reshape(-1, space.size))
-        tried = tried.reshape(count, len(DAMPINGS), *residual.shape[1:])
+        tried = tried.reshape(len(going), len(DAMPINGS), *residual.shape[1:])
         costs = np.stack([robust_cost(one, robust) for one in tried]) / objective.counted
-        best = costs.argmin(axis=1)
-        for n in range(count):
-            new = costs[n, best[n]]
+        evaluations += len(going) * (1 + len(DAMPINGS))
+        for i, n in enumerate(going):
+            best = costs[i].argmin()
+            new = costs[i, best]
             if new < cost[n]:
                 calm[n] = calm[n] + 1 if cost[n] - new < tolerance * cost[n] else 0
-                u[n], cost[n] = candidates[n, best[n]], new
-                damping[n] = np.clip(damping[n] * DAMPINGS[best[n]], 1e-7, MAX_DAMPING)
+                u[n], cost[n] = candidates[i, best], new
+                damping[n] = np.clip(damping[n] * DAMPINGS[best], 1e-7, MAX_DAMPING)
             else:
                 # Only when even a short step down the gradient does not help is the start at its minimum.
                 calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
@@ -71,25 +84,51 @@ def fit(
             break
     order = np.argsort(cost)
     return FitResult(u=u[order[0]], cost=float(cost[order[0]]), initial_cost=initial,
-                     evaluations=len(history) * count * (1 + len(DAMPINGS)), starts=u[order], start_costs=cost[order],
+                     evaluations=evaluations, starts=u[order], start_costs=cost[order],
                      history=np.array(history))
 
 
 def profile_delays(
-    objective: Objective, space: Space, u: np.ndarray, points: int = 16
-) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Cost over a grid of each delay-type parameter, the others held at u (P,).
+    objective: Residuals, space: Space, u: np.ndarray, points: int = 16, near: float = 0.005, robust: bool = False
+) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Cost over a grid of each delay-type parameter, the others following it from u (P,).
+
+    A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
+    by one damped Gauss-Newton step, which tells whether another valley is as deep.
+
+    Args:
+        points: of an even grid over the whole range.
+        near: six more on both sides of u are this far apart [s].
 
     Returns:
-        Per delay its name, the grid (G,) of its values [s] and the costs (G,).
+        Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
     """
     profiles = []
-    for index, name in enumerate(space.names):
-        if is_delay(name):
-            grid = np.linspace(0.0, 1.0, points)
-            at = np.tile(u, (len(grid), 1))
-            at[:, index] = grid
-            profiles.append((name, space.to_values(at)[:, index], objective.weighted_cost(at)))
+    delays = [index for index, name in enumerate(space.names) if is_delay(name)]
+    if not delays:
+        return []
+    jacobian = objective.jacobian(u[None])[1][0]
+    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
+
+    def cost(residual: np.ndarray) -> np.ndarray:
+        return np.asarray(robust_cost(residual, robust) / objective.counted)
+
+    for index in delays:
+        values = space.to_values(u)
+        around = np.tile(values, (13, 1))
+        around[:, index] += near * np.arange(-6, 7)
+        grid = np.concatenate([np.linspace(0.0, 1.0, points), space.to_unit(around)[:, index]])
+        grid = np.unique(grid.round(9))
+        at = np.tile(u, (len(grid), 1))
+        at[:, index] = grid
+        residual = objective.residuals(at)
+        free = np.arange(space.size) != index
+        weight = huber_weight(residual) if robust else np.ones_like(residual)
+        moved = np.stack([_step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, free)
+                          for point, one in zip(at, residual * weight, strict=True)])
+        both = np.stack([cost(residual), cost(objective.residuals(moved))])
+        followed = np.where((both[1] < both[0])[:, None], moved, at)
+        profiles.append((space.names[index], space.to_values(at)[:, index], both.min(0), followed))
     return profiles
 
 

@@ -9,12 +9,13 @@ noise as prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
-from sysid.rollout import Measured, Replay, Simulated
+from sysid.rollout import Measured, Simulated
 from sysid.space import Space
 
 DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
@@ -52,11 +53,19 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates")
 
 
+class Replays(Protocol):
+    """`sysid.rollout.Replay`, or what stands in for it."""
+
+    def simulate(self, values: np.ndarray) -> Simulated: ...
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]: ...
+
+
 @dataclass(frozen=True)
 class Objective:
     """Errors of N parameter sets against B trials, in unit coordinates of `space`."""
 
-    replay: Replay
+    replay: Replays
     space: Space
     trials: tuple[Trial, ...]
     measured: Measured

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.gradient import HUBER, huber_weight
 from sysid.objective import Objective
 
 CONFIDENCE = 0.90
@@ -58,15 +59,26 @@ class Uncertainty:
         return found
 
 
-def estimate(objective: Objective, u: np.ndarray, confidence: float = CONFIDENCE) -> Uncertainty:
-    """Intervals of the parameters at the fitted point u (P,)."""
+def estimate(
+    objective: Objective, u: np.ndarray, confidence: float = CONFIDENCE, robust: bool = False
+) -> Uncertainty:
+    """Intervals of the parameters at the fitted point u (P,).
+
+    Args:
+        robust: u minimises the Huber loss: residuals beyond its bend pull with a constant force and tell no curvature.
+    """
     from scipy import stats
 
     space = objective.space
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
     trials = len(residual)
+    if robust:
+        inside = np.abs(residual) <= HUBER
+        residual = residual * huber_weight(residual)
+        hessian = np.einsum("bkp,bkq->pq", jacobian * inside[..., None], jacobian)
+    else:
+        hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
     variance = max(float(np.square(residual).sum()) / max(objective.counted - space.size, 1), 1e-12)
-    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
     prior = np.eye(space.size) / PRIOR_SD**2
     by_trial = np.einsum("bkp,bk->bp", jacobian, residual)  # (B, P)
     by_piece = _piece_sums(objective, jacobian, residual)

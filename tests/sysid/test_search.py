@@ -140,11 +140,33 @@ def test_what_the_log_does_not_tell_is_named(objective):
     assert sum_sd < 0.1  # their sum is well known
 
 
-def test_a_delay_is_profiled_on_a_grid(objective):
+def test_a_delay_is_profiled_on_a_grid_and_the_others_follow(objective):
     renamed = dataclasses.replace(objective.space, names=("delay", "tau_omega", "turn"))
-    (name, grid, costs), = gradient.profile_delays(dataclasses.replace(objective, space=renamed), renamed, U_TRUTH)
-    assert name == "delay" and len(grid) == len(costs) == 16
-    assert grid[costs.argmin()] == pytest.approx(TRUTH[0], rel=0.35)
+    behind = dataclasses.replace(objective, space=renamed)
+    off = U_TRUTH + np.array([0.0, 0.1, 0.0])
+    (name, grid, costs, followed), = gradient.profile_delays(behind, renamed, off)
+    assert name == "delay" and 16 < len(grid) == len(costs) == len(followed) <= 16 + 13
+    assert grid[costs.argmin()] == pytest.approx(TRUTH[0], rel=0.1)
+    assert np.abs(followed[costs.argmin(), 1:] - U_TRUTH[1:]).max() < 0.05
+    np.testing.assert_allclose(behind.weighted_cost(followed), costs, rtol=1e-6)
+
+
+def test_starts_that_have_converged_are_not_searched_further(objective):
+    calls = []
+
+    class Counted:
+        counted = objective.counted
+        residuals = staticmethod(objective.residuals)
+
+        @staticmethod
+        def jacobian(u):
+            calls.append(len(u))
+            return objective.jacobian(u)
+
+    starts = np.array([U_TRUTH, [0.9, 0.9, 0.1]])
+    result = gradient.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
+    assert calls[0] == 2 and calls[-1] == 1
+    assert result.evaluations == 5 * sum(calls)
 
 
 def test_a_diverged_simulation_is_dear_and_not_a_number_nowhere(objective):

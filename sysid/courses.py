@@ -1,0 +1,104 @@
+"""Replay of trials in which repetitions of one course are driven once.
+
+Where a vehicle starts and which way it faces does not matter to its motion in its own frame, unless an effect is tied
+to the room. Trials with the same commands and the same speeds at the start are therefore one course: it is replayed
+from the origin, with its derivatives, and then moved to the start of each trial and read at that trial's own times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.log import Trial
+from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
+
+INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
+SETS = 4  # parameter sets replayed together there: one compilation serves them all
+
+
+class CourseReplay:
+    """`sysid.rollout.Replay` of trials, with as many drives as there are courses; `courses` is their number."""
+
+    def __init__(self, plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],
+                 anywhere: bool = True):
+        """`set_values` turns values (P,) into the vehicle's parameters.
+
+        Args:
+            anywhere: the motion does not depend on where in the room it starts; otherwise every trial is a course.
+        """
+        batch, self.measured = make_batch(trials, plant.dt)
+        command, start = np.asarray(batch.command), np.asarray(batch.start, float)
+        seen: dict[bytes, int] = {}
+        keys = [command[i].tobytes() + start[i, 3 if anywhere else 0 :].tobytes() for i in range(len(trials))]
+        self._course = np.array([seen.setdefault(key, len(seen)) for key in keys])  # (B,)
+        first = np.array([keys.index(key) for key in seen])
+        self.courses = len(first)
+        # Poses are moved from the start of the course to that of the trial.
+        from_start = start[first] * ([0, 0, 0, 1, 1] if anywhere else [1, 1, 1, 1, 1])
+        self._from, self._to = from_start[self._course, :3], start[:, :3]
+        records = command.shape[1]
+        every = np.tile(np.minimum(np.arange(records + 1), records - 1), (self.courses, 1))
+        last = np.tile((np.arange(records + 1) == records).astype(float), (self.courses, 1))
+        float_type = jnp.result_type(float)
+        whole = replace(batch, command=batch.command[first], start=jnp.asarray(from_start, float_type),
+                        pose_index=jnp.asarray(every), pose_weight=jnp.asarray(last, float_type),
+                        odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
+        self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
+                       "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
+        self._replay = Replay(plant, whole, set_values)
+
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
+        if jax.default_backend() != "cpu":
+            return self._spread(self._replay.simulate(values), motion=True)
+        rows, count = int(np.clip(INSTANCES // self.courses, 1, SETS)), len(values)
+        values = np.concatenate([values, np.repeat(values[-1:], -count % rows, axis=0)])
+        parts = [self._spread(self._replay.simulate(values[i : i + rows]), motion=True)
+                 for i in range(0, len(values), rows)]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replay and derivatives (a last axis P) for each of values (N, P)."""
+        rows = 1 if jax.default_backend() == "cpu" else len(values)
+        parts = []
+        for i in range(0, len(values), rows):
+            at, slope = self._replay.jacobian(values[i : i + rows])
+            parts.append((self._spread(at, motion=True), self._spread(slope, motion=False)))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    def _spread(self, simulated: Simulated, motion: bool) -> Simulated:
+        """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...); derivatives are turned but not moved."""
+        pose, odometry = (self._at(name, np.asarray(getattr(simulated, name), float)) for name in self._times)
+        diverged: Any = np.asarray(simulated.diverged)[:, self._course]
+        extra = (1,) * (pose.ndim - 4)
+        turn = (self._to[:, 2] - self._from[:, 2]).reshape(-1, 1, *extra)  # (B, 1)
+        x, y, yaw = (pose[:, :, :, c] for c in range(3))
+        if motion:
+            x, y, yaw = x - self._from[:, :1], y - self._from[:, 1:2], yaw + turn
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = cos * x - sin * y, sin * x + cos * y
+        if motion:
+            x, y = x + self._to[:, :1], y + self._to[:, 1:2]
+        moved: Any = np.stack([x, y, yaw], axis=3)
+        return Simulated(moved, odometry, diverged)
+
+    def _at(self, name: str, values: np.ndarray) -> Any:
+        index, weight = self._times[name]
+        course = self._course[:, None]
+        weight = weight.reshape(*weight.shape, *(1,) * (values.ndim - 3))
+        before, after = values[:, course, index], values[:, course, index + 1]
+        return before + weight * (after - before)
+
+
+def make_courses(plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],
+                 params: Any) -> tuple[CourseReplay, Measured]:
+    """Replay of trials of a vehicle with `params`, and what was measured."""
+    tied = any(getattr(effect, "room_fixed", True) for effect in params.effects)
+    replay = CourseReplay(plant, trials, set_values, anywhere=not tied)
+    return replay, replay.measured

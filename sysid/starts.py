@@ -1,0 +1,143 @@
+"""Where the search on poses starts: the vehicle fitted to its motion in short bins.
+
+A pose adds up all motion before it, so that far from the truth its error has folds in which a search stays. The motion
+within a bin of a quarter of a second has not, and what differs between replicates is nearly the same in every bin. A
+search there comes near the truth from far; poses then tell what adds up over a whole drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sysid import gradient
+from sysid.loop.features import Features, make_features
+from sysid.loop.noise import Whitener, deviations, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.objective import HUGE, Objective, Replays
+from sysid.result import FitResult, Progress
+from sysid.rollout import Simulated
+from sysid.space import Space
+
+AGREE = 0.02
+"""Starts agree where their costs differ by no more than this share of the best one."""
+USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
+"""Noise of the features where there are no replicates [m/s, rad/s]."""
+TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
+NEAR = 1e-3  # step of the features' derivative, in metres or radians of the samples
+
+
+@dataclass(frozen=True)
+class FeatureObjective:
+    """Whitened errors in features, in unit coordinates of `space`: what `gradient.fit` minimises."""
+
+    replay: Replays
+    space: Space
+    features: Features
+    target: np.ndarray  # (B, K, C) measured features
+    mask: np.ndarray  # (B, K, C) weights of the bins
+    whitener: Whitener
+
+    @property
+    def counted(self) -> int:
+        """Number of measured values."""
+        return int((self.mask > 0).sum())
+
+    def simulate(self, u: np.ndarray) -> np.ndarray:
+        """Features (N, B, K, C) at unit coordinates (N, P)."""
+        return self.features.of(self.replay.simulate(self.space.to_values(u)))
+
+    def weighted_cost(self, u: np.ndarray) -> np.ndarray:
+        """Mean squared residual (N,)."""
+        return np.square(self.residuals(u)).sum((-1, -2)) / self.counted
+
+    def residuals(self, u: np.ndarray) -> np.ndarray:
+        """(N, B, K C) white residuals of unit coordinates (N, P); those of a drive that diverged are huge."""
+        return self._white(self.simulate(u))
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (N, B, K C) and their derivatives by u (N, B, K C, P)."""
+        of, scale = self.features.of, self.space.slope(u)
+        value, slope = self.replay.jacobian(self.space.to_values(u))
+        at = of(value)
+        samples: list[Any] = [np.asarray(one, float) for one in (value.pose, value.odometry)]
+        columns = []
+        for p in range(u.shape[1]):  # features are a smooth map of the samples: differences suffice
+            steps = [np.nan_to_num(np.asarray(one[..., p], float), posinf=0.0, neginf=0.0)
+                     for one in (slope.pose, slope.odometry)]
+            largest = np.maximum(*(np.abs(step).max((1, 2, 3), initial=0.0) for step in steps))  # (N,)
+            size = (NEAR / np.maximum(largest, 1e-12))[:, None, None, None]
+            ends = [of(Simulated(samples[0] + sign * size * steps[0], samples[1] + sign * size * steps[1],
+                                 value.diverged)) for sign in (1, -1)]
+            columns.append(self._apply((ends[0] - ends[1]) / (2 * size)))
+        jacobian = np.where(_bad(at)[..., None], 0.0, np.stack(columns, axis=-1))
+        return self._white(at), jacobian * scale[:, None, None, :]
+
+    def _white(self, at: np.ndarray) -> np.ndarray:
+        white = self._apply(np.where(np.isfinite(at), at, 0.0) - self.target)
+        return np.where(_bad(at), HUGE * (self.mask > 0).reshape(len(self.mask), -1), white)
+
+    def _apply(self, series: np.ndarray) -> np.ndarray:
+        """White series (N, B, K C) of (N, B, K, C)."""
+        white = np.moveaxis(self.whitener.apply(np.moveaxis(series, 0, -1), self.mask), -1, 0)
+        return white.reshape(*white.shape[:2], -1)
+
+
+def _bad(at: np.ndarray) -> np.ndarray:
+    """(N, B, 1) drives that diverged, of features (N, B, K, C)."""
+    return ~np.isfinite(at).all((-1, -2))[..., None]
+
+
+def fit(
+    objective: Objective, points: np.ndarray, track: float, iterations: int = 15, progress: Progress | None = None
+) -> FitResult:
+    """Fit features from all starts, then from the best one with the noise that it leaves.
+
+    Args:
+        objective: that of the poses; its replay is used.
+        points: (S, P) unit coordinates of the starts.
+        track: of the vehicle [m]; tells how hard its wheels are pulled.
+
+    Returns:
+        The best point; `start_costs` are those of the first fit, ascending.
+    """
+    coarse = make_features_objective(objective)
+    found = gradient.fit(coarse, coarse.space, starts=points, iterations=iterations, tolerance=TOLERANCE,
+                         progress=progress)
+    at = coarse.simulate(found.u[None])[0]
+    if not np.isfinite(at).all():
+        return found
+    left, level = coarse.target - at, roughness(at, coarse.features.width, track)
+    mask = coarse.mask / fit_roughness(left, coarse.mask, level)[level]
+    fine = replace(coarse, mask=mask, whitener=fit_whitener(left, mask))
+    again = gradient.fit(fine, fine.space, starts=found.u[None], iterations=max(iterations // 2, 3),
+                         tolerance=TOLERANCE, progress=progress)
+    return replace(found, u=again.u, evaluations=found.evaluations + again.evaluations)
+
+
+def make_features_objective(objective: Objective) -> FeatureObjective:
+    """Errors in features of what an objective of poses compares, in the noise that replicates show."""
+    features = make_features(objective.trials)
+    target = features.of(objective.measured)
+    groups = replicate_groups(objective.trials)
+    return FeatureObjective(objective.replay, objective.space, features, target, features.mask,
+                            first_scales(target, features.mask, groups))
+
+
+def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) -> Whitener:
+    """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
+    part = deviations(target, groups)
+    inside = [i for group in groups if len(group) > 1 for i in group]
+    scale = np.array(USUAL)
+    if len(inside) >= 3:
+        count = np.maximum(mask[inside].sum((0, 1)), 1)
+        found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)
+        scale = np.where(found > 0, found, scale)
+    channels = target.shape[-1]
+    return Whitener(scale, np.zeros((1, channels, channels)), np.eye(channels))
+
+
+def agreeing(costs: np.ndarray) -> int:
+    """How many of the costs (S,) are that of the best start."""
+    return int((costs <= costs.min() * (1 + AGREE)).sum())

@@ -1,0 +1,109 @@
+"""Starts in features, and replicates that are driven once."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
+
+from sysid import gradient, starts
+from sysid.courses import CourseReplay, make_courses
+from sysid.fit import with_effects
+from sysid.objective import Objective, estimate_noise
+from sysid.rollout import Replay, make_batch
+from sysid.starts import FeatureObjective, make_features_objective
+from whill_mjx.effects import make_effect
+from whill_mjx.parameters import describe, get_values
+from whill_mjx.presets import preset_params
+from whill_mjx.specs import WHILL_CR
+from whill_mjx.types import VehicleParams
+
+U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def poses(unicycle_log) -> Objective:
+    trials = unicycle_log.training
+    replay = CourseReplay(unicycle_plant(), trials, lambda values: values)
+    return Objective(replay, UNICYCLE_SPACE, trials, replay.measured, estimate_noise(trials))
+
+
+@pytest.fixture(scope="module")
+def features(poses) -> FeatureObjective:
+    return make_features_objective(poses)
+
+
+@pytest.mark.parametrize("anywhere", [True, False])
+def test_courses_replay_every_trial_as_driving_each_by_itself_does(unicycle_log, anywhere):
+    trials, plant = unicycle_log.training, unicycle_plant()
+    courses = CourseReplay(plant, trials, lambda values: values, anywhere)
+    assert courses.courses == (len({trial.manoeuvre for trial in trials}) if anywhere else len(trials))
+    batch, measured = make_batch(trials, plant.dt)
+    alone = Replay(plant, batch, lambda values: values)
+    values = np.array([TRUTH, [0.1, 0.3, 1.2], [0.5, 0.5, 0.8]])
+    for one, other in zip(courses.jacobian(values), alone.jacobian(values), strict=True):
+        mask = (measured.pose_mask, measured.odometry_mask)
+        for a, b, known in zip((one.pose, one.odometry), (other.pose, other.odometry), mask, strict=True):
+            known = known.reshape(known.shape + (1,) * (b.ndim - 4))
+            np.testing.assert_allclose(a * known, b * known, atol=3e-4)
+    np.testing.assert_allclose(courses.simulate(values).pose, courses.jacobian(values)[0].pose, atol=1e-6)
+
+
+def test_an_effect_that_is_tied_to_the_room_makes_each_trial_a_course(unicycle_log):
+    params = preset_params(WHILL_CR, "physical")
+    trials, plant = unicycle_log.training[:4], unicycle_plant()
+    free, _ = make_courses(plant, trials, lambda values: values, params)
+    sloping = VehicleParams(params.body, (*params.effects, make_effect("slope")))
+    tied, _ = make_courses(plant, trials, lambda values: values, sloping)
+    assert free.courses == 2 and tied.courses == 4
+
+
+def test_the_jacobian_of_features_is_that_of_their_residual(features):
+    u = np.array([[0.4, 0.5, 0.6], [0.6, 0.4, 0.3]])
+    residual, jacobian = features.jacobian(u)
+    np.testing.assert_allclose(residual, features.residuals(u), atol=1e-4)
+    for parameter in range(3):
+        step = np.eye(3)[parameter] * 1e-2
+        slope = (features.residuals(u + step) - features.residuals(u - step)) / 2e-2
+        assert np.linalg.norm(slope - jacobian[..., parameter]) < 0.02 * np.linalg.norm(slope)
+
+
+def test_random_starts_in_features_agree_and_lie_where_the_poses_fit_best(poses):
+    points = gradient.random_starts(poses.space, 6, seed=2)
+    found = starts.fit(poses, points, WHILL_CR.track, iterations=20)
+    assert starts.agreeing(found.start_costs) == 6
+    np.testing.assert_allclose(poses.space.to_values(found.u), TRUTH, rtol=0.1)
+    polished = gradient.fit(poses, poses.space, starts=found.u[None], iterations=8)
+    direct = gradient.fit(poses, poses.space, iterations=30)
+    assert polished.cost <= direct.cost * 1.001
+
+
+def test_a_drive_that_diverges_is_dear_in_features(features):
+    class Broken:
+        def simulate(self, values):
+            simulated = features.replay.simulate(values)
+            pose = np.array(simulated.pose)
+            pose[:, 0] = np.nan
+            return dataclasses.replace(simulated, pose=pose)
+
+    cost = dataclasses.replace(features, replay=Broken()).weighted_cost(U_TRUTH[None])
+    assert np.isfinite(cost).all() and cost[0] > 1e3 * features.weighted_cost(U_TRUTH[None])[0]
+
+
+@pytest.mark.quick
+def test_costs_agree_within_a_share_of_the_best():
+    assert starts.agreeing(np.array([1.0, 1.01, 1.019, 1.2, np.inf])) == 3
+
+
+@pytest.mark.quick
+def test_effects_are_added_where_they_do_nothing():
+    params = preset_params(WHILL_CR, "physical")
+    more = with_effects(params, ("lateral_damping", "acceleration_limit", "yaw_scrub"))
+    assert sorted(set(describe(more)) - set(describe(params))) == [
+        "acceleration_limit.angular", "acceleration_limit.linear", "lateral_damping.c_front", "lateral_damping.c_rear"]
+    values = dict(zip(describe(more), np.asarray(get_values(more, list(describe(more)))), strict=True))
+    assert values["lateral_damping.c_front"] == 0.0 and np.isfinite(values["acceleration_limit.linear"])
+    with pytest.raises(ValueError, match="no effect 'anti_gravity'"):
+        with_effects(params, ("anti_gravity",))
