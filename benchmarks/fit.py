@@ -1,8 +1,8 @@
 """How well vehicles are identified: planted truth, the shared plant logs, and two published measured sets.
 
-    python -m benchmarks.fit --shared ../shared --parts planted plant drive mrclam
+    python -m benchmarks.fit --shared ../shared --parts planted plant chair contact speed starts drive mrclam
 
-Writes benchmarks/results/fit.json (planted, plant, speed) and measured.json (drive, mrclam). A "gain" is the share of
+Writes benchmarks/results/fit.json and, for drive and mrclam, measured.json. A "gain" is the share of
 the held-out mean position RMSE (or yaw RMSE) of the ideal kinematic replay that the fitted vehicle removes; every
 window restarts from the measured pose and wheel speeds and counts only where the measurement changed.
 """
@@ -24,6 +24,7 @@ from sysid.log import Log, Trial, load_log
 from sysid.measured import load_drive, load_mrclam, split
 from sysid.report import error_rows, summaries
 
+CLAIM = "How near a fit comes to the noise floor of its data"
 DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
 DRIVE_HELD_OUT = {"asphalt": ("warthog_asphalt_a:0.667-1",), "sand": ("warthog_sand_2",)}
 DRIVE_RUNS = ("warthog_asphalt_a", "warthog_sand_1", "warthog_sand_2")
@@ -35,17 +36,22 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/plant and data/measured."""
-    parts: tuple[Literal["planted", "plant", "drive", "mrclam", "speed"], ...] = ("planted", "plant", "drive", "mrclam")
+    parts: tuple[Literal["planted", "plant", "chair", "contact", "speed", "starts", "tpe", "drive", "mrclam"], ...] = (
+        "planted", "plant", "chair", "contact", "drive", "mrclam")
     terrains: tuple[Literal["asphalt", "sand", "pooled"], ...] = ("asphalt", "sand", "pooled")
     """Fits of the DRIVE runs."""
     windows: int = 100
     """Training windows of a measured set that are fitted, spread evenly; all held-out windows are scored."""
     evaluations: int = 96
-    """Parameter sets of the global search."""
+    """Parameter sets of the global search of the measured sets."""
     iterations: int = 20
-    """Iterations of the gradient search."""
+    """Iterations of the gradient search on poses."""
     starts: int = 3
-    """Starts of the gradient search."""
+    """Starts of the gradient search of the measured sets."""
+    repeats: int = 3
+    """Timed fits."""
+    seeds: tuple[int, ...] = (2000, 2001, 2002)
+    """Days of the contact plant (`benchmarks.plant`)."""
     physics_dt: float = 0.005
     """Physics step of the fits of measured sets [s]."""
     presets: tuple[Literal["paper", "physical"], ...] = ("physical", "paper")
@@ -84,8 +90,8 @@ def gains(summary: dict[str, Any], prefix: str) -> dict[str, dict[str, Any]]:
 
 def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -> FitConfig:
     # The paper's drive has no wheel-spin state: its odometry is its body's motion, so it can only fit the pose.
-    return FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations, starts=settings.starts,
-                     physics_dt=settings.physics_dt, robust=True,
+    return FitConfig(preset=preset, method="both", trials=settings.evaluations,
+                     iterations=settings.iterations, starts=settings.starts, physics_dt=settings.physics_dt,
                      channels="both" if preset == "physical" else "ground_truth")
 
 
@@ -135,21 +141,53 @@ def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
     log = load_log(settings.shared / "data" / "plant" / "plain")
     for preset in settings.presets:
-        config = FitConfig(preset=preset, trials=settings.evaluations, iterations=settings.iterations,
-                           starts=settings.starts)
-        fit = fit_log(log, config)
-        result = evaluate(fit, log.held_out)
-        one = result["summary"]["held_out"]["ground_truth"]["trajectory"]
-        # The held-out set has replicates of one manoeuvre only; the training set's floor is over all manoeuvres.
-        floor = evaluate(fit, log.trials)["noise_floor"]["held_out"]["ground_truth"]["trajectory"]
-        figures = gains(result["summary"]["held_out"], f"plant_{preset}")
-        figures[f"plant_replicate_ratio_{preset}"] = figure([one["fitted"] / floor], "-")
-        figures[f"seconds_plant_{preset}"] = figure([fit.seconds], "s")
+        fit = fit_log(log, FitConfig(preset=preset, iterations=settings.iterations))
+        figures, ratio = against_replicates(fit, log, f"plant_{preset}")
+        figures[f"plant_replicate_ratio_{preset}"] = ratio
         if preset == "physical":
-            figures["plant_replicate_ratio"] = figures[f"plant_replicate_ratio_{preset}"]
-        record("fit", "How near a fit comes to the noise floor of its data", figures)
+            figures["plant_replicate_ratio"] = ratio
+        record("fit", CLAIM, figures)
         show(figures)
         show_parameters(fit)
+
+
+def against_replicates(fit: Fit, log: Log, stem: str) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """Figures of the held-out trials; mean position RMSE over the replicates' spread."""
+    result = evaluate(fit, log.held_out)
+    one = result["summary"]["held_out"]["ground_truth"]["trajectory"]
+    # The held-out set has replicates of few manoeuvres; that of all trials is the floor.
+    floor = evaluate(fit, log.trials)["noise_floor"]["held_out"]["ground_truth"]["trajectory"]
+    figures = gains(result["summary"]["held_out"], stem)
+    figures[f"replicate_spread_{stem}"] = figure([floor], "m")
+    figures[f"seconds_{stem}"] = figure([fit.seconds], "s")
+    return figures, figure([one["fitted"] / floor], "-")
+
+
+def chair(settings: Benchmark) -> None:
+    """The log that ships with the package."""
+    log = load_log(Path(__file__).parents[1] / "sysid" / "data" / "chair")
+    fit = fit_log(log, FitConfig(iterations=settings.iterations))
+    figures, figures["chair_replicate_ratio"] = against_replicates(fit, log, "chair")
+    record("fit", CLAIM, figures)
+    show(figures)
+    show_parameters(fit)
+
+
+def contact(settings: Benchmark) -> None:
+    """Days of the contact plant, each fitted by itself: is the shared log an exception?"""
+    from benchmarks.plant.make import make_log
+
+    ratios, seconds = [], []
+    for seed in settings.seeds:
+        with tempfile.TemporaryDirectory() as folder:
+            make_log(Path(folder) / "log", seed=seed)
+            log = load_log(Path(folder) / "log")
+        fit = fit_log(log, FitConfig(iterations=settings.iterations))
+        ratios.append(against_replicates(fit, log, "contact")[1]["value"])
+        seconds.append(fit.seconds)
+    figures = {"contact_replicate_ratio": figure(ratios, "-"), "seconds_contact": figure(seconds, "s")}
+    record("fit", CLAIM, figures)
+    show(figures)
 
 
 def planted(settings: Benchmark) -> None:
@@ -166,37 +204,74 @@ def planted(settings: Benchmark) -> None:
     truth = set_values(start, space.names, get_values(preset_params(WHILL_CR, "paper_optimised"), space.names))
     with tempfile.TemporaryDirectory() as folder:
         log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, replicates=2))
-    config = FitConfig(preset="paper", trials=settings.evaluations, iterations=settings.iterations,
-                       starts=settings.starts)
-    fit = fit_log(log, config)
+    fit = fit_log(log, FitConfig(preset="paper", iterations=settings.iterations))
     one = evaluate(fit, log.held_out)["summary"]["held_out"]["ground_truth"]["trajectory"]
     inside = [estimate.low <= value <= estimate.high for estimate, value in zip(
         fit.uncertainty.estimates, np.asarray(get_values(truth, space.names)), strict=True) if estimate.identifiable]
     figures = {"noise_floor_ratio": figure([one["fitted"] / one["noise_floor"]], "-"),
                "planted_identifiable": figure([float(len(inside))], "count"),
                "planted_inside_interval": figure([float(np.mean(inside))], "share")}
-    record("fit", "How near a fit comes to the noise floor of its data", figures)
+    record("fit", CLAIM, figures)
     show(figures)
     show_parameters(fit)
 
 
 def speed(settings: Benchmark) -> None:
-    """Seconds of one gradient start and of 500 evaluations of TPE on the plant's plain chair, compilation included."""
-    from sysid import gradient, tpe
+    """Seconds of one start to convergence, features and poses, on 18 trials of 22 s; compilation included and apart."""
+    log = load_log(settings.shared / "data" / "plant" / "plain")
+    kept = {trial.name for trial in log.training[:18]}
+    log = log.select(lambda trial: trial.name in kept)
+    whole, compiling = [], []
+    for _ in range(settings.repeats):
+        fit = fit_log(log, FitConfig(iterations=settings.iterations))
+        whole.append(fit.seconds)
+        compiling.append(compile_seconds(fit, log))
+    figures = {"cpu_seconds": figure(whole, "s"),
+               "cpu_seconds_search": figure([a - b for a, b in zip(whole, compiling, strict=True)], "s")}
+    record("fit", CLAIM, figures)
+    show(figures)
+
+
+def compile_seconds(fit: Fit, log: Log) -> float:
+    """By how much the first replay and Jacobian of a fresh objective take longer than the second."""
+    objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, fit.noise)
+    spent = []
+    for _ in range(2):
+        began = time.perf_counter()
+        objective.jacobian(fit.u[None])
+        objective.residuals(np.tile(fit.u, (4, 1)))
+        spent.append(time.perf_counter() - began)
+    return spent[0] - spent[1]
+
+
+def starts(settings: Benchmark) -> None:
+    """How many of 32 random starts in features end at the same cost."""
+    from sysid import starts as feature_starts
+
+    log = load_log(settings.shared / "data" / "plant" / "plain")
+    fit = fit_log(log, FitConfig(iterations=settings.iterations, starts=32))
+    assert fit.coarse is not None
+    costs = fit.coarse.start_costs
+    figures = {"starts_agreeing_of_32": figure([float(feature_starts.agreeing(costs))], "count"),
+               "starts_within_10_percent_of_32": figure([float((costs < 1.1 * costs.min()).sum())], "count"),
+               "seconds_32_starts": figure([fit.seconds], "s")}
+    record("fit", CLAIM, figures)
+    show(figures)
+    print(np.round(costs, 3))
+
+
+def tpe500(settings: Benchmark) -> None:
+    """Seconds of 500 evaluations of TPE on the plant's plain chair, compilation included."""
+    from sysid import tpe
     from sysid.objective import estimate_noise
 
     log = load_log(settings.shared / "data" / "plant" / "plain")
-    fit = fit_log(log, FitConfig(method="lm", starts=1, iterations=1))
-    figures = {}
-    for name in ("cpu_seconds", "tpe500_cpu_seconds"):
-        objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, estimate_noise(log.training))
-        began = time.perf_counter()
-        if name == "cpu_seconds":
-            gradient.fit(objective, fit.space, iterations=settings.iterations)
-        else:
-            tpe.fit(objective, fit.space, evaluations=500)
-        figures[name] = figure([time.perf_counter() - began], "s")
-    record("fit", "How near a fit comes to the noise floor of its data", figures)
+    fit = fit_log(log, FitConfig(method="lm", iterations=1))
+    objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, estimate_noise(log.training))
+    began = time.perf_counter()
+    tpe.fit(objective, fit.space, evaluations=500)
+    figures = {"tpe500_cpu_seconds": figure([time.perf_counter() - began], "s")}
+    record("fit", CLAIM, figures)
     show(figures)
 
 
@@ -212,9 +287,11 @@ def show_parameters(fit: Fit) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"planted": planted, "plant": plant, "drive": drive, "mrclam": mrclam, "speed": speed}
+    parts = {"planted": planted, "plant": plant, "chair": chair, "contact": contact, "speed": speed, "starts": starts,
+             "tpe": tpe500, "drive": drive, "mrclam": mrclam}
     for name in settings.parts:
-        needs = {"plant": "plant", "speed": "plant", "drive": "measured/drive_norlab", "mrclam": "measured/mrclam"}
+        needs = {**dict.fromkeys(("plant", "speed", "starts", "tpe"), "plant"),
+                 "drive": "measured/drive_norlab", "mrclam": "measured/mrclam"}
         folder = settings.shared / "data" / needs.get(name, "")
         if name in needs and not folder.is_dir():
             print(f"{name}: {folder} is not there, left out")

@@ -94,6 +94,23 @@ def test_a_robust_fit_is_not_drawn_by_outliers(objective):
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_intervals_of_a_robust_fit_are_not_those_of_its_outliers(objective):
+    """Outliers of a few samples widen the intervals of squares, and hardly those of the Huber loss."""
+    pose = objective.measured.pose.copy()
+    pose[:, ::17, 2] += np.where(np.arange(pose[:, ::17].shape[1]) % 2, 0.3, -0.3)
+    spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
+    u = gradient.fit(spoiled, spoiled.space, robust=True).u
+
+    def widths(objective, robust):
+        known = uncertainty.estimate(objective, u, robust=robust).estimates
+        return np.array([one.high - one.low for one in known])
+
+    clean, squares, huber = widths(objective, False), widths(spoiled, False), widths(spoiled, True)
+    assert (huber < 2.5 * clean).all() and squares[2] > 1.5 * huber[2]
+    for one, truth in zip(uncertainty.estimate(spoiled, u, robust=True).estimates, TRUTH, strict=True):
+        assert one.low - (one.high - one.low) < truth < one.high + (one.high - one.low)
+
+
 @pytest.mark.parametrize("cost", ["paper", "weighted"])
 def test_tpe_improves_on_the_initial_values(objective, cost):
     result = tpe.fit(objective, objective.space, evaluations=64, seed=0, cost=cost, best=3)
