@@ -221,26 +221,29 @@ def speed(settings: Benchmark) -> None:
     log = load_log(settings.shared / "data" / "plant" / "plain")
     kept = {trial.name for trial in log.training[:18]}
     log = log.select(lambda trial: trial.name in kept)
-    whole, compiling = [], []
+    whole, process, compiling = [], [], []
     for _ in range(settings.repeats):
+        began = time.process_time()
         fit = fit_log(log, FitConfig(iterations=settings.iterations))
+        process.append(time.process_time() - began)
         whole.append(fit.seconds)
         compiling.append(compile_seconds(fit, log))
-    figures = {"cpu_seconds": figure(whole, "s"),
-               "cpu_seconds_search": figure([a - b for a, b in zip(whole, compiling, strict=True)], "s")}
+    # On a machine that others use as well, processor time is what the fit itself takes.
+    figures = {"cpu_seconds": figure(whole, "s"), "cpu_seconds_process": figure(process, "s"),
+               "cpu_seconds_process_search": figure([a - b for a, b in zip(process, compiling, strict=True)], "s")}
     record("fit", CLAIM, figures)
     show(figures)
 
 
 def compile_seconds(fit: Fit, log: Log) -> float:
-    """By how much the first replay and Jacobian of a fresh objective take longer than the second."""
+    """By how much more processor time the first replay and Jacobian of a fresh objective take than the second."""
     objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, fit.noise)
     spent = []
     for _ in range(2):
-        began = time.perf_counter()
+        began = time.process_time()
         objective.jacobian(fit.u[None])
         objective.residuals(np.tile(fit.u, (4, 1)))
-        spent.append(time.perf_counter() - began)
+        spent.append(time.process_time() - began)
     return spent[0] - spent[1]
 
 

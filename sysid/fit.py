@@ -44,7 +44,7 @@ from whill_mjx.types import VehicleParams
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
-FEATURE_ITERATIONS = 15
+FEATURE_ITERATIONS = 20
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 
 
@@ -216,9 +216,8 @@ def fit_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress)
-    pairs = [predict(fit, part) for part in (log.training, log.held_out)]
     trials = (*log.training, *log.held_out)
-    initial, fitted = ([*pairs[0][k], *pairs[1][k]] for k in (0, 1))
+    initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
     report = make_report(log, config, fit, rows, str(path), source)
     write_report(out / "report.json", report)
