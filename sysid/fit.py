@@ -21,6 +21,7 @@ from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
 from sysid.objective import Noise, Objective, estimate_noise
+from sysid.prior import SPREAD, Prior, make_prior, moved
 from sysid.report import (
     KIND,
     SCHEMA,
@@ -78,6 +79,10 @@ class FitConfig:
     """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
     physics_dt: float = 0.005
     """Physics step [s]."""
+    vehicle: Path | None = None
+    """Vehicle file of an earlier fit: where the search starts, and what is known before (instead of the preset)."""
+    spread: float = SPREAD
+    """With a vehicle file: standard deviation of a parameter from day to day, as a share of its value (assumed)."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,7 @@ class Fit:
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
+    prior: Prior | None = None
 
 
 def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None) -> Fit:
@@ -120,6 +126,9 @@ def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
+    prior_intervals: dict[str, tuple[float, float]] = {}
+    if config.vehicle is not None:
+        params, prior_intervals = _earlier(config.vehicle, log)
     params = preset_params(log.spec, config.preset) if params is None else params
     params = with_effects(params, config.effects)
     space = make_space(params, log.spec, config.parameters or None)
@@ -139,6 +148,9 @@ def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None
     elif config.method == "features":
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
+    if config.vehicle is not None and config.method != "tpe":
+        share = uncertainty.inflation(objective, points[0])
+        objective = replace(objective, prior=replace(make_prior(space, prior_intervals, config.spread), share=share))
     if config.method == "tpe":
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
@@ -150,7 +162,19 @@ def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None
     known = uncertainty.estimate(objective, u, robust=config.robust and config.method != "tpe")
     fitted = set_values(params, space.names, jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float)))
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant)
+               profiles, time.perf_counter() - began, plant, objective.prior)
+
+
+def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
+    """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
+    from whill_mjx.vehicle_file import load_intervals, load_vehicle
+
+    spec, params, _ = load_vehicle(path)
+    for name in ("wheel_radius", "track", "wheelbase", "drive"):
+        if getattr(spec, name) != getattr(log.spec, name):
+            raise ValueError(f"{path}: {name} is {getattr(spec, name)}, but {getattr(log.spec, name)} in {log.name!r}. "
+                             "The vehicle file must be of the same vehicle; correct dataset.toml or leave it out.")
+    return params, load_intervals(path)
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:
@@ -251,10 +275,12 @@ def make_report(
                     "notes": list(log.notes), "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out], **(source or {})},
         "code": code_hashes(),
-        "settings": asdict(config),
+        "settings": {**asdict(config), "vehicle": None if config.vehicle is None else str(config.vehicle)},
         "model": {"preset": config.preset, "effects": [effect.name for effect in fit.params.effects]},
         "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},
         "parameters": parameters, "fixed": fixed,
+        "prior": None if fit.prior is None else {
+            "file": str(config.vehicle), "assumed_spread": config.spread, "moved": moved(fit.prior, fit.space, fit.u)},
         "weak_combinations": fit.uncertainty.weak_combinations(),
         "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
                    "cost_initial": fit.initial_cost, "cost": fit.cost,
@@ -357,6 +383,13 @@ def main(arguments: Arguments) -> None:
     finally:
         close()
     print(parameter_table(report))
+    if report["prior"] is not None:
+        print(f"Against {settings.vehicle}, assuming {settings.spread:.0%} from day to day:")
+        for one in report["prior"]["moved"]:
+            if not one["within"]:
+                print(f"  {one['name']}: {one['before']:.4g} -> {one['after']:.4g}, {one['deviations']:+.1f} standard "
+                      "deviations")
+        print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
     print(f"wrote {arguments.out / 'report.html'}, report.json, vehicle.toml and the plots")
     if arguments.close_loop:

@@ -15,6 +15,7 @@ import numpy as np
 
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
+from sysid.prior import Prior
 from sysid.rollout import Measured, Simulated
 from sysid.space import Space
 
@@ -70,6 +71,8 @@ class Objective:
     trials: tuple[Trial, ...]
     measured: Measured
     noise: Noise
+    prior: Prior | None = None
+    """Its P residuals are the last ones of the first trial."""
 
     @property
     def counted(self) -> int:
@@ -103,14 +106,18 @@ class Objective:
         """(N, B, K) whitened residuals; masked samples are 0. K counts pose, odometry and start-pose terms."""
         simulated = self.simulate(u)
         residual, _ = self._whiten(simulated, None)
-        return residual
+        return residual if self.prior is None else _append(residual, self.prior.residual(u))
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K) and their derivatives by u (N, B, K, P)."""
         simulated, derivative = self.replay.jacobian(self.space.to_values(u))
         residual, jacobian = self._whiten(simulated, derivative)
         assert jacobian is not None
-        return residual, jacobian * self.space.slope(u)[:, None, None, :]
+        jacobian = jacobian * self.space.slope(u)[:, None, None, :]
+        if self.prior is None:
+            return residual, jacobian
+        slope = np.tile(np.diag(self.prior.slope), (len(u), 1, 1))
+        return _append(residual, self.prior.residual(u)), _append(jacobian, slope)
 
     def residual_noise(self, u: np.ndarray) -> Noise:
         """Noise re-estimated as the size of the residual (robustly) at one point u (P,)."""
@@ -192,3 +199,10 @@ class Objective:
             jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
             jacobian[:, :, :size] += np.einsum("nbki,nbip->nbkp", design, slope)
         return residual, jacobian
+
+
+def _append(table: np.ndarray, more: np.ndarray) -> np.ndarray:
+    """Table (N, B, K, ...) with more (N, P, ...) behind the columns of its first trial and zeros behind the others'."""
+    behind = np.zeros((*table.shape[:2], *more.shape[1:]))
+    behind[:, 0] = more
+    return np.concatenate([table, behind], axis=2)

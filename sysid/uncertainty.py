@@ -72,6 +72,8 @@ def estimate(
     space = objective.space
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
     trials = len(residual)
+    if objective.prior is not None:  # not a measurement: it comes back as a precision
+        residual, jacobian = residual[:, : -space.size], jacobian[:, : -space.size]
     if robust:
         inside = np.abs(residual) <= HUBER
         residual = residual * huber_weight(residual)
@@ -90,6 +92,11 @@ def estimate(
     scale = max(np.mean([np.trace(middle) for middle in middles]) / max(np.trace(hessian), 1e-12), 1e-12)
     inverse = np.linalg.inv(hessian + scale * prior)
     covariances = [inverse @ (middle + scale**2 * prior) @ inverse for middle in middles]
+    if objective.prior is not None:
+        # Weighed as it was, that is in units of the data's precision over `scale`; its own variance is 1.
+        told = objective.prior.precision
+        inverse = np.linalg.inv(hessian + told)
+        covariances = [inverse @ (middle + objective.prior.share * told) @ inverse for middle in middles]
     largest = max(covariances, key=np.trace)
     deviation = np.sqrt(np.max([np.diag(covariance) for covariance in covariances], axis=0))
     quantile = float(stats.t.ppf((1 + confidence) / 2, max(trials - 1, 1)))
@@ -107,6 +114,15 @@ def estimate(
         estimates.append(Estimate(name, float(space.initial[index]), float(space.to_values(u)[index]), float(low),
                                   float(high), bool(told), remark))
     return Uncertainty(tuple(estimates), information, directions, largest)
+
+
+def inflation(objective: Objective, u: np.ndarray) -> float:
+    """How many times the squared residuals count what they tell: their sum over neighbours against that one by one."""
+    residual, jacobian = (array[0] for array in objective.jacobian(u[None]))
+    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
+    pieces = _piece_sums(objective, jacobian, residual * huber_weight(residual))
+    told = np.diag(hessian) > 1e-9 * np.diag(hessian).max()
+    return max(float(np.median(np.square(pieces).sum(0)[told] / np.diag(hessian)[told])), 1.0)
 
 
 def _piece_sums(objective: Objective, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:

@@ -1,0 +1,65 @@
+"""A vehicle file as what is known before a fit."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import TRUTH, UNICYCLE_SPACE
+
+from sysid import fit as fit_module
+from sysid import gradient, uncertainty
+from sysid.prior import UNKNOWN, Prior, make_prior, moved
+from whill_mjx.presets import preset_params
+from whill_mjx.specs import WHILL_CR
+from whill_mjx.vehicle_file import save_vehicle
+
+U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
+
+
+def test_the_jacobian_with_a_prior_is_that_of_the_residual(objective):
+    known = dataclasses.replace(objective, prior=Prior(np.array([0.3, 0.4, 0.5]), np.array([0.1, 0.2, 0.05]), 2.0))
+    u = np.array([[0.4, 0.5, 0.6], [0.5, 0.5, 0.4]])
+    residual, jacobian = known.jacobian(u)
+    np.testing.assert_allclose(residual, known.residuals(u), atol=1e-5)
+    np.testing.assert_allclose(np.square(residual[:, 0, -3:]).sum(-1), [2 * (1 + 0.25 + 4), 2 * (4 + 0.25 + 4)])
+    np.testing.assert_array_equal(residual[:, 1:, -3:], 0.0)
+    np.testing.assert_allclose(jacobian[1, 0, -3:], np.diag(np.sqrt(2) / known.prior.sd))
+
+
+def test_a_weak_prior_yields_to_the_log_and_a_sharp_one_holds(objective):
+    """The log tells all three: a weak prior at wrong values hardly moves them, a sharp one does."""
+    wrong = U_TRUTH + np.array([0.1, 0.0, 0.1])
+    weak, sharp = (dataclasses.replace(objective, prior=Prior(wrong, np.full(3, sd))) for sd in (0.2, 1e-5))
+    ends = [gradient.fit(one, one.space, starts=U_TRUTH[None] + 0.05, iterations=12).u for one in (weak, sharp)]
+    assert np.abs(ends[0] - U_TRUTH).max() < 0.02
+    assert np.abs(ends[1] - wrong).max() < 0.02
+    free = uncertainty.estimate(objective, ends[0])
+    held = uncertainty.estimate(dataclasses.replace(objective, prior=Prior(ends[0], np.full(3, 3e-5))), ends[0])
+    for one, other in zip(held.estimates, free.estimates, strict=True):
+        assert one.high - one.low < 0.5 * (other.high - other.low)
+    assert uncertainty.inflation(objective, ends[0]) >= 1.0
+
+
+@pytest.mark.quick
+def test_a_parameter_without_an_interval_is_known_by_its_bounds_only():
+    prior = make_prior(UNICYCLE_SPACE, {"tau_v": (0.09, 0.11), "turn": (0.99, 1.01)}, spread=0.05)
+    assert prior.sd[1] == UNKNOWN and prior.sd[0] < 0.05
+    # 5 % of 1.0 on a range of 1.0, and 0.01 / 1.645 from the interval
+    assert prior.sd[2] == pytest.approx(np.hypot(0.05, 0.01 / 1.645), rel=1e-3)
+    rows = moved(prior, UNICYCLE_SPACE, prior.mean + np.array([0.0, 0.2, 0.2]))
+    assert [row["within"] for row in rows] == [True, True, False]
+
+
+@pytest.mark.quick
+def test_a_vehicle_file_of_another_vehicle_is_an_error(tmp_path):
+    params = preset_params(WHILL_CR, "physical")
+    path = tmp_path / "vehicle.toml"
+    save_vehicle(path, WHILL_CR, params, {"torque_drive.kp": (8.0, 9.0)}, {})
+    log = SimpleNamespace(spec=WHILL_CR, name="here")
+    assert fit_module._earlier(path, log)[1] == {"torque_drive.kp": (8.0, 9.0)}
+    other = SimpleNamespace(spec=dataclasses.replace(WHILL_CR, track=0.6), name="there")
+    with pytest.raises(ValueError, match="track is .* but 0.6 in 'there'"):
+        fit_module._earlier(path, other)
