@@ -34,6 +34,7 @@ from sysid.loop.evidence import Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
+from sysid.loop.unexplained import held_back_gains
 from sysid.loop.wander import Wander, estimate
 from sysid.result import Progress
 from sysid.rollout import PathReplay, Plant, vehicle_plant
@@ -161,7 +162,11 @@ def close_loop(
     gathered = time.perf_counter()
     refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
     draws = min(config.draws, 300) if config.quick else config.draws
-    outcome = search(evidence, found, refitter, ready.wander, config.thresholds, draws, config.seed, progress)
+
+    def anything(residual: np.ndarray) -> float:
+        return max(held_back_gains(log.training, log.spec, residual).values(), default=0.0)
+
+    outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted,
                "search": time.perf_counter() - gathered}
     return Result(log, tuple(references), config, ready, outcome, evidence, seconds)

@@ -1,4 +1,4 @@
-"""The base model fitted to drives in features: bounded Levenberg-Marquardt with exact Jacobians, and a prior."""
+"""The base model fitted to drives in features: bounded Levenberg-Marquardt, and a prior."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class BaseFit:
 
 
 def fit_base(
-    drives: Drives, space: Space, whitener: Whitener, start: np.ndarray, iterations: int = 15,
-    tolerance: float = 1e-3, prior: tuple[np.ndarray, np.ndarray] | None = None, sizes: np.ndarray | None = None,
+    drives: Drives, space: Space, whitener: Whitener, start: np.ndarray, sizes: np.ndarray, iterations: int = 15,
+    tolerance: float = 1e-3, prior: tuple[np.ndarray, np.ndarray] | None = None,
     progress: Progress | None = None,
 ) -> BaseFit:
     """Minimise |W (y - f(u))|^2 over the unit box.
@@ -35,7 +35,8 @@ def fit_base(
         drives: replays over exactly the parameters of `space`.
         start: (P,) unit coordinates.
         prior: mean (P,) and precision (P, P) of the unit coordinates.
-        sizes: (P,) take derivatives by differences of these sizes, not exact ones, which need another compilation.
+        sizes: (P,) over which derivatives are taken, in unit coordinates. Differences over what a day changes smooth
+            out the roughness of skids, and need no compilation of their own.
     """
     target, mask = drives.target, drives.mask
     middle, precision = prior if prior is not None else (start, np.zeros((len(start), len(start))))
@@ -45,12 +46,8 @@ def fit_base(
 
     u, damping, cost = start.copy(), 1e-2, np.inf
     for iteration in range(iterations):
-        if sizes is None:
-            value, slope = drives.jacobian(space.to_values(u))
-            slope = slope * space.slope(u)
-        else:
-            value = drives.simulate(space.to_values(u)[None])[0]
-            slope = drives.differences(space.to_values, u, sizes)
+        value = drives.simulate(space.to_values(u)[None])[0]
+        slope = drives.differences(space.to_values, u, sizes)
         residual = whitener.apply(target - value, mask).reshape(-1)
         jacobian = whitener.apply(slope, mask).reshape(len(residual), -1)
         cost = float(residual @ residual) + penalty(u)

@@ -11,7 +11,7 @@ import numpy as np
 from sysid.log import Trial
 from sysid.loop.features import BIN, Features, make_features
 from sysid.loop.noise import roughness
-from sysid.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Replay, Simulated, make_batch
+from sysid.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Simulated, make_batch
 from whill_mjx.parameters import get_values, set_values
 from whill_mjx.types import parameters_of
 
@@ -44,7 +44,6 @@ class Drives:
 
     trials: tuple[Trial, ...]
     names: tuple[str, ...]
-    replay: Replay
     paths: PathReplay
     batch: Batch
     courses: Courses
@@ -92,21 +91,6 @@ class Drives:
         odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
         return Simulated(pose, odometry, paths[:, -1, 8])  # type: ignore[arg-type]
 
-    def jacobian(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Features (B, K, 5) and their derivatives (B, K, 5, P) at values (P,): exact, from one forward-mode replay."""
-        value, slope = (_first(one) for one in self.replay.jacobian(values[None]))
-        at = self.features.of(value)
-        size = 1e-3
-        columns = []
-        for p in range(slope.pose.shape[-1]):  # features are a smooth map of the samples: differences suffice
-            scale = size / max(np.abs(slope.pose[..., p]).max(), np.abs(slope.odometry[..., p]).max(), 1e-12)
-            both = [self.features.of(Simulated(
-                np.asarray(value.pose, float) + sign * scale * slope.pose[..., p],
-                np.asarray(value.odometry, float) + sign * scale * slope.odometry[..., p], value.diverged))
-                for sign in (1, -1)]
-            columns.append((both[0] - both[1]) / (2 * scale))
-        return at, np.stack(columns, axis=-1)
-
     def differences(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """(B, K, 5, P) derivative by unit coordinates u (P,), by central differences of the given sizes.
 
@@ -122,7 +106,7 @@ class Drives:
         batch, measured = make_batch(trials, dt)
         features = make_features(trials, self.features.width)
         courses = _courses(batch, self.courses.room, self.courses.shared)
-        return Drives(trials, self.names, self.replay.on(batch), self.paths, batch, courses, measured, features,
+        return Drives(trials, self.names, self.paths, batch, courses, measured, features,
                       features.of(measured))
 
 
@@ -160,7 +144,7 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     courses = _courses(batch, room, shared)
     features = make_features(trials, width)
     paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))
-    return Drives(trials, names, Replay(plant, batch, vehicle), paths, batch, courses, measured, features,
+    return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
 
 
@@ -177,7 +161,3 @@ def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) ->
             first.append(i)
         of_trial.append(seen[key])
     return Courses(np.array(first), np.array(of_trial), room, shared)
-
-
-def _first(simulated: Simulated) -> Simulated:
-    return Simulated(*(np.asarray(leaf)[0] for leaf in (simulated.pose, simulated.odometry, simulated.diverged)))

@@ -125,25 +125,25 @@ def make_reference(
     groups = replicate_groups_by_day(trials, day)
     whitener = first_whitener(drives, groups)
     u = space.to_unit(space.initial)
+    sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
     if not fitted:
-        u = fit_base(drives, space, whitener, u, iterations, progress=progress).u
+        u = fit_base(drives, space, whitener, u, sizes, iterations, progress=progress).u
     at = drives.simulate(space.to_values(u)[None])[0]
     factors = fit_roughness(drives.target - at, drives.mask, roughness(at, drives.features.width, spec.track))
     drives = drives.weighted(at, factors, spec.track)
     if not fitted:
         whitener = fit_whitener(drives.target - at, drives.mask)
-        u = fit_base(drives, space, whitener, u, max(iterations // 2, 3), progress=progress).u
+        u = fit_base(drives, space, whitener, u, sizes, max(iterations // 2, 3), progress=progress).u
     left = drives.target - drives.simulate(space.to_values(u)[None])[0]
     whitener = fit_whitener(left, drives.mask)
     days = np.zeros((len(logs), space.size))
     if known:
         prior = (u, np.diag(1 / (3 * assumed_spread(space, u)) ** 2))
-        sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
         for number, log in enumerate(logs):
             index = np.flatnonzero(day == number)
             one = drives.of(log.training, plant.dt)
             one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
-            fit = fit_base(one, space, whitener, u, 6, prior=prior, sizes=sizes, progress=progress)
+            fit = fit_base(one, space, whitener, u, sizes, 6, prior=prior, progress=progress)
             days[number] = fit.u - u
             bins = one.target.shape[1]
             left[index, :bins] = one.target - one.simulate(space.to_values(fit.u)[None])[0]

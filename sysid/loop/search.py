@@ -86,9 +86,14 @@ class Search:
 
 def search(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    draws: int = 1000, seed: int = 0, progress: Progress | None = None,
+    anything: Callable[[np.ndarray], float], draws: int = 1000, seed: int = 0, progress: Progress | None = None,
 ) -> Search:
-    """The verdict on one set of drives."""
+    """The verdict on one set of drives.
+
+    Args:
+        anything: by how much the best of the smooth functions that know no physics lowers the sum of squares of a white
+            residual (B, n), on drives held back from it.
+    """
     def report(text: str) -> None:
         if progress is not None:
             progress(1, text)
@@ -145,12 +150,18 @@ def search(
         current = likely[0].refit
         if wander.p_excess(excess(current)) > thresholds.quiet:
             break
-    _decide(found, thresholds, wander, excess)
+    _decide(found, thresholds, wander, excess, anything)
     return found
 
 
-def _decide(found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float]) -> None:
-    """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one."""
+def _decide(
+    found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float],
+    anything: Callable[[np.ndarray], float],
+) -> None:
+    """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one.
+
+    Where little stands out, shares of it say little: an effect must then do better than functions without physics.
+    """
     keep = found.accepted[:1]
     for one in found.accepted[1:]:
         if one.share - keep[-1].share <= thresholds.step:
@@ -163,7 +174,9 @@ def _decide(found: Search, thresholds: Thresholds, wander: Wander, excess: Calla
     found.excess = (before, after)
     if not keep and wander.p_excess(before) >= thresholds.alpha:
         found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif keep and (found.share >= thresholds.share or wander.p_excess(after) > thresholds.quiet):
+    elif keep and (found.share >= thresholds.share or (
+            wander.p_excess(after) > thresholds.quiet
+            and found.base.cost - found.final.cost > anything(found.base.residual))):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
     else:
