@@ -34,7 +34,7 @@ def planted(tmp_path_factory):
     plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.01))  # the step is part of the model
     write_dataset(folder / "log", WHILL_CR, truth, replicates=2, seed=5, noise=SensorNoise(), plant=plant,
                   scenario=Scenario(v=0.5, omega=1.6, length=4.0))
-    config = FitConfig(preset="paper", method="lm", starts=1, iterations=20, parameters=tuple(PLANTED), physics_dt=0.01)
+    config = FitConfig(preset="paper", iterations=20, parameters=tuple(PLANTED), physics_dt=0.01)
     report = fit_dataset(folder / "log", folder / "run", config=config)
     return folder, report
 
@@ -84,6 +84,8 @@ def test_the_report_has_its_schema_and_a_row_per_trial_and_channel(planted):
     for one in report["parameters"]:
         assert set(one) >= {"name", "unit", "initial", "value", "interval", "identifiable", "remark"}
     assert report["noise"]["source"] == "replicates"
+    assert len(report["search"]["start_costs"]) == report["search"]["starts_agreeing"] == 1
+    assert report["prior"] is None
     for name in ("trajectories.png", "yaw.png", "errors.png"):
         assert (folder / "run" / name).stat().st_size > 10_000
 
