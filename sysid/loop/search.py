@@ -44,6 +44,8 @@ class Thresholds:
     """Share of the best refit's gain from which another one is polished too."""
     rival: float = 0.5
     """|cos| of two effects' signatures above which one is not named before the other was refitted."""
+    between: float = 0.5
+    """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
     alike: float = 0.9
     """|cos| of two effects' signatures above which they are not told apart."""
 
@@ -286,12 +288,18 @@ def _class_of(
     best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
     thresholds: Thresholds,
 ) -> list[str]:
-    """Effects that these drives do not tell from the best: nearly as good a fit, or alike signatures, at most four."""
-    near = {other.hypothesis.effect: other.gain / best.gain for other in candidates[1:]
-            if best.gain - other.gain < max(12.0, 0.1 * best.gain)}
+    """Effects that these drives do not tell from the best, at most four: nearly as good a fit, alike signatures, or a
+    fit so much better than imitating the best would bring that the truth may lie between the two."""
     mine = list(hypotheses).index(best.hypothesis)
-    for j, other in enumerate(hypotheses):
+    near: dict[str, float] = {}
+    for other in candidates:
+        imitated = float(similar[mine, list(hypotheses).index(other.hypothesis)]) ** 2
+        ratio = other.gain / best.gain
+        own = (ratio - imitated) / max(1 - imitated, 1e-9)
+        if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
+            near[other.hypothesis.effect] = ratio
+    for j, one in enumerate(hypotheses):
         if similar[mine, j] > thresholds.alike:
-            near[other.effect] = max(near.get(other.effect, 0.0), float(similar[mine, j]))
+            near[one.effect] = max(near.get(one.effect, 0.0), float(similar[mine, j]))
     near.pop(best.hypothesis.effect, None)
     return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])][:4]
