@@ -75,8 +75,8 @@ def next_drive(proposal: dict[str, Any]) -> str:
         parts.append(charts([
             line_chart([Line(held, np.repeat(command.v, 2)[:-1], "v [m/s]"),
                         Line(held, np.repeat(command.omega, 2)[:-1], "omega [rad/s]", PALETTE[1])], "t [s]", "command"),
-            line_chart([Line(x, y), Line(x[:1], y[:1], "start", PALETTE[3], markers=True)], "x [m]", "y [m]",
-                       "path in the room, if commands were followed at once", equal=True)]))
+            line_chart([Line(x, y), Line(x[:1], y[:1], colour=PALETTE[3], markers=True)], "x [m]", "y [m]",
+                       "ideal path in the room (dot: start)", equal=True)]))
     return "".join(parts)
 
 

@@ -179,20 +179,22 @@ def turned(table: Table, columns: np.ndarray, residual: np.ndarray) -> tuple[np.
                      ]), phases
 
 
-def from_first_wave(terms: Sequence[Term], coefficients: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """The same waves counted from where the first of the force rises through zero: where a wheel's angle begins is
-    anybody's choice."""
+def from_first_wave(
+    terms: Sequence[Term], coefficients: Sequence[np.ndarray]
+) -> tuple[tuple[np.ndarray, ...], float]:
+    """The same waves counted from where the first of the force rises through zero, as anybody may choose for a wheel;
+    and by how much more every drive then starts [rad]."""
     first = next((values for term, values in zip(terms, coefficients, strict=True)
                   if term.form == "harmonic" and term.number == 1), None)
     if first is None:
-        return tuple(coefficients)
+        return tuple(coefficients), 0.0
     phase, out = float(np.arctan2(first[1], first[0])), []
     for term, values in zip(terms, coefficients, strict=True):
         if term.form == "harmonic":
             cos, sin = np.cos(term.number * phase), np.sin(term.number * phase)
             values = np.kron(np.eye(2), np.array([[cos, sin], [-sin, cos]])) @ values
         out.append(values)
-    return tuple(out)
+    return tuple(out), phase
 
 
 def shift(angle: float) -> np.ndarray:

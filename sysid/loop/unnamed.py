@@ -29,9 +29,9 @@ from sysid.loop.tables import (
     turned,
 )
 from sysid.loop.terms import Term, columns_of, in_words
-from sysid.loop.unexplained import PHASES, WHEELS
+from sysid.loop.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.metrics import Prediction
-from sysid.rollout import Replay, make_batch, predictions
+from sysid.rollout import Plant, Replay, make_batch, predictions
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS, PERIODIC, QUANTITIES
 from whill_mjx.parameters import describe, get_values, set_values
@@ -48,8 +48,6 @@ LEAST = 0.1
 """Least share of the excess residual that a table must predict on held-back manoeuvres."""
 LEAST_GAIN = 25.0
 """Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
-ANGLE_PRICE = 4.0
-"""What fitting its start angle brings a trial in noise; taken off."""
 COMPACT = 0.75
 """Share of the table's held-back gain that few terms must reach to stand for it."""
 STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried
@@ -88,6 +86,7 @@ class Unnamed:
     """Squared white residual of the training trials per sample, replayed before and after."""
     tried: tuple[tuple[str, str, float], ...]
     """Quantity, kind and held-back gain of every table that was fitted."""
+    angles: np.ndarray  # (B,) rad, of the wheels at the start of each trial
     kept: bool
 
 
@@ -161,10 +160,30 @@ def find_unnamed(result: Result) -> Unnamed | None:
     found = fit_unnamed(Bench(result))
     if not found.kept or not result.config.poses:
         return found
-    if found.table.quantity in WHEELS:  # each trial starts at its own angle, which that refit knows nothing of
-        names = list(result.reference.space.names)
-        return replace(found, vehicle=set_values(found.vehicle, names, get_values(result.before, names)))
+    if found.table.quantity in WHEELS:
+        trials = result.log.training
+        if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
+            names = list(result.reference.space.names)
+            return replace(found, vehicle=set_values(found.vehicle, names, get_values(result.before, names)))
+        plant = with_start_angles(result.plant, found.vehicle, trials, found.angles)
+        result = replace(result, prepared=replace(result.prepared, plant=plant))
     return replace(found, vehicle=refit_poses(result, found.vehicle))
+
+
+def with_start_angles(plant: Plant, vehicle: VehicleParams, trials: Sequence[Trial], angles: np.ndarray) -> Plant:
+    """A plant that places the wheels at each trial's own angle (B,), which it knows by where the trial starts."""
+    starts = jnp.array([[one.start.x, one.start.y, one.start.yaw] for one in trials])
+    turned = jnp.asarray(angles, starts.dtype)
+    index = [effect.name for effect in vehicle.effects].index("unnamed")
+
+    def place(params: Any, start: jnp.ndarray) -> Any:
+        state = plant.place(params, start)
+        mine = turned[jnp.square(starts - start[:3]).sum(-1).argmin()]
+        memory = list(state.memory)
+        memory[index] = replace(memory[index], angle=mine + jnp.zeros(2))
+        return replace(state, memory=tuple(memory))
+
+    return replace(plant, place=place)
 
 
 def fit_unnamed(bench: Bench) -> Unnamed:
@@ -255,8 +274,9 @@ def _replayed(
             break
         (u, wrench), now, cost = tries[index], left[index], float(costs[index])
     coefficients = tuple(wrench[part] for part in parts) if chosen else ()
+    more = 0.0
     if table.quantity in WHEELS:
-        coefficients = from_first_wave(chosen, coefficients)
+        coefficients, more = from_first_wave(chosen, coefficients)
     full = columns_of(chosen, table.knots)[0] @ np.concatenate(coefficients) if chosen else basis @ wrench
     values = bench.values(u, table, full)
     vehicle = set_values(bench.params, bench.names, jnp.asarray(values, jnp.result_type(float)))
@@ -268,7 +288,7 @@ def _replayed(
     gain = float(gains.sum()) / excess
     kept = gain >= LEAST and gains.sum() >= LEAST_GAIN and before - cost > 0.5 * float(gains.sum())
     return Unnamed(table, full, chosen, coefficients, vehicle, gain, by_manoeuvre, (before / count, cost / count),
-                   tried, bool(kept))
+                   tried, PHASES[best.phases] + more, bool(kept))
 
 
 def as_report(found: Unnamed) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from sysid.loop.page import wrench as wrench_section
 from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
 from sysid.loop.terms import Term, columns_of, in_words
 from sysid.loop.unexplained import PHASES, align, wave_turns
-from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, vehicle_of
+from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, vehicle_of, with_start_angles
 from sysid.rollout import vehicle_plant
 from sysid.space import make_space
 from whill_mjx.config import VehicleConfig
@@ -93,14 +94,16 @@ def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
 def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_angle(bench):
     truth = Table("left wheel's angle", "push", 0.0, 1.0)
     force = 12 * np.sin(ANGLES)
-    measure(bench, truth, np.concatenate([force, -0.25 * force]), np.array([3, 17, 8, 22, 12]))
+    starts = np.array([3, 17, 8, 22, 12])
+    measure(bench, truth, np.concatenate([force, -0.25 * force]), starts)
     found = fit_unnamed(bench)
     assert (found.table.quantity, found.table.kind) == ("left wheel's angle", "push") and found.kept
     assert found.gain > 0.5
     wave = np.fft.rfft(found.wrench[:KNOTS])[1] * 2 / KNOTS
     np.testing.assert_allclose(abs(wave), 12, rtol=0.15)
     text = as_report(found)["symbolic"]["force"]
-    assert "sin(z)" in text  # counted from where the wave rises through zero
+    assert "sin(z)" in text  # counted from where the wave rises through zero, and so are the starts
+    np.testing.assert_allclose(np.cos(found.angles - PHASES[starts]), 1.0, atol=0.1)
 
 
 def test_nothing_is_kept_of_noise(bench):
@@ -108,6 +111,16 @@ def test_nothing_is_kept_of_noise(bench):
     found = fit_unnamed(bench)
     assert not found.kept
     assert describe_unnamed(as_report(found)).startswith("no wrench over one quantity explains it")
+
+
+def test_a_plant_places_the_wheels_as_each_trial_found_them(bench):
+    trials, angles = bench.result.log.training, np.linspace(0.5, 4.5, len(DRIVES))
+    plant = with_start_angles(bench.result.plant, bench.params, trials, angles)
+    for trial, angle in zip(trials, angles, strict=True):
+        start = jnp.array([trial.start.x, trial.start.y, trial.start.yaw, 0.0, 0.0])
+        state = plant.place(bench.params, start)
+        np.testing.assert_allclose(state.memory[-1].angle, angle, rtol=1e-6)
+        np.testing.assert_array_equal(state.qpos, bench.result.plant.place(bench.params, start).qpos)
 
 
 def products_of(columns, residual, groups=4):
