@@ -10,9 +10,9 @@
     noise_floor           training, held_out: channel -> metric -> error that a perfect model would still have, or null
     parameters            name, unit, initial, value, interval, confidence, bounds, identifiable, remark
     fixed                 name, value, reason
-    prior                 with a vehicle file: file, assumed_spread, moved (name, before, after, deviations, within); or null
+    prior                 file, assumed_spread, moved (name, before, after, deviations, within); null without
     weak_combinations     combinations of parameters that the log does not tell
-    search                evaluations, seconds, cost before and after, cost of each start, how many agree, delay profiles
+    search                evaluations, seconds, cost before and after, costs of the starts, number that agree, delays
     code                  SHA-256 over the sources of the packages, their versions and those of what they run on
     errors                per trial and channel: metric -> ideal, initial, fitted
     summary               training, held_out -> channel -> metric -> mean of ideal, initial, fitted, and noise_floor

@@ -2,8 +2,8 @@
 
 A pose adds up all motion before it, so that far from the truth its error has folds in which a search stays. The motion
 within a bin of a quarter of a second has not, and what differs between replicates is nearly the same in every bin. A
-search there needs few steps; poses then tell what adds up over a whole drive. Random starts within the full bounds of the
-physical model still end in valleys of a wrong delay or torque limit: what it starts from matters.
+search there needs few steps; poses then tell what adds up over a whole drive. Random starts within the full bounds of
+the physical model still end in valleys of a wrong delay or torque limit: what it starts from matters.
 """
 
 from __future__ import annotations
