@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid import command_line
-from sysid.log import Log
+from sysid.log import Log, Trial
 from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.loop.drives import CHUNK, make_drives
+from sysid.loop.drives import CHUNK, Drives, make_drives
 from sysid.loop.evidence import Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
@@ -217,9 +217,7 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
     refit may move base parameters and the accepted effects' own, and nothing else.
     """
-    from sysid import gradient
-    from sysid.fit import make_objective
-    from sysid.objective import estimate_noise
+    from sysid.loop.poses import fit_poses
     from sysid.space import make_space
 
     have = describe(vehicle)
@@ -229,13 +227,25 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
         names += [name for name in dict.fromkeys(moved) if name in have and name not in names
                   and np.isfinite(float(get_values(vehicle, [name])[0]))]
     space = make_space(vehicle, result.log.spec, names)
-    objective = make_objective(result.plant, vehicle, space, result.log.training, estimate_noise(result.log.training))
-    if objective.noise.source == "defaults":
-        objective = objective.with_noise(objective.residual_noise(space.to_unit(space.initial)))
-    fit = gradient.fit(objective, space, iterations=iterations)
-    if not fit.cost < fit.initial_cost:
-        return vehicle
-    return set_values(vehicle, space.names, jnp.asarray(space.to_values(fit.u), jnp.result_type(float)))
+    spread = np.zeros((space.size, space.size))
+    known = result.reference.space.size
+    spread[:known, :known] = result.reference.spread
+    trials = result.log.training
+    u = fit_poses(drives_of(result, trials), trials, space, all_values(result, vehicle), spread, iterations)
+    return vehicle if u is None else set_values(
+        vehicle, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
+
+
+def drives_of(result: Result, trials: tuple[Trial, ...]) -> Drives:
+    """Trials replayed by the vehicle with the catalogue, as it was compiled for the search."""
+    ready = result.prepared
+    return make_drives(ready.plant, ready.full, ready.names, trials, paths=ready.paths)
+
+
+def all_values(result: Result, vehicle: Any) -> np.ndarray:
+    """Values of all parameters of the vehicle with the catalogue; effects that `vehicle` does not have are neutral."""
+    values = {**base_values(result.full), **base_values(vehicle)}
+    return np.array([values[name] for name in result.names])
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from sysid.log import Trial
@@ -65,17 +66,28 @@ class Drives:
 
     def simulate(self, values: np.ndarray) -> np.ndarray:
         """Features (N, B, K, 5) of replays with values (N, P)."""
+        return np.stack([self.features.of(self._sampled(paths)) for paths, _ in self._paths(values)])
+
+    def replay(self, values: np.ndarray) -> Simulated:
+        """Replays with values (N, P) in the room, at the measurements' times; leaves gain the axis N in front."""
+        start = np.asarray(self.batch.start, float)
+        first = start[self.courses.first[self.courses.of_trial]]
+        each = [self._sampled(_moved(paths, first, start) if shared else paths)
+                for paths, shared in self._paths(values)]
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+
+    def _paths(self, values: np.ndarray) -> Iterator[tuple[np.ndarray, bool]]:
+        """Of each of values (N, P) the paths (B, R + 1, 9), and whether trials of one course share theirs."""
         every = np.arange(len(self.trials))
         once = [self.courses.repeat(row) for row in values]
         rows = [self.courses.first if shared else every for shared in once]
         sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
         paths = self.paths(values[sets], self.batch, np.concatenate(rows))
-        out, start = [], 0
+        start = 0
         for shared, each in zip(once, rows, strict=True):
             mine = paths[start : start + len(each)]
             start += len(each)
-            out.append(self.features.of(self._sampled(mine[self.courses.of_trial] if shared else mine)))
-        return np.stack(out)
+            yield (mine[self.courses.of_trial] if shared else mine), shared
 
     def _sampled(self, paths: np.ndarray) -> Simulated:
         """Paths (B, R + 1, 9) at the measurements' times."""
@@ -146,6 +158,15 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
+
+
+def _moved(paths: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Paths (B, R + 1, 9) moved in the room from starts (B, 5) to other ones; odometry and speeds stay."""
+    turn = (after[:, 2] - before[:, 2])[:, None]
+    x, y = paths[..., 0] - before[:, :1], paths[..., 1] - before[:, 1:2]
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y = after[:, :1] + cos * x - sin * y, after[:, 1:2] + sin * x + cos * y
+    return np.concatenate([np.stack([x, y, paths[..., 2] + turn], axis=-1), paths[..., 3:]], axis=-1)
 
 
 def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:

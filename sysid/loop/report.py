@@ -39,9 +39,9 @@ from sysid.loop.solver import Solver
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
-from sysid.rollout import Replay, make_batch, predictions
+from sysid.rollout import predictions
 from whill_mjx.effects import EFFECTS
-from whill_mjx.parameters import describe, get_values, set_values
+from whill_mjx.parameters import describe
 from whill_mjx.types import parameters_of
 
 if TYPE_CHECKING:
@@ -93,10 +93,9 @@ def make_report(result: Result) -> dict[str, Any]:
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials by a vehicle."""
-    batch, _ = make_batch(trials, result.plant.dt)
-    name = next(iter(describe(vehicle)))
-    value = np.asarray(get_values(vehicle, [name]), float)[None]
-    simulated = Replay(result.plant, batch, lambda values: set_values(vehicle, [name], values)).simulate(value)
+    from sysid.close_loop import all_values, drives_of
+
+    simulated = drives_of(result, trials).replay(all_values(result, vehicle)[None])
     return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
 
 
