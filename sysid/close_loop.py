@@ -34,7 +34,7 @@ from sysid.loop.evidence import Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
-from sysid.loop.unexplained import held_back_gains
+from sysid.loop.unexplained import best_gain
 from sysid.loop.wander import Wander, estimate
 from sysid.result import Progress
 from sysid.rollout import PathReplay, Plant, vehicle_plant
@@ -164,7 +164,7 @@ def close_loop(
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
-        return max(held_back_gains(log.training, log.spec, residual).values(), default=0.0)
+        return best_gain(log.training, log.spec, residual)
 
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted,
@@ -183,7 +183,7 @@ def prepare(
     paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), CHUNK)
     drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), paths=paths)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
-    wander = estimate(drives, reference, found, full, progress)
+    wander = estimate(drives, reference, found, full, spec, progress)
     return Prepared(reference, plant, found, full, tuple(base), paths, wander)
 
 

@@ -112,8 +112,8 @@ def search(
         return float(np.square(fit.residual).sum()) / count - 1
 
     def explained(fit: Refit) -> float:
-        """Share of the excess that a fit removes; none where there is no excess to speak of."""
-        return (excess(base) - max(excess(fit), 0.0)) / max(excess(base), thresholds.excess)
+        """Share of the excess that a fit removes; where there is hardly any, of one that would be worth a word."""
+        return float(np.clip((excess(base) - excess(fit)) / max(excess(base), thresholds.excess), 0.0, 1.0))
 
     found = Search("none", base, base, first, excess=(excess(base), excess(base)))
     if first.p_family >= thresholds.alpha and wander.p_excess(excess(base)) >= thresholds.alpha:
@@ -156,13 +156,20 @@ def search(
     return found
 
 
+def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray], float]) -> float:
+    """Share of what the effects gain in that and what smooth functions gain after them, beyond a day's own."""
+    gain = found.base.cost - found.final.cost
+    more = max(anything(found.final.residual) - wander.usual * len(found.final.residual), 0.0)
+    return gain / max(gain + more, 1e-9)
+
+
 def _decide(
     found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float],
     anything: Callable[[np.ndarray], float],
 ) -> None:
     """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one.
 
-    Where little stands out, shares of it say little: an effect must then do better than functions without physics.
+    Where little stands out, shares of it say little: an effect must then leave little to functions without physics.
     """
     keep = found.accepted[:1]
     for one in found.accepted[1:]:
@@ -176,9 +183,8 @@ def _decide(
     found.excess = (before, after)
     if not keep and wander.p_excess(before) >= thresholds.alpha:
         found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif keep and (found.share >= thresholds.share or (
-            wander.p_excess(after) > thresholds.quiet
-            and found.base.cost - found.final.cost > anything(found.base.residual))):
+    elif keep and (found.share >= thresholds.share or wander.p_excess(after) > thresholds.quiet
+                   and _of_what_lasts(found, wander, anything) >= thresholds.share):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
     else:

@@ -66,6 +66,11 @@ def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray) ->
     return out
 
 
+def best_gain(trials: Sequence[Trial], spec: Any, residual: np.ndarray) -> float:
+    """What the best of the quantities gains; 0 where none does."""
+    return max(0.0, *held_back_gains(trials, spec, residual).values())
+
+
 def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np.ndarray]:
     """Smooth functions (K, F) of each quantity at the middle of each bin."""
     t = (np.arange(bins) + 0.5) * width

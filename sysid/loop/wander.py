@@ -17,7 +17,9 @@ from sysid.loop.drives import Drives
 from sysid.loop.evidence import Columns, Evidence, gather
 from sysid.loop.reference import Reference
 from sysid.loop.solver import Solver
+from sysid.loop.unexplained import best_gain
 from sysid.result import Progress
+from whill_mjx.specs import VehicleSpec
 from whill_mjx.types import VehicleParams
 
 ASSUMED = 0.3
@@ -38,6 +40,8 @@ class Wander:
     """Degrees of freedom that the covariances rest on."""
     excess: float = EXCESS
     """Standard deviation from day to day of the squared residual over the noise, less 1."""
+    usual: float = 0.0
+    """What smooth functions that know no physics gain on a reference day, per trial."""
 
     def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""
@@ -69,7 +73,7 @@ def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:
 
 
 def estimate(
-    drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams,
+    drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams, spec: VehicleSpec,
     progress: Progress | None = None,
 ) -> Wander:
     """Wander on the reference days.
@@ -91,8 +95,11 @@ def estimate(
     evidence = replace(evidence, residual=residual, moments=np.einsum("bni,bn->bi", evidence.design, residual))
     measured = (drives.mask > 0).reshape(len(day), -1)
     excess = [np.square(left[day == number]).sum() / measured[day == number].sum() - 1 for number in range(count)]
+    usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number])
+             / float((day == number).sum()) for number in range(count)]
     estimates = [coordinates(evidence, np.flatnonzero(day == number)) for number in range(count)]
-    return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)))
+    return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)),
+                   usual=float(np.mean(usual)))
 
 
 def _spread(excess: np.ndarray) -> float:
