@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid import gradient
 from sysid.loop.features import Features, make_features
-from sysid.loop.noise import Whitener, deviations, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
 from sysid.objective import HUGE, Objective, Replays
 from sysid.result import FitResult, Progress
 from sysid.rollout import Simulated
@@ -23,8 +23,6 @@ from sysid.space import Space
 
 AGREE = 0.02
 """Starts agree where their costs differ by no more than this share of the best one."""
-USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
-"""Noise of the features where there are no replicates [m/s, rad/s]."""
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
 NEAR = 1e-3  # step of the features' derivative, in metres or radians of the samples
 
@@ -124,19 +122,6 @@ def make_features_objective(objective: Objective) -> FeatureObjective:
     groups = replicate_groups(objective.trials)
     return FeatureObjective(objective.replay, objective.space, features, target, features.mask,
                             first_scales(target, features.mask, groups))
-
-
-def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) -> Whitener:
-    """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
-    part = deviations(target, groups)
-    inside = [i for group in groups if len(group) > 1 for i in group]
-    scale = np.array(USUAL)
-    if len(inside) >= 3:
-        count = np.maximum(mask[inside].sum((0, 1)), 1)
-        found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)
-        scale = np.where(found > 0, found, scale)
-    channels = target.shape[-1]
-    return Whitener(scale, np.zeros((1, channels, channels)), np.eye(channels))
 
 
 def agreeing(costs: np.ndarray) -> int:

@@ -14,6 +14,8 @@ from sysid.log import Trial
 
 ORDER = 4  # bins of memory of the filter
 RIDGE = 2e-3  # of the regression, as a share of its data
+USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
+"""Noise of the features where there are no replicates [m/s, rad/s]."""
 FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
 
 
@@ -124,3 +126,16 @@ def deviations(series: np.ndarray, groups: list[list[int]]) -> np.ndarray:
             part = series[group]
             out[group] = (part - part.mean(0)) * np.sqrt(len(group) / (len(group) - 1))
     return out
+
+
+def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) -> Whitener:
+    """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
+    part = deviations(target, groups)
+    inside = [i for group in groups if len(group) > 1 for i in group]
+    scale = np.array(USUAL)
+    if len(inside) >= 3:
+        count = np.maximum(mask[inside].sum((0, 1)), 1)
+        found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)
+        scale = np.where(found > 0, found, scale)
+    channels = target.shape[-1]
+    return Whitener(scale, np.zeros((1, channels, channels)), np.eye(channels))

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.log import Log, Trial
 from sysid.loop.base import fit_base
 from sysid.loop.drives import Drives, make_drives
-from sysid.loop.noise import Whitener, deviations, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
 from sysid.result import Progress
 from sysid.rollout import Plant
 from sysid.space import Space, make_space
@@ -123,7 +123,7 @@ def make_reference(
     day = np.array([number for number, log in enumerate(logs) for _ in log.training])
     drives = make_drives(plant, start, space.names, trials)
     groups = replicate_groups_by_day(trials, day)
-    whitener = first_whitener(drives, groups)
+    whitener = first_scales(drives.target, drives.mask, groups)
     u = space.to_unit(space.initial)
     sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
     if not fitted:
@@ -165,21 +165,6 @@ def expected_without(leftovers: Sequence[Leftover], one: Leftover) -> np.ndarray
     """(K, C) mean leftover of the other days' drives of the same course."""
     others = [other for other in leftovers if other.day != one.day and alike(other.trial, one.trial)]
     return mean_by_day(others, len(one.series))
-
-
-def first_whitener(drives: Drives, groups: list[list[int]]) -> Whitener:
-    """Scales from what replicates do not share, or from usual sensors where there are none; no memory yet."""
-    part = deviations(drives.target, groups)
-    inside = np.zeros(len(part), bool)
-    for group in groups:
-        inside[group] = len(group) > 1
-    channels = drives.target.shape[-1]
-    usual = np.array([0.01, 0.02, 0.02, 0.02, 0.03])
-    if inside.sum() >= 3:
-        count = np.maximum(drives.mask[inside].sum((0, 1)), 1)
-        found = np.sqrt((np.square(part[inside]) * drives.mask[inside]).sum((0, 1)) / count)
-        usual = np.where(found > 0, found, usual)
-    return Whitener(usual, np.zeros((1, channels, channels)), np.eye(channels))
 
 
 def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[list[int]]:
