@@ -139,3 +139,15 @@ def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) 
         scale = np.where(found > 0, found, scale)
     channels = target.shape[-1]
     return Whitener(scale, np.zeros((1, channels, channels)), np.eye(channels))
+
+
+def scatter(residual: np.ndarray, courses: np.ndarray) -> float:
+    """Excess of what replicates do not share: mean square, less 1, of white residuals (B, n) about their courses'
+    means; nan where no course (B,) was driven twice."""
+    square, count = 0.0, 0.0
+    for course in np.unique(courses):
+        mine = residual[courses == course]
+        measured = np.abs(mine).min(0) > 0
+        square += float(np.square(mine - mine.mean(0))[:, measured].sum())
+        count += (len(mine) - 1) * float(measured.sum())
+    return square / count - 1 if count else float("nan")

@@ -152,7 +152,7 @@ def search(
         current = likely[0].refit
         if wander.p_excess(excess(current)) > thresholds.quiet:
             break
-    _decide(found, thresholds, wander, excess, anything)
+    _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial)
     return found
 
 
@@ -165,11 +165,12 @@ def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray
 
 def _decide(
     found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float],
-    anything: Callable[[np.ndarray], float],
+    anything: Callable[[np.ndarray], float], courses: np.ndarray,
 ) -> None:
     """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one.
 
-    Where little stands out, shares of it say little: an effect must then leave little to functions without physics.
+    Where little stands out, shares of it say little, and what replicates do not share (gusts, say) nothing can explain:
+    an effect must then leave little to functions without physics.
     """
     keep = found.accepted[:1]
     for one in found.accepted[1:]:
@@ -183,8 +184,10 @@ def _decide(
     found.excess = (before, after)
     if not keep and wander.p_excess(before) >= thresholds.alpha:
         found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif keep and (found.share >= thresholds.share or wander.p_excess(after) > thresholds.quiet
-                   and _of_what_lasts(found, wander, anything) >= thresholds.share):
+    elif keep and (found.share >= thresholds.share or (
+            found.share >= thresholds.share / 2 or wander.p_excess(after) > thresholds.quiet)
+            and wander.p_excess(after - wander.unshared(found.final.residual, courses)) > thresholds.quiet
+            and _of_what_lasts(found, wander, anything) >= thresholds.share):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
     else:

@@ -15,6 +15,7 @@ import numpy as np
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.drives import Drives
 from sysid.loop.evidence import Columns, Evidence, gather
+from sysid.loop.noise import scatter
 from sysid.loop.reference import Reference
 from sysid.loop.solver import Solver
 from sysid.loop.unexplained import best_gain
@@ -42,6 +43,12 @@ class Wander:
     """Standard deviation from day to day of the squared residual over the noise, less 1."""
     usual: float = 0.0
     """What smooth functions that know no physics gain on a reference day, per trial."""
+    scatter: float = 0.0
+    """Excess of what a reference day's replicates do not share."""
+
+    def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
+        """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
+        return max(float(np.nan_to_num(scatter(residual, courses) - self.scatter)), 0.0)
 
     def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""
@@ -97,9 +104,11 @@ def estimate(
     excess = [np.square(left[day == number]).sum() / measured[day == number].sum() - 1 for number in range(count)]
     usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number])
              / float((day == number).sum()) for number in range(count)]
+    apart = [scatter(left[day == number], drives.courses.of_trial[day == number]) for number in range(count)]
+    apart = [one for one in apart if np.isfinite(one)]
     estimates = [coordinates(evidence, np.flatnonzero(day == number)) for number in range(count)]
     return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)),
-                   usual=float(np.mean(usual)))
+                   usual=float(np.mean(usual)), scatter=float(np.mean(apart)) if apart else 0.0)
 
 
 def _spread(excess: np.ndarray) -> float:
