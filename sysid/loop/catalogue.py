@@ -36,6 +36,8 @@ class Axis:
     """add: value = neutral + unit q.  inverse: unit / q.  factor: base value x exp(unit q).  moment: unit q / mass."""
     limit: float = 12.0
     """Largest |q| that a refit may reach."""
+    dependent: bool = False
+    """Whether it does nothing by itself, but changes what the other axes do."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class Hypothesis:
     @property
     def signed(self) -> bool:
         return all(axis.signed for axis in self.axes)
+
+    @property
+    def main(self) -> list[int]:
+        """Axes that do something by themselves."""
+        return [i for i, axis in enumerate(self.axes) if not axis.dependent]
 
     def values(self, q: np.ndarray, base: Mapping[str, float]) -> dict[str, float]:
         """Parameter values at coordinates q (k,), given the base values of all parameters."""
@@ -94,6 +101,8 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
 
     base = describe(params)
     shift: dict[str, Any] = {"kind": "parameter_shift"}
+    brakes = [axis(f"acceleration_limit.{way}", 0.25, form="factor", signed=True, dependent=True, limit=6.0)
+              for way in ("slowing", "reversing", "turn_slowing")]
     every = [
         one("command_delay", axis("command_delay.delay", 0.04, limit=10.0), **shift),
         one("command_dead_zone", axis("command_dead_zone.linear", 0.02 * speed),
@@ -101,7 +110,8 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
         one("acceleration_limit", axis("acceleration_limit.linear", 1.5, form="inverse"), variant="linear"),
         one("acceleration_limit", axis("acceleration_limit.angular", 3.0, form="inverse"), variant="angular"),
         one("acceleration_limit", axis("acceleration_limit.linear", 1.5, form="inverse"),
-            axis("acceleration_limit.angular", 3.0, form="inverse"), variant="both"),
+            axis("acceleration_limit.angular", 3.0, form="inverse"), *brakes, variant="ramp"),
+        one("acceleration_limit", axis("acceleration_limit.wheel", 1.5, form="inverse"), *brakes[:2], variant="wheel"),
         one("jerk_limit", axis("jerk_limit.linear", 20.0, form="inverse"),
             axis("jerk_limit.angular", 40.0, form="inverse")),
         one("command_scale", axis("command_scale.linear", 0.02, signed=True),
@@ -119,12 +129,13 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
             axis("wheel_radius_difference.common", 0.005, signed=True)),
         one("track_width", axis("track_width.error", 0.01, signed=True)),
         one("payload_shift", axis("payload_shift.mass", 0.08 * spec.mass),
-            axis("payload_shift.x", 0.01 * spec.mass * spec.wheelbase, form="moment", signed=True),
-            axis("payload_shift.y", 0.01 * spec.mass * track, form="moment", signed=True),
+            axis("payload_shift.x", 0.01 * spec.mass * spec.wheelbase, form="moment", signed=True, dependent=True),
+            axis("payload_shift.y", 0.01 * spec.mass * track, form="moment", signed=True, dependent=True),
             constants=(("payload_shift.z", 0.3),)),
         one("yaw_scrub", axis("yaw_scrub.torque", 0.008 * weight * track), **shift),
         one("omni_roller_friction", axis("omni_roller_friction.mu_t", 0.02)),
-        one("caster_kick", axis("caster_kick.force_limit", force)),
+        one("caster_kick", axis("caster_kick.force_limit", force),
+            axis("caster_kick.trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0)),
         one("traction_limit", axis("slip_traction.mu", -0.15, form="factor"), **shift),
         one("rolling_resistance_speed", axis("rolling_resistance_speed.mu_1", 0.004 / speed)),
         one("quadratic_drag", axis("quadratic_drag.coefficient", force / speed**2)),

@@ -71,8 +71,8 @@ def signature_columns(
         for level in ((1.0,) if one.signed else LEVELS):
             for position, axis in enumerate(one.axes):
                 q = np.zeros(len(one.axes))
-                if axis.form == "moment":
-                    q[0] = level  # a place needs a mass to be at; its effect is taken relative to the mass alone
+                if axis.dependent:
+                    q[one.main] = level  # what it changes is taken relative to the others alone
                 for sign in ((1, -1) if axis.signed else (1,)):
                     q[position] = sign * (1.0 if axis.signed else level)
                     sets.append(with_values(values, names, one.values(q, base)))

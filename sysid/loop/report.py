@@ -265,7 +265,7 @@ def detectable(result: Result) -> list[dict[str, Any]]:
             if (one.key, axis.parameter) in done or not usable:
                 continue
             done.add((one.key, axis.parameter))
-            if axis.form == "moment":
+            if axis.dependent:
                 continue
             at = np.array([q if other is axis else 0.0 for other in one.axes])
             value = one.values(at, base)[axis.parameter]

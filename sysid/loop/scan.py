@@ -72,7 +72,9 @@ def look(
     if np.any(wrong):
         gain, worth, q = (np.where(wrong if leaf.ndim == wrong.ndim else wrong[..., None], 0.0, leaf)
                           for leaf in (found.gain, found.worth, found.q))
-        for position in range(len(axes)) if len(axes) > 1 else ():
+        for position, axis in enumerate(axes) if len(axes) > 1 else ():
+            if axis.dependent:
+                continue
             part = [position]
             shift = away[..., part] if isinstance(away, np.ndarray) else away
             alone = _fit(solver, (columns.index[position],), wander[np.ix_(part, part)], moments, shift)

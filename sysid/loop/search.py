@@ -211,7 +211,7 @@ def _rescan(
 def _starts(
     hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, taken: set[str], thresholds: Thresholds
 ) -> list[tuple[int, np.ndarray]]:
-    """Hypotheses to refit and where to start, one per effect.
+    """Hypotheses to refit and where to start.
 
     Of each scan those that gain most, and of the last the one that stands out most. A large effect shows best in the
     scan around the reference, a small one in that around the base refitted to these drives.
@@ -226,8 +226,9 @@ def _starts(
             chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
         new = 0
         for h in chosen:
-            if hypotheses[h].effect not in order and new < thresholds.candidates:
-                order[hypotheses[h].effect] = _widest(hypotheses, h, q, standing)
+            wide, start = _widest(hypotheses, h, q, standing)
+            if hypotheses[wide].key not in order and new < thresholds.candidates:
+                order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
 
@@ -264,9 +265,10 @@ def _widest(
              and mine < {axis.parameter for axis in one.axes}]
     if not wider:
         return h, q[h]
+    most = max(wider, key=lambda i: len(hypotheses[i].axes))
     alone = {hypotheses[i].axes[0].parameter: float(q[i][0]) for i in standing
              if hypotheses[i].effect == hypotheses[h].effect and len(hypotheses[i].axes) == 1}
-    return wider[0], np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[wider[0]].axes])
+    return most, np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[most].axes])
 
 
 def _candidate(

@@ -90,6 +90,22 @@ def test_acceleration_limit_ramps_the_command():
     np.testing.assert_allclose(command, [0.17, -0.3], rtol=1e-4)
 
 
+@pytest.mark.parametrize("wanted, rate", [(1.0, 1.0), (0.2, 2.0), (-0.2, 2.0), (-0.5, 1.0), (-1.0, 1.0)])
+def test_a_limit_for_slowing_down_holds_unless_as_much_is_asked_for_the_other_way(wanted, rate):
+    limit = AccelerationLimit(linear=jnp.array(1.0), angular=jnp.array(1.0), slowing=jnp.array(2.0))
+    memory = (jnp.array([0.5, 0.0]), jnp.array([0.5, 0.5]))
+    _, command = limit.command(memory, jnp.array([wanted, 0.0]), motion_at())
+    np.testing.assert_allclose(abs(command[0] - 0.5), rate * motion_at().dt, rtol=1e-3)
+
+
+def test_a_limit_of_the_wheels_bounds_the_faster_wheel():
+    motion = motion_at()
+    limit = AccelerationLimit(wheel=jnp.array(1.0), angular=jnp.array(jnp.inf))
+    _, command = limit.command(limit.init(), jnp.array([1.0, 1.0]), motion)
+    left, right = command[0] - command[1] * motion.track / 2, command[0] + command[1] * motion.track / 2
+    np.testing.assert_allclose([left, right], motion.dt, rtol=1e-3)
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.1, 0.22])
 def test_a_delayed_command_arrives_after_its_delay(delay):
     effect = CommandDelay(delay=jnp.array(delay))

@@ -12,24 +12,47 @@ from whill_mjx.types import Motion, parameter
 
 @struct.dataclass
 class AccelerationLimit(Effect):
-    """The command followed at a limited rate: |dv/dt| <= linear, |domega/dt| <= angular.
+    """The command followed at a limited rate: |dv/dt| <= linear, |domega/dt| <= angular, |dv_wheel/dt| <= wheel.
+
+    Where the command asks for less, the limit is `slowing` times as large (of omega `turn_slowing` times); where it
+    asks for as much or more the other way, it is `reversing` times as large until the vehicle stands.
 
     Source: the maker's protocol specification, 3.2.8: velocity commands are ramped with about 1.7 m/s^2. Whether the
-    ramp acts on (v, omega) or on each wheel is not documented; here it acts on (v, omega).
+    ramp acts on (v, omega) or on each wheel is not documented; either can be given, or both one after the other.
     """
 
     name = "acceleration_limit"
-    typical = {"linear": (0.5, 2.0), "angular": (1.0, 8.0)}
+    typical = {"linear": (0.5, 2.0), "angular": (1.0, 8.0), "wheel": (0.6, 2.5), "slowing": (1.0, 2.0),
+               "turn_slowing": (1.0, 2.0), "reversing": (1.0, 2.0)}
     source = "maker's protocol specification, 3.2.8: about 1.7 m/s^2 on velocity commands"
     linear: jax.Array = parameter("m/s^2", 0.1, 5.0, float("inf"), "largest change of v")
     angular: jax.Array = parameter("rad/s^2", 0.2, 15.0, float("inf"), "largest change of omega")
+    wheel: jax.Array = parameter("m/s^2", 0.1, 5.0, float("inf"), "largest change of a wheel's speed")
+    slowing: jax.Array = parameter("-", 0.2, 5.0, 1.0, "limit when slowing down over that when speeding up")
+    turn_slowing: jax.Array = parameter("-", 0.2, 5.0, 1.0, "the same of omega")
+    reversing: jax.Array = parameter("-", 0.2, 5.0, 1.0, "limit on the way to a stop before driving the other way")
 
-    def init(self) -> jax.Array:
-        return jnp.zeros(2)  # the ramped command so far
+    def init(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros(2), jnp.zeros(2)  # ramped (v, omega) and wheels' speeds so far
 
-    def command(self, memory: jax.Array, command: jax.Array, motion: Motion) -> tuple[jax.Array, jax.Array]:
+    def command(
+        self, memory: tuple[jax.Array, jax.Array], command: jax.Array, motion: Motion
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         """Ramped command (2,)."""
-        step = jnp.stack([self.linear, self.angular]) * motion.dt
-        # Two one-sided bounds instead of memory + clip(...): exact at infinite limits.
-        ramped = jnp.minimum(jnp.maximum(command, memory - step), memory + step)
-        return ramped, ramped
+        ramped = self._follow(memory[0], command, jnp.stack([self.linear, self.angular]) * motion.dt,
+                              jnp.stack([self.slowing, self.turn_slowing]))
+        half = motion.track / 2
+        wanted = jnp.stack([ramped[0] - half * ramped[1], ramped[0] + half * ramped[1]])
+        wheels = self._follow(memory[1], wanted, self.wheel * motion.dt * jnp.ones(2), self.slowing)
+        behind = wheels - wanted  # exactly 0 at an infinite limit
+        both = ramped + jnp.stack([behind[0] + behind[1], (behind[1] - behind[0]) / half]) / 2
+        return (ramped, wheels), both
+
+    def _follow(self, now: jax.Array, wanted: jax.Array, step: jax.Array, slowing: jax.Array) -> jax.Array:
+        """`now` (2,) brought towards `wanted` by one step, another one where it slows down."""
+        limited = jnp.isfinite(step)
+        step = jnp.where(limited, step, 1.0)
+        back = (now * wanted < 0) & (jnp.abs(wanted) >= jnp.abs(now))
+        brake = jnp.where(back, self.reversing, slowing) * step
+        up, down = jnp.where(now < 0, brake, step), jnp.where(now > 0, brake, step)
+        return jnp.where(limited, jnp.minimum(jnp.maximum(wanted, now - down), now + up), wanted)

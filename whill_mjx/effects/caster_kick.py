@@ -15,7 +15,7 @@ TIE_BREAK = 0.02  # [rad], lets an exactly straight reversal start the swivel, c
 
 @struct.dataclass
 class CasterKick(Effect):
-    """d(delta)/dt = (|v| / L) sin(phi - delta); F = F_k sin(phi - delta) across each free wheel, against its sliding.
+    """d(delta)/dt = (|v| / L) sin(phi - delta) - omega; F = F_k sin(phi - delta) across each free wheel.
 
     delta is the direction in which a caster's wheel rolls, phi that of the motion at its pivot. A caster that trails
     gives no force; after a reversal or from a parked angle it pushes until it has swivelled, over a path of a few
@@ -37,6 +37,7 @@ class CasterKick(Effect):
         cos, sin = jnp.cos(memory), jnp.sin(memory)
         speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
         across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK * (speed - REST_SPEED)
-        swivelled = memory + across / self.trail * motion.dt
+        turning = (motion.ground_axes[2] * motion.angular_velocity).sum()  # the chassis turns under the caster
+        swivelled = memory + (across / self.trail - turning) * motion.dt
         push = -self.force_limit * (1 - motion.world.geometry.driven) * across / speed
         return swivelled, contact_wrench(motion, -push * sin, push * cos)
