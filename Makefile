@@ -28,10 +28,10 @@ train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-quick: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -m quick
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .
