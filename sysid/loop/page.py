@@ -104,7 +104,7 @@ def candidates(report: dict[str, Any]) -> str:
     """The refitted candidates of each round."""
     parts = []
     for number, each in enumerate(report["candidates"], start=1):
-        parts.append(table(["effect", "gain", "explains", "p by itself"],
+        parts.append(table(["effect", "gain", "explains", "p of the gain"],
                            [[f"{one['effect']} {one['variant']}".strip(), one["gain"], f"{one['explained']:.0%}",
                              one["p_value"]] for one in each], f"round {number}"))
     return "".join(parts) or paragraph("Nothing stood out, so nothing was refitted.")
