@@ -100,10 +100,10 @@ def test_costs_agree_within_a_share_of_the_best():
 @pytest.mark.quick
 def test_effects_are_added_where_they_do_nothing():
     params = preset_params(WHILL_CR, "physical")
-    more = with_effects(params, ("lateral_damping", "acceleration_limit", "yaw_scrub"))
+    more = with_effects(params, ("lateral_damping", "jerk_limit", "yaw_scrub"))
     assert sorted(set(describe(more)) - set(describe(params))) == [
-        "acceleration_limit.angular", "acceleration_limit.linear", "lateral_damping.c_front", "lateral_damping.c_rear"]
+        "jerk_limit.angular", "jerk_limit.linear", "lateral_damping.c_front", "lateral_damping.c_rear"]
     values = dict(zip(describe(more), np.asarray(get_values(more, list(describe(more)))), strict=True))
-    assert values["lateral_damping.c_front"] == 0.0 and np.isfinite(values["acceleration_limit.linear"])
+    assert values["lateral_damping.c_front"] == 0.0 and np.isfinite(values["jerk_limit.linear"])
     with pytest.raises(ValueError, match="no effect 'anti_gravity'"):
         with_effects(params, ("anti_gravity",))
