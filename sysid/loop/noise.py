@@ -91,7 +91,8 @@ def fit_roughness(series: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np
         for k in range(len(ROUGH) + 1):
             chosen = (level == k) & (mask[..., c] > 0)
             size[k, c] = np.sqrt(np.mean(np.square(series[..., c][chosen]))) if chosen.sum() > 30 else np.nan
-    first = np.where(np.isfinite(size[0]) & (size[0] > 0), size[0], np.nanmin(size, axis=0))
+    known = np.where(np.isfinite(size), size, np.inf).min(0)
+    first = np.where(np.isfinite(size[0]) & (size[0] > 0), size[0], np.where(np.isfinite(known), known, 1.0))
     factors = np.where(np.isfinite(size), size, 0.0) / np.maximum(first, 1e-12)
     return np.maximum(np.maximum.accumulate(factors, axis=0), 1.0)
 

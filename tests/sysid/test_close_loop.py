@@ -11,7 +11,7 @@ from sysid.log import load_log
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.drives import make_drives
 from sysid.loop.features import CHANNELS, make_features
-from sysid.loop.noise import deviations, fit_whitener, replicate_groups
+from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.report import make_report, replay, write_run
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
@@ -198,6 +198,17 @@ def test_whitener_makes_autocorrelated_noise_white():
     assert abs(white.std() - 1) < 0.05
     assert abs(np.mean(white[:, 1:, 0] * white[:, :-1, 0])) < 0.03
     assert abs(np.mean(white[..., 0] * white[..., 1])) < 0.03
+
+
+@pytest.mark.quick
+def test_a_channel_that_was_not_measured_is_no_rougher():
+    series = np.random.default_rng(0).standard_normal((3, 100, 2))
+    mask = np.ones_like(series)
+    mask[..., 1] = 0
+    level = np.repeat([[0] * 50 + [3] * 50], 3, axis=0)
+    factors = fit_roughness(series * np.where(level == 3, 4.0, 1.0)[..., None] * mask, mask, level)
+    assert np.allclose(factors[:, 1], 1.0)
+    assert 3 < factors[3, 0] < 5 and factors[0, 0] == 1
 
 
 @pytest.mark.quick
