@@ -55,6 +55,8 @@ class Benchmark:
     """Logs with two effects of 4 times that size."""
     full: int = 4
     """Every how many-th named log also has its held-out trials opened."""
+    speed: bool = False
+    """How long the whole command takes, from start to report, on a log of 27 trials with six reference days."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     collect: bool = False
@@ -71,6 +73,8 @@ def main(settings: Benchmark) -> None:
         shared(settings)
     if settings.nulls or settings.base or settings.scales or settings.pairs:
         plant(settings)
+    if settings.speed:
+        contact.speed(settings.work / "plant")
     if settings.classes:
         look_alikes(settings)
     if settings.collect:

@@ -8,6 +8,9 @@ a file beside it that the loop never reads.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -131,6 +134,20 @@ def judge(job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool)
     return content
 
 
+def speed(work: Path) -> None:
+    """Time the command line with its compilations; nulls are linear, as always."""
+    reference_days(work)
+    log = work / "logs" / "speed"
+    if not log.exists():
+        make_log(log, effects={"slope": EFFECTS["slope"].base}, seed=70000)
+    days = sorted((work / "reference").glob("day_*"))
+    command = [sys.executable, "-m", "sysid.close_loop", log, "--reference", *days, "--out", work / "speed"]
+    environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    began = time.perf_counter()
+    subprocess.run([str(part) for part in command], check=True, env=environment)
+    write_report(work / "speed.json", {"seconds": time.perf_counter() - began})
+
+
 def brief(result: Result) -> dict[str, Any]:
     """A verdict without its report; held-out trials stay closed."""
     found, alpha = result.search, result.config.thresholds.alpha
@@ -159,6 +176,9 @@ def figures(work: Path) -> None:
     if ratios:
         found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
     found["seconds_per_log"] = figure([one["seconds"] for _, one in cases], "s on one core, reference fit apart")
+    if (work / "speed.json").exists():
+        taken = json.loads((work / "speed.json").read_text())["seconds"]
+        found["cpu_quick_seconds"] = figure([taken], "s, the whole command with linear nulls, compilations included")
     path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
     content = json.loads(path.read_text())
     content["sizes"] = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}

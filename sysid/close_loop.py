@@ -30,7 +30,7 @@ from sysid import command_line
 from sysid.log import Log, Trial
 from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.drives import CHUNK, Drives, make_drives
-from sysid.loop.evidence import Evidence, gather
+from sysid.loop.evidence import PARTS, Evidence, gather
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
@@ -264,9 +264,11 @@ def _check(log: Log, references: Sequence[Log]) -> None:
                                  "reference must be a drive of the same vehicle; correct dataset.toml or leave it out.")
 
 
-def expected_steps(config: LoopConfig) -> int:
-    """How far the progress bar goes at most."""
-    return 2 * config.iterations + 60
+def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
+    """How far the progress bar goes at most, with so many reference days."""
+    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+    base = 0 if fitted else iterations + max(iterations // 2, 3)
+    return base + 6 * days + 2 * PARTS + 2 + 3 * config.thresholds.rounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,7 +313,8 @@ def run(log: Log, references: Sequence[Log], out: Path, config: LoopConfig, vehi
     """Close the loop with a progress bar, open the held-out trials, write the folder `out` and print the verdict."""
     from sysid.loop.report import make_report, summary, write_run
 
-    progress, close = command_line.progress_bar(expected_steps(config), "close the loop", "step")
+    progress, close = command_line.progress_bar(
+        expected_steps(config, len(references), vehicle is not None), "close the loop", "step")
     try:
         result = close_loop(log, references, config, vehicle, progress)
     finally:

@@ -14,10 +14,12 @@ import numpy as np
 
 from sysid.log import Trial
 from sysid.loop.catalogue import LEVELS, Hypothesis, base_values
-from sysid.loop.drives import CHUNK, Drives
+from sysid.loop.drives import Drives
 from sysid.loop.reference import Reference, alike, difference_sizes
 from sysid.result import Progress
 from whill_mjx.types import VehicleParams
+
+PARTS = 10  # in which signatures are simulated, for the progress bar
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,8 @@ def signature_columns(
                     sets.append(with_values(values, names, one.values(q, base)))
                 jobs.append((number, level, position, axis.signed))
     seen = []
-    rows = max(CHUNK // len(drives.trials), 1)
-    for start in range(0, len(sets), rows):
-        seen.append(drives.simulate(np.stack(sets[start : start + rows])))
+    for part in np.array_split(np.stack(sets), min(PARTS, len(sets))):
+        seen.append(drives.simulate(part))
         if progress is not None:
             progress(1, "signatures")
     flat, cursor = np.concatenate(seen), 0
