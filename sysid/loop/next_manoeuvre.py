@@ -323,7 +323,7 @@ def _held(result: Result, fit: Refit) -> np.ndarray:
     for one, q in zip(fit.hypotheses, fit.split, strict=True):
         part = slice(start, start + len(q))
         covariance[part, part] += result.prepared.wander.at(
-            result.evidence.columns, list(result.hypotheses).index(one), q)
+            result.evidence.columns, result.hypotheses.index(one), q)
         start += len(q)
     out[size:, size:] = np.linalg.inv(covariance)
     return out

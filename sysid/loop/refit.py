@@ -35,6 +35,14 @@ class Refit:
     jacobian: np.ndarray  # (B, n, P + k) of the white features by (u, q)
     values: np.ndarray  # all parameters
 
+    def products(self, precision: np.ndarray) -> np.ndarray:
+        """(P + k, P + k) of the white columns, with the precision (P, P) of the base parameters."""
+        flat = self.jacobian.reshape(-1, self.jacobian.shape[-1])
+        matrix = flat.T @ flat
+        size = len(precision)
+        matrix[:size, :size] += precision
+        return matrix
+
     @property
     def split(self) -> list[np.ndarray]:
         """Coordinates of each hypothesis."""

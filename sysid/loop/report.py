@@ -190,7 +190,7 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     groups = result.evidence.groups
     summed = np.stack([scores[list(group)].sum(0) for group in groups])
     robust = covariance @ (summed.T @ summed) @ covariance * len(groups) / max(len(groups) - 1, 1)
-    wander = [np.diag(result.prepared.wander.at(result.evidence.columns, list(result.hypotheses).index(one), q))
+    wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
               for one, q in zip(final.hypotheses, final.split, strict=True)]
     deviation = np.sqrt(np.maximum(np.diag(covariance), np.diag(robust))[size:] + np.concatenate([[], *wander]))
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(groups) - 1, 1))
@@ -199,10 +199,7 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
 
 def information(final: Refit, result: Result) -> np.ndarray:
     """(P + k, P + k) of the joint fit, with the day-to-day spread as prior."""
-    flat = final.jacobian.reshape(-1, final.jacobian.shape[-1])
-    matrix = flat.T @ flat
-    size = len(final.u)
-    matrix[:size, :size] += result.evidence.precision
+    matrix = final.products(result.evidence.precision)
     matrix[np.diag_indices(len(matrix))] += 1e-9 * np.diag(matrix).max()
     return matrix
 

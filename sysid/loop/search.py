@@ -280,13 +280,9 @@ def _candidate(
     gain = max(current.cost - fit.cost, 0.0)
     q = fit.q[-len(one.axes) :]
     size = fit.jacobian.shape[-1] - len(q)
-    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    products = flat.T @ flat
-    known = products[:size, :size].copy()
-    extra = evidence.precision.shape[0]
-    known[:extra, :extra] += evidence.precision
+    products = fit.products(evidence.precision)
     cross = products[:size, size:]
-    inside = products[size:, size:] - cross.T @ np.linalg.lstsq(known, cross, rcond=None)[0]
+    inside = products[size:, size:] - cross.T @ np.linalg.lstsq(products[:size, :size], cross, rcond=None)[0]
     moved = np.abs(q) > 1e-9
     inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])
@@ -301,10 +297,10 @@ def _class_of(
 ) -> list[str]:
     """Effects that these drives do not tell from the best, at most four: nearly as good a fit, alike signatures, or a
     fit so much better than imitating the best would bring that the truth may lie between the two."""
-    mine = list(hypotheses).index(best.hypothesis)
+    mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}
     for other in candidates:
-        imitated = float(similar[mine, list(hypotheses).index(other.hypothesis)]) ** 2
+        imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
         ratio = other.gain / best.gain
         own = (ratio - imitated) / max(1 - imitated, 1e-9)
         if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
