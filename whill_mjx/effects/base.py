@@ -81,6 +81,11 @@ def contact_wrench(motion: Motion, forward: jax.Array, left: jax.Array, normal: 
     )  # fmt: skip
 
 
+def yaw_rate(motion: Motion) -> jax.Array:
+    """Turning of the chassis about the ground's normal [rad/s]."""
+    return (motion.ground_axes[2] * motion.angular_velocity).sum()
+
+
 def per_side(values: jax.Array) -> jax.Array:
     """Sums (2,) over the left and the right contacts of values (4,)."""
     return jnp.stack([values[0] + values[2], values[1] + values[3]])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect, contact_wrench
+from whill_mjx.effects.base import Effect, contact_wrench, yaw_rate
 from whill_mjx.types import Motion, Wrench, parameter
 
 REST_SPEED = 0.05  # [m/s], fades the kick at rest
@@ -37,7 +37,6 @@ class CasterKick(Effect):
         cos, sin = jnp.cos(memory), jnp.sin(memory)
         speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
         across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK * (speed - REST_SPEED)
-        turning = (motion.ground_axes[2] * motion.angular_velocity).sum()  # the chassis turns under the caster
-        swivelled = memory + (across / self.trail - turning) * motion.dt
+        swivelled = memory + (across / self.trail - yaw_rate(motion)) * motion.dt  # the chassis turns under it
         push = -self.force_limit * (1 - motion.world.geometry.driven) * across / speed
         return swivelled, contact_wrench(motion, -push * sin, push * cos)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.effects.base import Effect, driven_mean, yaw_rate
 from whill_mjx.effects.smooth import soft_sign
 from whill_mjx.types import Motion, Wrench, parameter
 
@@ -37,7 +37,7 @@ class UnnamedMemory:
 def quantities(memory: UnnamedMemory, motion: Motion) -> jax.Array:
     """Values (8,) of `QUANTITIES`."""
     speed = motion.spin.mean() * motion.wheel_radius
-    rate = (motion.ground_axes[2] * motion.angular_velocity).sum()
+    rate = yaw_rate(motion)
     return jnp.stack([memory.time, speed, rate, memory.angle[0], memory.angle[1], motion.heading, memory.moving,
                       memory.distance])
 

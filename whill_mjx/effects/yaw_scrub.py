@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect
+from whill_mjx.effects.base import Effect, yaw_rate
 from whill_mjx.types import Motion, Wrench, parameter
 
 REST_RATE = 0.05  # [rad/s], smooths the change of sign at rest
@@ -25,5 +25,4 @@ class YawScrub(Effect):
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench with a yaw torque only."""
-        yaw_rate = (motion.ground_axes[2] * motion.angular_velocity).sum()
-        return memory, replace(Wrench.zero(), tz=-self.torque * jnp.tanh(yaw_rate / REST_RATE))
+        return memory, replace(Wrench.zero(), tz=-self.torque * jnp.tanh(yaw_rate(motion) / REST_RATE))
