@@ -19,6 +19,7 @@ from whill_mjx.effects import (
     RollingResistance,
     SlipTraction,
     YawScrub,
+    make_effect,
 )
 from whill_mjx.effects.base import PLACES, place_of
 from whill_mjx.model import build_model
@@ -186,6 +187,32 @@ def test_a_drive_with_zero_gains_gives_no_force(name):
     _, after = effect.actuation(effect.init(), drive, motion_at(0.3))
     np.testing.assert_array_equal(after.force, 0.0)
     np.testing.assert_array_equal(after.torque, 0.0)
+
+
+@pytest.mark.parametrize("windup", [0.0, 0.5, 1.0])
+def test_the_integral_of_the_torque_drive_goes_on_at_its_limit_as_windup_says(windup):
+    drive, motion = make_effect("torque_drive", kp=4.0, ki=2.0, limit=10.0, windup=windup), motion_at()
+    memory, out = drive.actuation(drive.init(), Drive(jnp.array([1.0, 0.1]), jnp.zeros(2), jnp.zeros(2)), motion)
+    error = np.array([1.0, 0.1]) / 0.1325  # rad/s: the left side asks for 30 N m, the right side for 3 N m
+    np.testing.assert_allclose(memory, error * [windup, 1.0] * motion.dt, rtol=1e-5)
+    assert out.torque[0] == 10.0 and 0 < out.torque[1] <= 4.0 * error[1]
+
+
+@pytest.mark.parametrize("limit", [0.5, 0.02])
+def test_the_papers_integral_stops_at_its_limit(limit):
+    drive, motion = make_effect("pid_drive", ki=2.0, integral_limit=limit), motion_at()
+    memory, wanted = drive.init(), Drive(jnp.array([1.0, -1.0]), jnp.zeros(2), jnp.zeros(2))
+    for _ in range(10):
+        memory, out = drive.actuation(memory, wanted, motion)
+    integral = min(limit, 10 * motion.dt)  # m
+    np.testing.assert_allclose(out.force, 52 / 2 * 2.0 * integral * np.array([1, -1]), rtol=1e-5)
+
+
+def test_forward_slip_scales_the_traction_alone():
+    drive = Drive(jnp.array([0.5, 0.2]), jnp.array([30.0, -20.0]), jnp.array([4.0, 5.0]))
+    _, after = make_effect("forward_slip", eta=0.84).actuation((), drive, motion_at())
+    np.testing.assert_allclose(after.force, [25.2, -16.8], rtol=1e-6)
+    np.testing.assert_array_equal(after.torque, drive.torque)
 
 
 @pytest.mark.parametrize("kind", EFFECTS.values())

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from whill_mjx.kinematics import body_twist, reference_pose
+from whill_mjx.kinematics import body_twist, reference_pose, rotation_from_quaternion
 from whill_mjx.model import build_model, mujoco_model
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset, preset_params
@@ -19,6 +19,7 @@ from whill_mjx.specs import SPECS, WARTHOG, WHILL_CR, VehicleSpec, find_spec
 from whill_mjx.vehicle import drive, forces, measure, nominal_world, place, substep
 
 VEHICLES = ["whill_cr_ramp", "whill_cr_physical"]
+CHAIRS = ["whill_cr_paper", "whill_cr_ramp", "whill_cr_physical", "whill_cr_documented", "whill_cr_castored"]
 
 
 @lru_cache
@@ -98,15 +99,33 @@ def test_slip_separates_odometry_from_the_body():
     assert 0 < yaw < 0.8 * state.odometry.yaw
 
 
-@pytest.mark.parametrize("name", [*SPECS, "whill_cr_paper", "whill_cr_ramp", "whill_cr_physical"])
-def test_static_axle_loads_stay_positive_up_to_the_documented_acceleration(name):
-    """Quasi-static load transfer at 1.7 m/s^2 leaves load on both axles, for every preset."""
+@pytest.mark.parametrize("kind", ["paper", "physical"])
+@pytest.mark.parametrize("name", [*SPECS, *CHAIRS])
+def test_static_axle_loads_stay_positive_up_to_the_documented_acceleration(name, kind):
+    """Load transfer at 1.7 m/s^2 forward and backward leaves load on both axles, for every preset and base model."""
     spec, params = preset(name)
+    if name in SPECS:
+        params = preset_params(spec, kind)
     height = spec.wheel_radius + float(params.body.com_z)
     rear_arm = float(params.body.com_x) - spec.rear_x
     front_arm = spec.front_x - float(params.body.com_x)
     transfer = 1.7 * height / 9.81  # shift of the load's point of action [m]
     assert rear_arm - transfer > 0 and front_arm - transfer > 0
+
+
+def test_a_centre_of_mass_behind_the_driven_axle_would_tip_the_chair():
+    """So the paper's com_x of -0.265 m is from mid-length and not from the rear axle, which lies at -0.36 m."""
+    spec, params = preset("whill_cr_paper")
+    assert spec.rear_x < -0.2654 < 0 and spec.rear_x == spec.reference_x
+    behind = params.replace(body=params.body.replace(com_x=params.body.com_x + spec.rear_x))
+    model, _, period = compiled_period("whill_cr_paper")
+    pitches = []
+    for vehicle in (params, behind):
+        state = place(model, vehicle, 0.0, 0.0, 0.0)
+        for _ in range(6):
+            state = period(vehicle, state, jnp.zeros(2))
+        pitches.append(float(rotation_from_quaternion(state.qpos[3:7])[2, 0]))  # sine of the nose-up angle
+    assert abs(pitches[0]) < 0.02 and pitches[1] > 0.3
 
 
 def test_suspension_carries_the_weight_and_shifts_it_towards_the_centre_of_mass():
