@@ -62,7 +62,7 @@ def with_effects_at(places):
     left_out = have | STEPPED | ELSEWHERE
     names = [name for name in EFFECTS if name not in left_out and place_of(make_effect(name)) in places]
     names.sort(key=lambda name: name != "pid_drive")  # what scales its force comes behind it
-    body = params.body.replace(com_y=jnp.asarray(0.01), com_z=jnp.asarray(0.1))
+    body = replace(params.body, com_y=jnp.asarray(0.01), com_z=jnp.asarray(0.1))
     return spec, replace(params, body=body, effects=(*params.effects, *map(gentle, names)))
 
 
@@ -181,7 +181,7 @@ def test_energy_never_grows_without_input():
 
         def one(params):
             state = place(model, params, 0.0, 0.0, 0.0, 1.0, 0.5)
-            state = state.replace(qvel=state.qvel.at[1].add(0.3))
+            state = replace(state, qvel=state.qvel.at[1].add(0.3))
 
             def record(state, command):
                 state = substeps(model, params, state, command)
