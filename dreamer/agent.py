@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import behavior, image, optim, rssm, world_model
+from dreamer import behavior, optim, rssm, sensors, spaces, world_model
 from dreamer.behavior import ReturnNorm
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch
 from dreamer.rssm import Latent
+from dreamer.spaces import ActionSpec, ObsShape
 from dreamer.types import Carry, Params
 
 
@@ -34,23 +36,24 @@ class AgentState:
         return self.opt.count
 
 
-def init_params(config: DreamerConfig, obs_shape: tuple[int, int, int], action_dim: int, key: jax.Array) -> Params:
+def init_params(config: DreamerConfig, obs_shape: ObsShape, action_dim: ActionSpec, key: jax.Array) -> Params:
     """Parameters of world model, policy and critic."""
     world_key, policy_key, value_key = jax.random.split(key, 3)
+    actions = spaces.actions(action_dim)
     return {
-        **world_model.init(config, obs_shape, action_dim, world_key),
-        "policy": behavior.init_actor(config, action_dim, policy_key),
+        **world_model.init(config, obs_shape, actions.width, world_key),
+        "policy": behavior.init_actor(config, actions.outputs, policy_key),
         "value": behavior.init_critic(config, value_key),
     }
 
 
-def init_agent(config: DreamerConfig, obs_shape: tuple[int, int, int], action_dim: int, key: jax.Array) -> AgentState:
+def init_agent(config: DreamerConfig, obs_shape: ObsShape, action_dim: ActionSpec, key: jax.Array) -> AgentState:
     """A new agent.
 
     Args:
         config: hyperparameters.
-        obs_shape: (H, W, C).
-        action_dim: A.
+        obs_shape: (H, W, C), (D,) or a dict of them.
+        action_dim: A or Discrete(n).
         key: consumed.
     """
     params = init_params(config, obs_shape, action_dim, key)
@@ -59,17 +62,18 @@ def init_agent(config: DreamerConfig, obs_shape: tuple[int, int, int], action_di
     return AgentState(params, slow_value, optim.init(params), ReturnNorm(zero, jnp.copy(zero)))
 
 
-def init_carry(config: DreamerConfig, batch: int, action_dim: int) -> Carry:
+def init_carry(config: DreamerConfig, batch: int, action_dim: ActionSpec) -> Carry:
     """Recurrent state of `batch` instances: all zeros mean the start of an episode."""
     latent = rssm.initial(config, batch)
-    return {"deter": latent.deter, "stoch": latent.stoch, "action": jnp.zeros((batch, action_dim), jnp.float32)}
+    action = jnp.zeros((batch, spaces.actions(action_dim).width), jnp.float32)
+    return {"deter": latent.deter, "stoch": latent.stoch, "action": action}
 
 
 def act(
     config: DreamerConfig,
     params: Params,
     carry: Carry,
-    obs: jax.Array,
+    obs: Any,
     is_first: jax.Array,
     key: jax.Array | None,
     mode: bool = False,
@@ -80,50 +84,53 @@ def act(
         config: sizes.
         params: of the agent.
         carry: from `init_carry` or the previous call.
-        obs: (N, H, W, C) uint8.
+        obs: (N, ...) as the environment shows it.
         is_first: (N,) bool, resets the carry.
         key: consumed; may be None in mode.
-        mode: take the most probable latent and the mean action, as on the vehicle.
+        mode: take the most probable latent and action, as on the vehicle.
 
     Returns:
-        The carry, whose latent is the state after this frame, and actions (N, A), not clipped.
+        The carry, whose latent is the state after this frame, and actions (N, A), not clipped; one-hot classes.
     """
     keep = {name: jnp.where(is_first[:, None], jnp.zeros_like(value), value) for name, value in carry.items()}
-    tokens = image.encode(config, params["enc"], obs)
+    tokens = sensors.encode(config, params["enc"], obs)
     uniform = None
     if not mode:
         assert key is not None
         latent_key, action_key = jax.random.split(key)
-        uniform = jax.random.uniform(latent_key, (obs.shape[0], config.stoch))
+        uniform = jax.random.uniform(latent_key, (tokens.shape[0], config.stoch))
     previous = Latent(keep["deter"], keep["stoch"])
     latent = rssm.observe_step(config, params["dyn"], previous, keep["action"], tokens, uniform)
-    action, std = behavior.policy(config, params["policy"], latent.features())
-    if not mode:
-        action = action + std * jax.random.normal(action_key, action.shape)
+    actions, raw = spaces.actions_of(params), world_model.head(params["policy"], latent.features())
+    if mode:
+        action = actions.mode(config, raw)
+    else:
+        action = actions.sample(config, raw, actions.noise(action_key, raw.shape[:1]))
     return {"deter": latent.deter, "stoch": latent.stoch, "action": action}, action
 
 
-def policy_step(config: DreamerConfig, params: Params, carry: Carry, image: jax.Array) -> tuple[Carry, jax.Array]:
+def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -> tuple[Carry, jax.Array]:
     """One control step of ONE instance in float32, deterministic: the function that runs on the vehicle.
 
     Args:
         config: sizes; the compute type is ignored.
         params: of the agent.
         carry: deter (D,), stoch (S * C,), action (A,) float32; zeros start an episode.
-        image: (H, W, C) uint8.
+        obs: (H, W, C) uint8, or what else the environment shows.
 
     Returns:
-        The new carry and the action (A,) in [-1, 1].
+        The new carry and the action (A,) in [-1, 1], or a one-hot class (n,).
     """
     config = dataclasses.replace(config, compute_dtype="float32")
     batched = {name: value[None].astype(jnp.float32) for name, value in carry.items()}
-    new_carry, action = act(config, params, batched, image[None], jnp.zeros((1,), bool), None, mode=True)
+    obs = jax.tree.map(lambda x: x[None], obs)
+    new_carry, action = act(config, params, batched, obs, jnp.zeros((1,), bool), None, mode=True)
     return {name: value[0] for name, value in new_carry.items()}, action[0]
 
 
-def policy_carry(config: DreamerConfig, action_dim: int) -> Carry:
+def policy_carry(config: DreamerConfig, action_dim: ActionSpec) -> Carry:
     """Zero carry of `policy_step`."""
-    sizes = {"deter": config.deter, "stoch": config.stoch_size, "action": action_dim}
+    sizes = {"deter": config.deter, "stoch": config.stoch_size, "action": spaces.actions(action_dim).width}
     return {name: jnp.zeros((width,), jnp.float32) for name, width in sizes.items()}
 
 

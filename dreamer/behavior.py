@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer import distributions as dist
-from dreamer import rssm, world_model
+from dreamer import rssm, spaces, world_model
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent
 from dreamer.types import Params
@@ -36,26 +36,19 @@ class Imagined:
     features: jax.Array
     """(H + 1, M, F), the start included."""
     actions: jax.Array
-    """(H + 1, M, A) raw samples; the last one has no outcome."""
+    """(H + 1, M, A) raw samples or one-hot classes; the last one has no outcome."""
 
 
-def init_actor(config: DreamerConfig, action_dim: int, key: jax.Array) -> Params:
-    """Parameters of the policy: an MLP whose output holds A means and A raw standard deviations."""
+def init_actor(config: DreamerConfig, outputs: int, key: jax.Array) -> Params:
+    """Parameters of the policy: an MLP with so many outputs, which `spaces` turns into actions."""
     features = config.deter + config.stoch_size
-    outputs, outscale = 2 * action_dim, config.policy_outscale
-    return world_model.init_head(config, key, features, config.policy_layers, outputs, outscale)
+    return world_model.init_head(config, key, features, config.policy_layers, outputs, config.policy_outscale)
 
 
 def init_critic(config: DreamerConfig, key: jax.Array) -> Params:
     """Parameters of the critic; its output is exactly 0 at the start."""
     features = config.deter + config.stoch_size
     return world_model.init_head(config, key, features, config.value_layers, config.bins, outscale=0.0)
-
-
-def policy(config: DreamerConfig, params: Params, features: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation (..., A) of the action at features (..., F)."""
-    mean, std = jnp.split(world_model.head(params, features), 2, -1)
-    return dist.bounded_normal(mean, std, config.min_std, config.max_std)
 
 
 def lambda_return(
@@ -97,15 +90,14 @@ def imagine(config: DreamerConfig, params: Params, start: Latent, key: jax.Array
         key: consumed.
     """
     rows, steps = start.deter.shape[0], config.imag_horizon
-    actions = params["policy"]["out"]["b"].shape[0] // 2
+    actions = spaces.actions_of(params)
     latent_key, action_key = jax.random.split(key)
     uniform = jax.random.uniform(latent_key, (steps, rows, config.stoch))
-    normal = jax.random.normal(action_key, (steps + 1, rows, actions))
+    draws = actions.noise(action_key, (steps + 1, rows))
     params = jax.tree.map(lambda p: p.astype(config.dtype) if p.ndim >= 2 else p, params)  # once, not in every step
 
     def act(latent: Latent, noise: jax.Array) -> jax.Array:
-        mean, std = policy(config, params["policy"], latent.features())
-        return mean + std * noise
+        return actions.sample(config, world_model.head(params["policy"], latent.features()), noise)
 
     def advance(latent: Latent, noise: tuple[jax.Array, jax.Array]) -> tuple[Latent, tuple[jax.Array, jax.Array]]:
         action = act(latent, noise[1])
@@ -115,9 +107,9 @@ def imagine(config: DreamerConfig, params: Params, start: Latent, key: jax.Array
         return Latent(deter, stoch), (latent.features(), action)
 
     unroll = min(config.scan_unroll, steps)
-    last, (features, taken) = jax.lax.scan(advance, start, (uniform, normal[:-1]), unroll=unroll)
+    last, (features, taken) = jax.lax.scan(advance, start, (uniform, draws[:-1]), unroll=unroll)
     return Imagined(
-        jnp.concatenate([features, last.features()[None]]), jnp.concatenate([taken, act(last, normal[-1])[None]])
+        jnp.concatenate([features, last.features()[None]]), jnp.concatenate([taken, act(last, draws[-1])[None]])
     )
 
 
@@ -129,26 +121,19 @@ def update_return_norm(config: DreamerConfig, norm: ReturnNorm, returns: jax.Arr
 
 
 def actor_loss(
-    config: DreamerConfig,
-    mean: jax.Array,
-    std: jax.Array,
-    action: jax.Array,
-    advantage: jax.Array,
-    weight: jax.Array,
+    config: DreamerConfig, log_prob: jax.Array, entropy: jax.Array, advantage: jax.Array, weight: jax.Array
 ) -> jax.Array:
     """REINFORCE loss (H, M): -weight * (log pi(a_t | s_t) * advantage_t + entropy_scale * entropy).
 
     Args:
         config: entropy scale.
-        mean: (H, M, A), std alike.
-        std: (H, M, A).
-        action: (H, M, A) taken in state t.
+        log_prob: (H, M) of the action taken in state t.
+        entropy: (H, M) of the policy there.
         advantage: (H, M) of the action taken in state t.
         weight: (H, M) probability that state t is reached alive.
     """
     stop = jax.lax.stop_gradient
-    log_prob = dist.normal_log_prob(mean, std, stop(action))
-    gain = log_prob * stop(advantage) + config.entropy_scale * dist.normal_entropy(std)
+    gain = log_prob * stop(advantage) + config.entropy_scale * entropy
     return -stop(weight) * gain
 
 
@@ -198,15 +183,16 @@ def imagination_loss(
     weight = jnp.cumprod(alive, 0)
     norm = update_return_norm(config, norm, returns)
     advantage = (returns - value[:-1]) / norm.scale()
-    mean, std = policy(config, params["policy"], features[:-1])
+    actions, raw = spaces.actions_of(params), world_model.head(params["policy"], features[:-1])
+    log_prob, entropy = actions.score(config, raw, rollout.actions[:-1])
     slow_logits = world_model.head(slow, features[:-1])
     losses = {
-        "policy": actor_loss(config, mean, std, rollout.actions[:-1], advantage, weight[:-1]),
+        "policy": actor_loss(config, log_prob, entropy, advantage, weight[:-1]),
         "value": critic_loss(config, logits[:-1], slow_logits, returns, weight[:-1]),
     }
     metrics = {
-        "policy_std": jnp.mean(std),
-        "policy_entropy": jnp.mean(dist.normal_entropy(std)),
+        **actions.watch(config, raw),
+        "policy_entropy": jnp.mean(entropy),
         "imagined_return": jnp.mean(returns),
         "imagined_reward": jnp.mean(reward[1:]),
         "imagined_value": jnp.mean(value),

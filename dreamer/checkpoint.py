@@ -158,6 +158,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _check_config(path: Path, saved: dict[str, Any], config: DreamerConfig) -> None:
     current = json.loads(json.dumps(dataclasses.asdict(config)))
+    # A field that is newer than the checkpoint had the value that is now its default.
+    saved = {**json.loads(json.dumps(dataclasses.asdict(DreamerConfig()))), **saved}
     names = sorted(set(saved) | set(current))
     changed = [f"{n}: saved {saved.get(n)}, now {current.get(n)}" for n in names if saved.get(n) != current.get(n)]
     if changed:

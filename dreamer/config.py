@@ -38,6 +38,8 @@ class DreamerConfig:
     """Patch side [pixel]."""
     patch_units: int = 32
     """Features of one patch."""
+    vector_layers: int = 3
+    """Layers of the encoder and of the decoder of vector observations."""
     reward_layers: int = 1
     """Layers of the reward head."""
     continue_layers: int = 1
@@ -97,7 +99,7 @@ class DreamerConfig:
     rep_scale: float = 0.1
     """Weight of the representation loss."""
     recon_scale: float = 1.0
-    """Weight of the image loss."""
+    """Weight of the loss of each reconstruction, images and vectors."""
     reward_scale: float = 1.0
     """Weight of the reward loss."""
     continue_scale: float = 1.0

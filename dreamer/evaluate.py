@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer import agent as agents
+from dreamer import seeds, spaces
 from dreamer.config import DreamerConfig
 from dreamer.types import FunctionalEnv, Params
 
@@ -30,29 +31,33 @@ def evaluate(
     Args:
         env: vector environment.
         config: sizes.
-        params: of the agent.
-        key: consumed.
+        params: of the agent, or of several with a seed axis in front.
+        key: consumed; all seeds meet the same starts.
         episodes: how many; rounds of `env.num_envs`, the last one cut to its first instances.
         mode: act deterministically, as on the vehicle.
         max_steps: a round ends here even if an instance has not finished.
 
     Returns:
-        Arrays (episodes,): return, length [steps], finished, and every metric of the environment on the last frame.
+        Arrays (episodes,), or (S, episodes) of S seeds: return, length [steps], finished, and every metric of the
+        environment on the last frame.
 
     Raises:
         ValueError: episodes is not positive.
     """
     if episodes < 1:
         raise ValueError(f"episodes = {episodes}: it must be at least 1. Pass a positive number.")
-    play = _compiled(env, config, mode, max_steps)
+    play = _compiled(env, config, mode, max_steps, bool(seeds.count(params)))
     keys = jax.random.split(key, -(-episodes // env.num_envs))
     rounds = [jax.device_get(play(params, round_key)) for round_key in keys]
-    return {name: np.concatenate([result[name] for result in rounds])[:episodes] for name in rounds[0]}
+    return {name: np.concatenate([result[name] for result in rounds], -1)[..., :episodes] for name in rounds[0]}
 
 
 @lru_cache(maxsize=8)
-def _compiled(env: FunctionalEnv, config: DreamerConfig, mode: bool, max_steps: int) -> Any:
-    return jax.jit(lambda params, key: play_round(env, config, params, key, mode, max_steps))
+def _compiled(env: FunctionalEnv, config: DreamerConfig, mode: bool, max_steps: int, several: bool) -> Any:
+    def play(params: Params, key: jax.Array) -> dict[str, jax.Array]:
+        return play_round(env, config, params, key, mode, max_steps)
+
+    return jax.jit(jax.vmap(play, in_axes=(0, None)) if several else play)
 
 
 def play_round(
@@ -68,7 +73,7 @@ def play_round(
         "finished": zeros.astype(bool),
         **{name: zeros for name in transition.metrics},
     }
-    carry = agents.init_carry(config, env.num_envs, env.action_dim)
+    carry, actions = agents.init_carry(config, env.num_envs, env.action_dim), spaces.actions(env.action_dim)
 
     def running(loop: tuple) -> jax.Array:
         return (loop[0] < max_steps) & ~jnp.all(loop[-1]["finished"])
@@ -77,8 +82,7 @@ def play_round(
         step, env_state, transition, carry, result = loop
         step_key = jax.random.fold_in(run_key, step)
         carry, action = agents.act(config, params, carry, transition.obs, transition.is_first, step_key, mode)
-        action = jnp.clip(action, -1.0, 1.0)
-        env_state, transition = env.step(env_state, action)
+        env_state, transition = env.step(env_state, actions.to_env(action))
         active = ~result["finished"]
         ends = active & transition.is_last
         new = {

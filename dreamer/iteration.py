@@ -12,7 +12,7 @@ from flax import struct
 from jax.sharding import Mesh
 
 from dreamer import agent as agents
-from dreamer import image, parallel, replay
+from dreamer import parallel, replay, sensors, spaces
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch, Replay
@@ -43,21 +43,22 @@ class TrainState:
     """(N,) int32 steps of the running episodes."""
 
 
-def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int) -> TrainState:
+def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array) -> TrainState:
     """State before the first step.
 
     Raises:
-        ValueError: image or replay do not fit.
+        ValueError: observation, action or replay do not fit.
     """
-    image.check_shape(config, env.obs_shape)
+    sensors.check(config, env.obs_shape)
     agent_key, env_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state, transition = env.reset(env_key)
+    spaces.check(env.obs_shape, transition.obs, env.num_envs)
     return TrainState(
         agent=agents.init_agent(config, env.obs_shape, env.action_dim, agent_key),
         env_state=env_state,
         transition=transition,
         carry=agents.init_carry(config, env.num_envs, env.action_dim),
-        replay=replay.init(config, env.num_envs, env.obs_shape, env.action_dim),
+        replay=replay.init(config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width),
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
         credit=jnp.zeros((), jnp.int32),
@@ -103,11 +104,12 @@ def collect(
     policy_key, random_key = jax.random.split(key)
     frame = state.transition
     carry, action = agents.act(config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key)
-    random_action = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
+    actions = spaces.actions(env.action_dim)
+    random_action = actions.random(random_key, action.shape[:1])
     action = jnp.where(state.env_steps < config.learning_starts, random_action, action)
     latent = Latent(carry["deter"], carry["stoch"])
     memory = replay.write(config, state.replay, frame, action, latent)
-    env_state, transition = env.step(state.env_state, jnp.clip(action, -1.0, 1.0))
+    env_state, transition = env.step(state.env_state, actions.to_env(action))
     begun = transition.is_first
     episode_return = jnp.where(begun, 0.0, state.episode_return) + transition.reward
     episode_length = jnp.where(begun, 0, state.episode_length + 1)

@@ -9,14 +9,17 @@ marks that.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from dreamer import distributions as dist
+from dreamer import spaces
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent
+from dreamer.spaces import ObsShape
 from dreamer.types import Transition
 
 
@@ -24,8 +27,8 @@ from dreamer.types import Transition
 class Replay:
     """The memory, with L rows."""
 
-    obs: jax.Array
-    """(L, N, H, W, C) uint8."""
+    obs: Any
+    """(L, N, H, W, C) uint8 images, (L, N, D) float32 vectors, as the environment names them."""
     reward: jax.Array
     """(L, N) float32."""
     is_first: jax.Array
@@ -33,7 +36,7 @@ class Replay:
     is_last: jax.Array
     is_terminal: jax.Array
     action: jax.Array
-    """(L, N, A) float32 taken after the frame."""
+    """(L, N, A) float32 taken after the frame; one-hot where it is a class."""
     deter: jax.Array
     """(L, N, D) in the compute type, refreshed by the updates."""
     stoch: jax.Array
@@ -48,8 +51,8 @@ class Replay:
 class Batch:
     """T steps of B sequences, T leading."""
 
-    obs: jax.Array
-    """(T, B, H, W, C) uint8."""
+    obs: Any
+    """(T, B, H, W, C) uint8 images, (T, B, D) float32 vectors."""
     prev_action: jax.Array
     """(T, B, A) action taken before the frame."""
     reward: jax.Array
@@ -88,16 +91,16 @@ def rows_for(config: DreamerConfig, num_envs: int) -> int:
     return rows
 
 
-def init(config: DreamerConfig, num_envs: int, obs_shape: tuple[int, int, int], action_dim: int) -> Replay:
-    """An empty memory."""
+def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int) -> Replay:
+    """An empty memory for actions of so many numbers."""
     shape = (rows_for(config, num_envs), num_envs)
     return Replay(
-        obs=jnp.zeros((*shape, *obs_shape), jnp.uint8),
+        obs=spaces.zeros(obs_shape, shape),
         reward=jnp.zeros(shape, jnp.float32),
         is_first=jnp.zeros(shape, bool),
         is_last=jnp.zeros(shape, bool),
         is_terminal=jnp.zeros(shape, bool),
-        action=jnp.zeros((*shape, action_dim), jnp.float32),
+        action=jnp.zeros((*shape, action_width), jnp.float32),
         deter=jnp.zeros((*shape, config.deter), config.dtype),
         stoch=jnp.zeros((*shape, config.stoch), jnp.uint8),
         written=jnp.zeros((), jnp.int32),
@@ -127,7 +130,7 @@ def write(config: DreamerConfig, replay: Replay, transition: Transition, action:
 
     return dataclasses.replace(
         replay,
-        obs=put(replay.obs, transition.obs),
+        obs=jax.tree.map(put, replay.obs, transition.obs),
         reward=put(replay.reward, transition.reward),
         is_first=put(replay.is_first, transition.is_first),
         is_last=put(replay.is_last, transition.is_last),
@@ -184,7 +187,7 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
     index = take(replay.stoch, context).astype(jnp.int32)
     stoch = dist.one_hot(index, config.classes).reshape(index.shape[0], -1).astype(replay.deter.dtype)
     return Batch(
-        obs=take(replay.obs, trained),
+        obs=jax.tree.map(lambda memory: take(memory, trained), replay.obs),
         prev_action=take(replay.action, window.row[:-1]),
         reward=take(replay.reward, trained),
         is_first=take(replay.is_first, trained),

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dreamer import checkpoint, parallel
+from dreamer import checkpoint, parallel, seeds
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
@@ -68,7 +68,8 @@ class Meter:
     def read(self, config: DreamerConfig, steps_per_iter: int) -> dict[str, float]:
         """Means since the last reading, and rates; starts anew."""
         fetched = jax.device_get(self._sums)
-        sums = {name: float(np.sum([x[name] for x in fetched])) for name in fetched[0]} if fetched else {}
+        # Several seeds: their mean.
+        sums = {name: float(np.sum([np.mean(x[name]) for x in fetched])) for name in fetched[0]} if fetched else {}
         now = time.monotonic()
         seconds, self._since = max(now - self._since, 1e-9), now
         updates, episodes = sums.pop("updates", 0.0), sums.pop("episodes", 0.0)
@@ -96,7 +97,7 @@ def train(
     config: DreamerConfig,
     out: Path | str,
     total_steps: int,
-    seed: int,
+    seed: int | Sequence[int],
     *,
     eval_fn: EvalFn | None = None,
     eval_every: int = 10_000,
@@ -106,6 +107,7 @@ def train(
     progress: bool = True,
     on_metrics: MetricsFn | None = None,
     stop: StopFn | None = None,
+    time_limit_s: float | None = None,
     devices: Sequence[jax.Device] = (),
 ) -> TrainResult:
     """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
@@ -118,7 +120,8 @@ def train(
         config: hyperparameters.
         out: folder of the run.
         total_steps: when to stop; a resumed run may get more.
-        seed: of everything random.
+        seed: of everything random. Several make one program of as many runs: steps then count those of one run,
+            figures are means over the runs, and parameters have a seed axis in front.
         eval_fn: (params, env_steps) -> figures, logged as eval/...
         eval_every: control steps between evaluations; one more happens at the end.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
@@ -128,6 +131,7 @@ def train(
         on_metrics: called with every logged line.
         stop: called with every logged line that holds an evaluation; True ends the run there. With several processes
             it must come to the same answer in each.
+        time_limit_s: end after this call has taken so long [s], as if interrupted; a later call goes on.
         devices: over which instances and batches are split, those of all processes; none takes the first one.
 
     Raises:
@@ -136,12 +140,17 @@ def train(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
+    if mesh is not None and not isinstance(seed, int):
+        raise ValueError(f"seed = {seed}: several seeds run in one program on one device. Give one, or no devices.")
     state, wall_before = _first_state(env, config, out, seed, resume, mesh)
     began = time.monotonic()
     steps_per_iter = env.num_envs * config.steps_per_iter
     env_steps = int(state.env_steps)
     log = _Log(out / "metrics.jsonl", env_steps, on_metrics)
-    iterate = compile_iteration(env, config, state, mesh)
+    if isinstance(seed, int):
+        iterate = compile_iteration(env, config, state, mesh)
+    else:
+        iterate = seeds.compile_iterations(env, config, state)
     bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
     meter, saved_at = Meter(), time.monotonic()
 
@@ -177,6 +186,7 @@ def train(
             due = now - saved_at >= checkpoint_every_s
             if jax.process_count() > 1:
                 due = iterations % AGREE_EVERY == 0 and parallel.agree(due)
+            stopped = stopped or (time_limit_s is not None and parallel.agree(now - began > time_limit_s))
             if finished or stopped or due:
                 save_state(out, state, config, wall_s())
                 saved_at = time.monotonic()
@@ -193,25 +203,25 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     """Write a checkpoint of the whole run; of the replay only what is filled."""
     rows = state.replay.reward.shape[0]
     used = max(1, min(rows, int(state.replay.written)))
-    folder = out / "checkpoints"
-    path = checkpoint.save(folder, state, config, int(state.env_steps), wall_s, rows=("replay.", used, rows))
+    filled = ("replay.", used, rows) if state.replay.reward.ndim == 2 else None  # of several seeds all is written
+    path = checkpoint.save(out / "checkpoints", state, config, int(state.env_steps), wall_s, rows=filled)
     parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
     return path
 
 
 def _first_state(
-    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int, resume: bool, mesh: Mesh | None
+    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int | Sequence[int], resume: bool, mesh: Mesh | None
 ) -> tuple[TrainState, float]:
     """State to start from and the time [s] already spent."""
     if resume and checkpoint.complete(out / "checkpoints"):
-        template = jax.jit(lambda: init_state(env, config, seed))()
+        template = _init(env, config, seed, None)()
         restored = checkpoint.restore(out / "checkpoints", template, config)
         if restored is not None:
             state = restored[0]
             if mesh is not None:
                 state = parallel.place(state, parallel.state_shardings(mesh, state, env.num_envs))
             return state, float(restored[1]["wall_s"])
-    state = compile_init(env, config, seed, mesh)()
+    state = _init(env, config, seed, mesh)()
     if not parallel.is_first_process():
         return state, 0.0
     if not resume:
@@ -219,6 +229,13 @@ def _first_state(
             checkpoint.remove(path)
     _write_atomically(out / "config.json", json.dumps({**asdict(config), "seed": seed}, indent=1) + "\n")
     return state, 0.0
+
+
+def _init(env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], mesh: Mesh | None) -> Any:
+    """The compiled first state, () -> state."""
+    if isinstance(seed, int):
+        return compile_init(env, config, seed, mesh)
+    return jax.jit(lambda: seeds.init_states(env, config, seed))
 
 
 def _headline(line: dict[str, Any]) -> dict[str, str]:

@@ -9,6 +9,8 @@ from typing import Any
 import jax
 from flax import struct
 
+from dreamer.spaces import ActionSpec, ObsShape
+
 EnvState = Any
 Params = dict[str, Any]
 Carry = dict[str, jax.Array]
@@ -19,8 +21,8 @@ Carry = dict[str, jax.Array]
 class Transition:
     """What N environment instances emit at one control step."""
 
-    obs: jax.Array
-    """(N, H, W, C) uint8 image."""
+    obs: Any
+    """(N, H, W, C) uint8 image, (N, D) float32 vector, or a dict of them."""
     reward: jax.Array
     """(N,) float32, earned by the action that led to this frame; 0 on the first frame."""
     is_first: jax.Array
@@ -33,17 +35,17 @@ class Transition:
     """(N,) floats that are only watched, read on the last frame of an episode."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FunctionalEnv:
-    """A vector environment as two pure functions. Compared by identity of the functions, so it can be static."""
+    """A vector environment as two pure functions. Compared by identity, so it can be static."""
 
     num_envs: int
     """Instances N."""
-    obs_shape: tuple[int, int, int]
-    """(H, W, C) of one image."""
-    action_dim: int
-    """A, each component in [-1, 1]."""
+    obs_shape: ObsShape
+    """(H, W, C) of one image, (D,) of one vector, or a dict of them by name."""
+    action_dim: ActionSpec
+    """A, each component in [-1, 1]; or Discrete(n)."""
     reset: Callable[[jax.Array], tuple[EnvState, Transition]]
     """key -> state and first frames."""
     step: Callable[[EnvState, jax.Array], tuple[EnvState, Transition]]
-    """state, action (N, A) in [-1, 1] -> state and next frames."""
+    """state, action -> state and next frames; actions are (N, A) in [-1, 1], or classes (N,) int32."""

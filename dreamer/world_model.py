@@ -6,21 +6,22 @@ import jax
 import jax.numpy as jnp
 
 from dreamer import distributions as dist
-from dreamer import image, nets, rssm
+from dreamer import nets, rssm, sensors
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch
 from dreamer.rssm import Latent
+from dreamer.spaces import ObsShape
 from dreamer.types import Params
 
 
-def init(config: DreamerConfig, obs_shape: tuple[int, int, int], action_dim: int, key: jax.Array) -> Params:
+def init(config: DreamerConfig, obs_shape: ObsShape, action_width: int, key: jax.Array) -> Params:
     """Parameters named enc, dyn, dec, reward and continue."""
     keys = jax.random.split(key, 5)
     features = config.deter + config.stoch_size
     return {
-        "enc": image.init_encoder(config, obs_shape, keys[0]),
-        "dyn": rssm.init(config, image.token_size(config, obs_shape), action_dim, keys[1]),
-        "dec": image.init_decoder(config, obs_shape, keys[2]),
+        "enc": sensors.init_encoder(config, obs_shape, keys[0]),
+        "dyn": rssm.init(config, sensors.token_size(config, obs_shape), action_width, keys[1]),
+        "dec": sensors.init_decoder(config, obs_shape, keys[2]),
         "reward": init_head(config, keys[3], features, config.reward_layers, config.bins, outscale=0.0),
         "continue": init_head(config, keys[4], features, config.continue_layers, 1),
     }
@@ -78,7 +79,7 @@ def loss(
         key: consumed by the latents' samples.
     """
     steps = batch.reward.shape
-    tokens = image.encode(config, params["enc"], batch.obs)
+    tokens = sensors.encode(config, params["enc"], batch.obs)
     uniform = jax.random.uniform(key, (*steps, config.stoch))
     latent, post = rssm.observe(
         config, params["dyn"], batch.start, batch.prev_action, tokens, batch.is_first, uniform
@@ -86,9 +87,7 @@ def loss(
     prior = rssm.prior_probs(config, params["dyn"], latent.deter)
     dyn, rep = kl_losses(config, post, prior)
     features = latent.features()
-    flat = Latent(latent.deter.reshape(-1, config.deter), latent.stoch.reshape(-1, config.stoch_size))
-    frames = batch.obs.reshape(-1, *batch.obs.shape[2:])
-    recon = image.reconstruction_loss(config, params["dec"], flat.deter, flat.stoch, frames).reshape(steps)
+    recon = sensors.reconstruction_losses(config, params["dec"], latent, batch.obs)
     reward_logits = head(params["reward"], features)
     reward = dist.cross_entropy(reward_logits, dist.twohot(batch.reward, config.bins))
     continue_logit = head(params["continue"], features)[..., 0]
@@ -96,7 +95,7 @@ def loss(
     losses = {
         "dyn": config.dyn_scale * dyn,
         "rep": config.rep_scale * rep,
-        "recon": config.recon_scale * recon,
+        **{name: config.recon_scale * error for name, error in recon.items()},
         "reward": config.reward_scale * reward,
         "continue": config.continue_scale * continuation,
     }

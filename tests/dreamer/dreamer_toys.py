@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer.config import DreamerConfig, preset
+from dreamer.spaces import Discrete
 from dreamer.types import FunctionalEnv, Transition
 
 SHAPE = (16, 16, 3)
@@ -117,3 +119,29 @@ def counting_env(num_envs: int, limits: tuple[int, ...]) -> FunctionalEnv:
         return ToyState(new.key, new.place, new.count, transition.is_last), transition
 
     return FunctionalEnv(num_envs, SHAPE, 2, reset, step)
+
+
+def choice_env(num_envs: int, length: int = 3, limit: int = 10) -> FunctionalEnv:
+    """The corridor with three classes (back, stay, on), seen as an image, its own place and a distance at once."""
+    plain = corridor_env(num_envs, length, limit)
+
+    def dressed(state: ToyState, transition: Transition) -> Transition:
+        place = state.place.astype(jnp.float32)
+        senses = {"place": jax.nn.one_hot(state.place, length + 1), "range": 50.0 * place[:, None]}
+        return dataclasses.replace(transition, obs={"camera": transition.obs, **senses})
+
+    def reset(key: jax.Array) -> tuple[ToyState, Transition]:
+        state, transition = plain.reset(key)
+        return state, dressed(state, transition)
+
+    def step(state: ToyState, action: jax.Array) -> tuple[ToyState, Transition]:
+        here = state.place
+        state, transition = plain.step(state, (action[:, None] - 1).astype(jnp.float32))
+        moved = action != 1  # standing still is to the corridor a step back
+        stays = ~moved & ~transition.is_first
+        state = dataclasses.replace(state, place=jnp.where(stays, here, state.place))
+        level = dataclasses.replace(transition, obs=shade(state.place / length))
+        return state, dressed(state, level)
+
+    shapes = {"camera": SHAPE, "place": (length + 1,), "range": (1,)}
+    return FunctionalEnv(num_envs, shapes, Discrete(3), reset, step)

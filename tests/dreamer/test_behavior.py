@@ -7,6 +7,7 @@ import pytest
 from dreamer_toys import SHAPE, tiny_config
 
 from dreamer import agent, behavior, rssm, world_model
+from dreamer import distributions as dist
 from dreamer.behavior import ReturnNorm
 
 CONFIG = tiny_config(imag_horizon=15)
@@ -121,7 +122,8 @@ def test_a_bandit_in_imagination_moves_the_policy_towards_what_pays(paying):
 
     def loss(mean):
         means = jnp.full((1, 4096, 1), mean)
-        return jnp.mean(behavior.actor_loss(CONFIG, means, jnp.ones_like(means), action[:1], returns, weight))
+        log_prob = dist.normal_log_prob(means, jnp.ones_like(means), action[:1])
+        return jnp.mean(behavior.actor_loss(CONFIG, log_prob, jnp.zeros_like(log_prob), returns, weight))
 
     # d log pi / d mean = a, the advantage is +-a: the gradient is -+ weight * E[a^2], with the root's weight 0.5.
     assert float(jax.grad(loss)(0.0)) == pytest.approx(-0.5 * paying, abs=0.05)
@@ -130,8 +132,11 @@ def test_a_bandit_in_imagination_moves_the_policy_towards_what_pays(paying):
 def test_entropy_alone_widens_the_policy():
     std = jnp.full((1, 8, 1), 0.5)
     zeros, ones = jnp.zeros((1, 8)), jnp.ones((1, 8))
-    mean = jnp.zeros((1, 8, 1))
-    gradient = jax.grad(lambda s: jnp.sum(behavior.actor_loss(CONFIG, mean, s, mean, zeros, ones)))(std)
+
+    def loss(std):
+        return jnp.sum(behavior.actor_loss(CONFIG, zeros, dist.normal_entropy(std), zeros, ones))
+
+    gradient = jax.grad(loss)(std)
     np.testing.assert_allclose(gradient, -CONFIG.entropy_scale / 0.5, rtol=1e-5)
 
 

@@ -1,0 +1,88 @@
+"""Encoder and decoder of a whole observation: its images through `image`, its vectors through small MLPs.
+
+Parameters of the image layers lie flat, those of the vectors under the name `vector`; either may be absent.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dreamer import distributions as dist
+from dreamer import image, nets
+from dreamer.config import DreamerConfig
+from dreamer.rssm import Latent
+from dreamer.spaces import ObsShape, image_of, image_shape, vector_of, vector_size
+from dreamer.types import Params
+
+
+def check(config: DreamerConfig, obs_shape: ObsShape) -> None:
+    """Raise ValueError where the observation does not fit the layers."""
+    pixels = image_shape(obs_shape)
+    if pixels:
+        image.check_shape(config, pixels)
+
+
+def token_size(config: DreamerConfig, obs_shape: ObsShape) -> int:
+    """Width E of the encoder's output."""
+    pixels = image_shape(obs_shape)
+    return (image.token_size(config, pixels) if pixels else 0) + (config.units if vector_size(obs_shape) else 0)
+
+
+def init_encoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> Params:
+    """Parameters of `encode`."""
+    pixels, width = image_shape(obs_shape), vector_size(obs_shape)
+    params = image.init_encoder(config, pixels, key) if pixels else {}
+    if width:
+        params["vector"] = nets.init_mlp(jax.random.fold_in(key, 1), width, config.units, config.vector_layers)
+    return params
+
+
+def encode(config: DreamerConfig, params: Params, obs: Any) -> jax.Array:
+    """Tokens (..., E) of an observation with any leading axes. Vectors are squeezed by symlog first."""
+    pixels, vector = image_of(obs), vector_of(obs)
+    tokens = [] if pixels is None else [image.encode(config, params, pixels)]
+    if vector is not None:
+        tokens.append(nets.mlp(params["vector"], dist.symlog(vector).astype(config.dtype)))
+    return tokens[0] if len(tokens) == 1 else jnp.concatenate(tokens, -1)
+
+
+def init_decoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> Params:
+    """Parameters of `reconstruction_losses`."""
+    pixels, width = image_shape(obs_shape), vector_size(obs_shape)
+    params = image.init_decoder(config, pixels, key) if pixels else {}
+    if width:
+        mlp_key, out_key = jax.random.split(jax.random.fold_in(key, 1))
+        params["vector"] = {
+            **nets.init_mlp(mlp_key, config.deter + config.stoch_size, config.units, config.vector_layers),
+            "out": nets.init_linear(out_key, config.units, width),
+        }
+    return params
+
+
+def decode_vector(params: Params, features: jax.Array) -> jax.Array:
+    """Predicted symlog of the vectors (..., D) float32 from features (..., F)."""
+    return nets.linear(params["vector"]["out"], nets.mlp(params["vector"], features)).astype(jnp.float32)
+
+
+def reconstruction_losses(config: DreamerConfig, params: Params, latent: Latent, obs: Any) -> dict[str, jax.Array]:
+    """Squared errors (...) by name: `recon` summed over the pixels, `recon_vector` over the symlogs of all vectors.
+
+    Args:
+        config: sizes.
+        params: from `init_decoder`.
+        latent: states (..., D).
+        obs: observation with the same leading axes.
+    """
+    pixels, vector, batch = image_of(obs), vector_of(obs), latent.deter.shape[:-1]
+    losses = {}
+    if pixels is not None:
+        flat = Latent(latent.deter.reshape(-1, config.deter), latent.stoch.reshape(-1, config.stoch_size))
+        frames = pixels.reshape(-1, *pixels.shape[-3:])
+        losses["recon"] = image.reconstruction_loss(config, params, flat.deter, flat.stoch, frames).reshape(batch)
+    if vector is not None:
+        error = decode_vector(params, latent.features()) - dist.symlog(vector)
+        losses["recon_vector"] = jnp.sum(jnp.square(error), -1)
+    return losses
