@@ -111,6 +111,8 @@ class DreamerConfig:
     """Learning rate. Small networks on small budgets like more, such as 3e-4."""
     warmup: int = 1000
     """Updates over which the learning rate rises linearly."""
+    lr_decay: int = 0
+    """Updates by which it has fallen linearly to a twentieth, for runs of known length; 0 keeps it."""
     agc: float = 0.3
     """Adaptive clipping: largest update norm relative to the parameter norm, per tensor."""
     agc_min_norm: float = 1e-3
@@ -136,6 +138,7 @@ class DreamerConfig:
             (2 <= self.classes <= 256, "classes", "must lie in 2..256: indices are stored as bytes"),
             (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
+            (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
             (self.batch_length >= 2, "batch_length", "must be at least 2"),
             (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),
             (self.steps_per_iter >= 1, "steps_per_iter", "must be at least 1"),

@@ -36,8 +36,12 @@ def clip_adaptively(gradient: jax.Array, param: jax.Array, clip: float, min_norm
 
 
 def learning_rate(config: DreamerConfig, count: jax.Array) -> jax.Array:
-    """() rate of the update after `count` updates: 0 at first, full after the warm-up."""
-    return config.lr * jnp.minimum(1.0, count / max(config.warmup, 1) if config.warmup else 1.0)
+    """() rate of the update after `count` updates: 0 at first, full after the warm-up, and falling from there."""
+    rate = config.lr * jnp.minimum(1.0, count / max(config.warmup, 1) if config.warmup else 1.0)
+    if config.lr_decay:
+        fallen = jnp.clip((count - config.warmup) / (config.lr_decay - config.warmup), 0.0, 1.0)
+        rate = rate * (1.0 - 0.95 * fallen)
+    return rate
 
 
 def update(config: DreamerConfig, params: Params, gradients: Params, state: OptState) -> tuple[Params, OptState]:

@@ -148,3 +148,12 @@ def test_the_learning_rate_rises_linearly_and_then_stays():
     config = DreamerConfig(lr=1.0, warmup=10)
     rates = [float(optim.learning_rate(config, jnp.array(count))) for count in (0, 5, 10, 100)]
     np.testing.assert_allclose(rates, [0.0, 0.5, 1.0, 1.0], rtol=1e-6)
+
+
+@pytest.mark.quick
+def test_the_learning_rate_falls_to_a_twentieth_where_the_length_of_the_run_is_known():
+    config = DreamerConfig(lr=1.0, warmup=10, lr_decay=110)
+    rates = [float(optim.learning_rate(config, jnp.array(count))) for count in (5, 10, 60, 110, 500)]
+    np.testing.assert_allclose(rates, [0.5, 1.0, 0.525, 0.05, 0.05], rtol=1e-6)
+    with pytest.raises(ValueError, match="lr_decay"):
+        DreamerConfig(warmup=10, lr_decay=10)
