@@ -1,6 +1,7 @@
 """The obstacle course: trainings with every seed shown, and the planner that is their ceiling.
 
     python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
+    python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
     python -m benchmarks.course planner
 """
@@ -8,6 +9,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import statistics
 from pathlib import Path
@@ -17,7 +19,10 @@ import jax
 import numpy as np
 
 from benchmarks.harness import RESULTS, device_name, figure, record
-from whill_mjx.train import TrainOptions, main
+from dreamer.evaluate import evaluate
+from dreamer.train import train
+from whill_mjx.train import TrainOptions, main, mean_figures
+from whill_mjx.training import find_preset, functional_env, make_training_env
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
 
@@ -32,6 +37,56 @@ def run(options: argparse.Namespace) -> None:
     )  # fmt: skip
     note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed}
     (options.out / "course.json").write_text(json.dumps({**note, **result}, indent=1) + "\n")
+
+
+def together(options: argparse.Namespace) -> None:
+    """Several seeds side by side in one program, without what the main command does besides; OUT/seed_N each.
+
+    The time is that of all of them, so it says nothing of one run's.
+    """
+    preset = find_preset(options.preset, "obstacle_course")
+    task = dataclasses.replace(preset.task, layout=options.layout)
+    steps = options.steps or preset.total_steps
+    rows = min(preset.learner.replay_capacity, steps + 2 * preset.instances)
+    learner = dataclasses.replace(preset.learner, replay_capacity=rows)
+    vehicle = options.vehicle or "whill_cr_ramp"
+    held_out = functional_env(make_training_env(task, vehicle, preset.eval_episodes), shaped=False)
+
+    def evaluation(params: Any, number: int, episodes: int) -> list[dict[str, float]]:
+        found = evaluate(held_out, learner, params, jax.random.key(number), episodes)
+        return [mean_figures({name: value[i] for name, value in found.items()}) for i in range(len(options.seeds))]
+
+    def inside(params: Any, env_steps: int) -> dict[str, float]:
+        each = evaluation(params, 77, preset.eval_episodes)
+        print(env_steps, " ".join(f"{one['return']:.0f} ({one['success']:.0%})" for one in each), flush=True)
+        return {f"{name}_{seed}": value for seed, one in zip(options.seeds, each, strict=True)
+                for name, value in one.items()}
+
+    env = functional_env(make_training_env(task, vehicle, preset.instances))
+    result = train(env, learner, options.out, steps, tuple(options.seeds), eval_fn=inside, eval_every=preset.eval_every,
+                   progress=False, time_limit_s=60 * options.minutes if options.minutes else None)
+    if result.env_steps < steps:
+        print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
+        return
+    lines = [json.loads(line) for line in (options.out / "metrics.jsonl").read_text().splitlines()]
+    last = evaluation(result.agent.params, 1077, 1000)
+    for seed, policy in zip(options.seeds, last, strict=True):
+        folder = options.out / f"seed_{seed}"
+        folder.mkdir(exist_ok=True)
+        mine = [_of_seed(line, seed) for line in lines]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in mine))
+        note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": seed,
+                "together": len(options.seeds), "task": dataclasses.asdict(task), "policy": policy}
+        (folder / "course.json").write_text(json.dumps(note, indent=1) + "\n")
+        print(seed, policy, flush=True)
+
+
+def _of_seed(line: dict[str, Any], seed: int) -> dict[str, Any]:
+    """A logged line with the evaluation of one seed alone."""
+    ending = f"_{seed}"
+    own = {name.removesuffix(ending): value for name, value in line.items()
+           if name.startswith("eval/") and name.endswith(ending)}
+    return {**{name: value for name, value in line.items() if not name.startswith("eval/")}, **own}
 
 
 def collect(options: argparse.Namespace) -> None:
@@ -91,12 +146,13 @@ def paper_figures(runs: list[dict[str, Any]], layout: str) -> dict[str, Any]:
     arrivals = [m["eval/arrival_s"] for ms in late for m in ms if "eval/arrival_s" in m]
     suffix = "" if layout == "randomised" else "_fixed"
     arrival = {f"arrival_s_at_18000{suffix}": figure(arrivals, "s", device)} if arrivals else {}  # none: never arrived
+    alone = [training_s(one) for one in runs if "together" not in one]
     return {
         **arrival,
         f"return_at_18000_median{suffix}": figure(returns, "-", device),
         f"return_at_18000_worst{suffix}": {**figure(returns, "-", device), "value": min(returns)},
         f"success_at_22000{suffix}": figure([one["policy"]["success"] for one in runs], "share", device),
-        f"wallclock_s{suffix}": figure([training_s(one) for one in runs], "s", device),
+        **({f"wallclock_s{suffix}": figure(alone, "s", device)} if alone else {}),
     }
 
 
@@ -172,6 +228,15 @@ def parse() -> argparse.Namespace:
     one.add_argument("--vehicle", type=Path)
     one.add_argument("--steps", type=int)
     one.set_defaults(call=run)
+    side = commands.add_parser("together")
+    side.add_argument("--out", type=Path, required=True)
+    side.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    side.add_argument("--preset", default="paper")
+    side.add_argument("--layout", default="randomised")
+    side.add_argument("--vehicle", type=Path)
+    side.add_argument("--steps", type=int)
+    side.add_argument("--minutes", type=float, help="stop by then; the same command goes on")
+    side.set_defaults(call=together)
     several = commands.add_parser("collect")
     several.add_argument("--runs", type=Path, nargs="+", required=True)
     several.set_defaults(call=collect)

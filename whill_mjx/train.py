@@ -233,7 +233,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trai
 
     def evaluate(params: Any, env_steps: int) -> dict[str, float]:
         episodes = jax.device_get(ends(params))
-        return _figures({**episodes, "return": episodes["episode_return"]})
+        return mean_figures({**episodes, "return": episodes["episode_return"]})
 
     return Trained(*train_ppo(
         functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
@@ -248,12 +248,12 @@ def evaluation_of(batch: BatchEnv, preset: Preset, seed: int):
     env = functional_env(batch, preset.safety, shaped=False)
 
     def run(params: Any, env_steps: int) -> dict[str, float]:
-        return _figures(evaluate(env, preset.learner, params, jax.random.key(seed + 77), batch.count))
+        return mean_figures(evaluate(env, preset.learner, params, jax.random.key(seed + 77), batch.count))
 
     return run
 
 
-def _figures(episodes: dict[str, np.ndarray]) -> dict[str, float]:
+def mean_figures(episodes: dict[str, np.ndarray]) -> dict[str, float]:
     """Means of an evaluation inside the run."""
     success = np.asarray(episodes["success"]) > 0.5
     figures = {name: float(np.mean(episodes[name])) for name in ("return", "success", "collision", "timeout")}
