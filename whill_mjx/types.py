@@ -81,6 +81,10 @@ class Motion:
     spin: jax.Array  # (2,) speed of the driven wheels, left and right [rad/s]
     drive_torque: jax.Array  # (2,) motor torque on the driven wheels [N m]; zero for the paper's drive
     wheel_inertia: jax.Array  # () spin inertia of the driven wheels of one side [kg m^2]
+    total_mass: jax.Array  # () kg, with payload
+    com: jax.Array  # (3,) centre of mass with payload, chassis frame [m]
+    yaw_inertia: jax.Array  # () about that centre of mass [kg m^2]
+    others: Wrench  # all other forces on the chassis, for effects that react to them (effects/planar.py)
     wheel_radius: float = struct.field(pytree_node=False)  # nominal [m]
     track: float = struct.field(pytree_node=False)  # nominal [m]
     dt: float = struct.field(pytree_node=False)  # physics step [s]

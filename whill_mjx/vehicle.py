@@ -85,8 +85,10 @@ def forces(
     target = wheel_speeds(command, model.spec.track)
     memory, signal = apply_chain(effects, memory, "actuation", _no_drive(target), motion)
     motion = dataclasses.replace(motion, drive_torque=signal.torque)
-    memory, wrench = sum_forces(effects, memory, motion)
+    memory, wrench = sum_forces(effects, memory, motion, reacts=False)
     wrench = wrench + contact_wrench(motion, side_forces(motion, signal.force), jnp.zeros(4), motion.normal_force)
+    memory, reaction = sum_forces(effects, memory, dataclasses.replace(motion, others=wrench), reacts=True)
+    wrench = wrench + reaction
     return memory, generalised_force(motion, wrench), motion
 
 
@@ -102,7 +104,7 @@ def integrate(
 
     data = model.data.replace(qpos=state.qpos, qvel=state.qvel, qfrc_applied=force)
     data = mjx.step(instance_model(model, params, world), data)
-    return data.qpos, data.qvel
+    return rigid.moved(state.qpos, (state.qvel + data.qvel) / 2, model.config.physics_dt), data.qvel
 
 
 def mass_distribution(
@@ -179,6 +181,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         return axis[0] * point_velocity[0] + axis[1] * point_velocity[1] + axis[2] * point_velocity[2]
 
     forward, left, normal = under.contact_axes
+    mass, inertia, com = mass_distribution(model, params, world)
     stiffness, damping = suspension(params.body.mass)
     smooth = SMOOTH_LOAD * params.body.mass * GRAVITY / 4  # [N]
     load = stiffness * (spec.wheel_radius - under.height) - damping * along(normal)
@@ -198,6 +201,10 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         spin=state.qvel[6:8],
         drive_torque=jnp.zeros(2),
         wheel_inertia=jnp.asarray(spec.wheel_inertia),
+        total_mass=mass,
+        com=com,
+        yaw_inertia=inertia[2],
+        others=Wrench.zero(),
         wheel_radius=spec.wheel_radius,
         track=spec.track,
         dt=model.config.physics_dt,
@@ -227,11 +234,12 @@ def advance_odometry(odometry: Odometry, spin: jax.Array, model: VehicleModel) -
     radius, track, dt = model.spec.wheel_radius, model.spec.track, model.config.physics_dt
     v = radius * (spin[0] + spin[1]) / 2
     omega = radius * (spin[1] - spin[0]) / track
-    middle = odometry.yaw + omega * dt / 2
+    mean_v, turn = (odometry.v + v) / 2, (odometry.omega + omega) / 2 * dt
+    middle = odometry.yaw + turn / 2
     return Odometry(
-        x=odometry.x + v * jnp.cos(middle) * dt,
-        y=odometry.y + v * jnp.sin(middle) * dt,
-        yaw=odometry.yaw + omega * dt,
+        x=odometry.x + mean_v * jnp.cos(middle) * dt,
+        y=odometry.y + mean_v * jnp.sin(middle) * dt,
+        yaw=odometry.yaw + turn,
         v=v,
         omega=omega,
     )

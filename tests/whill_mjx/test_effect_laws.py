@@ -183,7 +183,7 @@ def test_one_smaller_wheel_rolls_slower_and_the_nominal_radius_stays():
     assert motion.wheel_radius == 0.1325
     _, wrench = make_effect("rolling_contact", grip=1.0).force((), motion)
     spin = motion.spin + wrench.spin_torque * DT / motion.wheel_inertia
-    np.testing.assert_allclose(spin, [0.5 / 0.1325, 0.5 / 0.1325 / 0.98], rtol=1e-4)
+    np.testing.assert_allclose(spin, [0.5 / 0.1325, 0.5 / 0.1325 / 0.98], rtol=1e-3)
 
 
 @quick

@@ -4,7 +4,7 @@ An effect is a frozen pytree whose leaves are its own parameters. It acts at one
 
     command(memory, command (2,), motion)   -> memory, command     delay, dead zone, limiter
     actuation(memory, Drive, motion)        -> memory, Drive       controller, lag, saturation
-    force(memory, motion)                   -> memory, Wrench      friction, slip, drag
+    force(memory, motion)                   -> memory, Wrench      friction, slip, drag; what reacts comes last
     world(memory, World)                    -> memory, World       slope, ground, true geometry
     sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
 
@@ -32,6 +32,8 @@ class Effect:
     """Usual values on a real vehicle by parameter, lowest and highest."""
     source: ClassVar[str] = ""
     """Where equation and usual values come from; "estimate" where no source is known."""
+    reacts: ClassVar[bool] = False
+    """Of place `force`: it depends on the drive and on all other forces (`motion.others`), and so acts after them."""
     room_fixed: ClassVar[bool] = False
     """Whether the motion depends on where in the room the vehicle starts and which way it faces."""
 
@@ -57,12 +59,12 @@ def apply_chain(effects: tuple, memory: tuple, place: str, value: Any, *context:
     return tuple(memory_list), value
 
 
-def sum_forces(effects: tuple, memory: tuple, motion: Motion) -> tuple[tuple, Wrench]:
-    """Sum of the wrenches of all effects of place `force`, and the new memory."""
+def sum_forces(effects: tuple, memory: tuple, motion: Motion, reacts: bool) -> tuple[tuple, Wrench]:
+    """Sum of the wrenches of the effects of place `force` that react, or of those that do not; and the new memory."""
     memory_list = list(memory)
     total = Wrench.zero()
     for index, effect in enumerate(effects):
-        if place_of(effect) == "force":
+        if place_of(effect) == "force" and effect.reacts == reacts:
             memory_list[index], wrench = effect.force(memory_list[index], motion)
             total = total + wrench
     return tuple(memory_list), total
@@ -94,6 +96,16 @@ def per_side(values: jax.Array) -> jax.Array:
 def to_contacts(values: jax.Array) -> jax.Array:
     """Values (2,) of the left and right side at each of the four contacts (4,)."""
     return jnp.stack([values[0], values[1], values[0], values[1]])
+
+
+def per_axle(values: jax.Array) -> jax.Array:
+    """Sums (2,) over the rear and the front contacts of values (4,)."""
+    return jnp.stack([values[0] + values[1], values[2] + values[3]])
+
+
+def to_axles(values: jax.Array) -> jax.Array:
+    """Values (2,) of the rear and the front axle at each of the four contacts (4,)."""
+    return jnp.stack([values[0], values[0], values[1], values[1]])
 
 
 def driven_mean(motion: Motion, values: jax.Array) -> jax.Array:

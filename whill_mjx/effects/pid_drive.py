@@ -8,7 +8,8 @@ import jax
 from flax import struct
 
 from whill_mjx.control import PidMemory, pid, pid_memory
-from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.effects.base import Effect
+from whill_mjx.effects.planar import look_ahead
 from whill_mjx.types import Drive, Motion, Wrench, parameter
 
 
@@ -54,17 +55,18 @@ class ForwardSlip(Effect):
 class RollingContact(Effect):
     """Driven wheels roll without slip: the torque that makes their speed that of the ground after one step.
 
-    The paper's model has no wheel-spin state; with this effect its wheels follow the body, one physics step late.
+    The paper's model has no wheel-spin state; with this effect its wheels follow the body.
     `grip` = 0 is neutral (the wheels are left alone), 1 is rolling without slip.
     """
 
     name = "rolling_contact"
+    reacts = True
     typical = {"grip": (1.0, 1.0)}
     source = "definition of the paper's model, which has no wheel speeds"
     grip: jax.Array = parameter("-", 0.0, 1.0, 0.0, "share of the speed difference removed in one step")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench with a torque on the driven wheels only."""
-        ground_speed = driven_mean(motion, motion.contact_vx) / motion.world.geometry.wheel_radius
+        ground_speed = look_ahead(motion).forward / motion.world.geometry.wheel_radius
         torque = self.grip * motion.wheel_inertia * (ground_speed - motion.spin) / motion.dt
         return memory, replace(Wrench.zero(), spin_torque=torque)

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect, contact_wrench, per_side, to_contacts
+from whill_mjx.effects.base import Effect, contact_wrench, per_axle, per_side, to_axles, to_contacts
+from whill_mjx.effects.planar import held, look_ahead
 from whill_mjx.types import Motion, Wrench, parameter
 
 ROUNDS = 2  # of the implicit step
 TINY = 1e-6  # [N], keeps the ratio defined where nothing grips
-GRAVITY = 9.81  # [m/s^2]
 
 
 @struct.dataclass
@@ -21,13 +21,13 @@ class SlipTraction(Effect):
     """Slip force of driven wheels, on a friction circle: F = mu N q / sqrt(1 + |q|^2), q = (s_x / s0, s_y / s0_y).
 
     s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact; s0 and s0_y are the sliding speeds along
-    and across the wheel at which the force has 1/sqrt(2) of its limit. The wheel gets the reaction -r F_x. The stiff
-    wheel speed is advanced implicitly: F is taken at the speed the wheel will have after the step, so that any s0 is
-    stable at any step. Sideways sliding is advanced explicitly, so s0_y has a floor of dt mu g. Passive wheels roll:
-    they carry `mu_free` N sideways only.
+    and across the wheel at which the force has 1/sqrt(2) of its limit. The wheel gets the reaction -r F_x. Both
+    are advanced implicitly: F is taken at the speeds that wheels and chassis will have after the step, so that any s0
+    and s0_y are stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
     """
 
     name = "slip_traction"
+    reacts = True
     typical = {"mu": (0.2, 0.9), "slip_speed": (0.005, 0.1), "side_slip_speed": (0.02, 0.1), "mu_free": (0.0, 0.1)}
     source = "estimate: 0.6 to 0.9 dry, 0.2 to 0.4 wet"
     mu: jax.Array = parameter("-", 0.05, 1.5, 0.0, "friction coefficient of driven wheels")
@@ -42,22 +42,25 @@ class SlipTraction(Effect):
         slide_x = to_contacts(radius * motion.spin) - motion.contact_vx
         slide_y = -motion.contact_vy
         grip = self.mu * motion.normal_force * geometry.driven
-        across = jnp.sqrt(self.side_slip_speed**2 + (motion.dt * self.mu * GRAVITY) ** 2)
+        carried = self.mu_free * motion.normal_force * (1 - geometry.driven)
         relaxation = motion.dt / motion.wheel_inertia
+        free_spin = motion.spin + relaxation * motion.drive_torque
+        ahead = look_ahead(motion)
         for _ in range(ROUNDS):
-            # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v_x), with C = mu N / (s0 sqrt(1 + |q|^2))
-            # taken at the sliding of the previous round.
-            share = grip / jnp.sqrt(1 + (slide_x / self.slip_speed) ** 2 + (slide_y / across) ** 2)  # [N]
+            # Forces of the form stiffness * sliding, the stiffness taken at the sliding of the previous round.
+            share = grip / jnp.sqrt(1 + (slide_x / self.slip_speed) ** 2 + (slide_y / self.side_slip_speed) ** 2)  # [N]
             stiffness = share / self.slip_speed  # [N s/m]
-            total, carried = per_side(stiffness), per_side(stiffness * motion.contact_vx)
-            torque = motion.drive_torque + radius * carried
-            spin = (motion.spin + relaxation * torque) / (1 + relaxation * radius**2 * total)
-            slide_x = to_contacts(radius * spin) - motion.contact_vx
-        forward, left = stiffness * slide_x, share * slide_y / across
+            sideways = share / self.side_slip_speed + carried / jnp.sqrt(slide_y**2 + self.side_slip_speed**2)
+            # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v'), put into the force C (r w' - v').
+            total = per_side(stiffness)
+            yielding = 1 + relaxation * radius**2 * total
+            forward, left = held(motion, ahead, total / yielding, radius * free_spin, per_axle(sideways))
+            spin = (free_spin + relaxation * radius * total * forward) / yielding
+            slide_x, slide_y = to_contacts(radius * spin - forward), -to_axles(left)
+        forward, left = stiffness * slide_x, share * slide_y / self.side_slip_speed
         # A wheel that a large torque spins up within the step would leave the friction circle.
         excess = jnp.maximum(1.0, jnp.sqrt(forward**2 + left**2 + TINY) / (grip + TINY))
         forward, left = forward / excess, left / excess
-        free = self.mu_free * motion.normal_force * (1 - geometry.driven)
-        left = left + free * slide_y / jnp.sqrt(slide_y**2 + across**2)
+        left = left + (sideways - share / self.side_slip_speed) * slide_y
         wrench = contact_wrench(motion, forward, left)
         return memory, replace(wrench, spin_torque=-radius * per_side(forward))

@@ -1,0 +1,95 @@
+"""The chassis on the ground as a rigid body in the plane: where it will be one step on.
+
+A wheel that grips is stiff: its force follows the speeds that wheel and chassis have after the step, not before it.
+Effects that react so (`Effect.reacts`) act last, when the sum of all other forces on the chassis is known.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.effects.base import driven_mean, per_axle, yaw_rate
+from whill_mjx.types import Motion
+
+
+@struct.dataclass
+class Ahead:
+    """Planar motion after one step under all forces but those of the wheels in question; chassis frame."""
+
+    forward: jax.Array  # (2,) speed of the driven contacts of the left and the right side [m/s]
+    left: jax.Array  # (2,) speed of the rear and the front contacts to the left [m/s]
+    arm_y: jax.Array  # (2,) of the left and right contacts, from the centre of mass to the left [m]
+    arm_x: jax.Array  # (2,) of the rear and front contacts, from the centre of mass forward [m]
+
+
+def look_ahead(motion: Motion) -> Ahead:
+    """Speeds of the contacts one physics step on, under `motion.others` and gravity.
+
+    m (v' + omega x v) = F and I omega' = T about the centre of mass, in the chassis frame; pitch and roll go on.
+    """
+    mass, com = motion.total_mass, motion.com
+    others, rate = motion.others, yaw_rate(motion)
+    gravity = motion.rotation.T @ motion.world.gravity
+    vx, vy = motion.velocity[0] - rate * com[1], motion.velocity[1] + rate * com[0]
+    ax = others.fx / mass + gravity[0] + rate * vy
+    ay = others.fy / mass + gravity[1] - rate * vx
+    turn = (others.tz - com[0] * others.fy + com[1] * others.fx) / motion.yaw_inertia
+    arm_y = motion.world.geometry.contact_y[:2] - com[1]
+    arm_x = motion.world.geometry.contact_x[1:3] - com[0]
+    return Ahead(
+        driven_mean(motion, motion.contact_vx) + motion.dt * (ax - turn * arm_y),
+        per_axle(motion.contact_vy) / 2 + motion.dt * (ay + turn * arm_x),
+        arm_y,
+        arm_x,
+    )
+
+
+def spin_response(motion: Motion) -> jax.Array:
+    """Spin acceleration per motor torque (2,) [1/(kg m^2)], of both wheels together and of one against the other.
+
+    The wheels roll without slip and turn the chassis about the driven axle, whose tyres hold it sideways.
+    """
+    driven = motion.world.geometry.driven
+    axle = (motion.world.geometry.contact_x * driven).sum() / driven.sum()
+    turning = motion.yaw_inertia + motion.total_mass * (motion.com[0] - axle) ** 2
+    carried = jnp.stack([motion.total_mass / 2, 2 * turning / motion.track**2])  # by one side's force [kg]
+    return 1 / (motion.wheel_inertia + motion.wheel_radius**2 * carried)
+
+
+def by_mode(values: jax.Array, factors: jax.Array) -> jax.Array:
+    """Values (2,) of the left and the right side, their mean times factors[0], their difference times factors[1]."""
+    together = (values[0] + values[1]) / 2 * factors[0]
+    against = (values[1] - values[0]) / 2 * factors[1]
+    return jnp.stack([together - against, together + against])
+
+
+def held(
+    motion: Motion, ahead: Ahead, grip: jax.Array, wanted: jax.Array, hold: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Speeds forward (2,) and left (2,) of `ahead` with the wheels' forces added, both taken after the step.
+
+    The wheels push with grip (wanted - forward) at each side and with -hold left at each axle: an implicit step, so
+    any stiffness is stable. Three equations, of which two are eliminated:
+
+        m dvx = dt sum F_side,  m dvy = dt sum F_axle,  I domega = dt (sum x F_axle - sum y F_side).
+
+    Args:
+        motion, ahead: the present motion, and `look_ahead` of it.
+        grip: (2,) of the left and right side [N s/m].
+        wanted: (2,) forward speed at which the wheels do not push [m/s].
+        hold: (2,) of the rear and front axle [N s/m].
+    """
+    pull, push = grip * (wanted - ahead.forward), -hold * ahead.left
+    inertia = motion.total_mass / motion.dt
+    along, across = inertia + grip.sum(), inertia + hold.sum()
+    along_turn, across_turn = -(grip * ahead.arm_y).sum(), (hold * ahead.arm_x).sum()
+    turn = motion.yaw_inertia / motion.dt + (grip * ahead.arm_y**2).sum() + (hold * ahead.arm_x**2).sum()
+    torque = (push * ahead.arm_x).sum() - (pull * ahead.arm_y).sum()
+    rate = (torque - along_turn / along * pull.sum() - across_turn / across * push.sum()) / (
+        turn - along_turn**2 / along - across_turn**2 / across
+    )
+    forward = (pull.sum() - along_turn * rate) / along
+    left = (push.sum() - across_turn * rate) / across
+    return ahead.forward + forward - rate * ahead.arm_y, ahead.left + left + rate * ahead.arm_x
