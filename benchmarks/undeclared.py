@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
-from sysid.close_loop import LoopConfig, close_loop, prepare
+from sysid.close_loop import LoopConfig, Prepared, close_loop, prepare
 from sysid.log import Log, load_log
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.report import make_report, write_run
@@ -46,13 +46,13 @@ class Benchmark:
     nulls: int = 0
     """Logs of the contact plant with nothing in them."""
     base: bool = False
-    """Logs of the contact plant with one effect each at its base size, of the catalogue and beyond it."""
+    """Logs of the contact plant with one effect each, from its base size to the one that is noticed with 80 % power."""
     scales: tuple[float, ...] = ()
-    """The same at multiples of the size that is noticed with 80 % power, which the base sizes tell."""
+    """The same at multiples of that size."""
     seeds: int = 1
     """Logs of each effect and multiple."""
     pairs: int = 0
-    """Logs with two effects of 4 times that size."""
+    """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     full: int = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -64,7 +64,7 @@ class Benchmark:
     work: Path = Path("runs/undeclared")
     """Folder for logs and verdicts."""
     part: str = "1/1"
-    """I/N: only every N-th log from the I-th on, for several processes."""
+    """I/N: only every N-th log or effect from the I-th on, for several processes."""
 
 
 def main(settings: Benchmark) -> None:
@@ -115,21 +115,28 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 
 def plant(settings: Benchmark) -> None:
     """Logs of the contact plant."""
-    work, config = settings.work / "plant", LoopConfig()
+    work, config, part = settings.work / "plant", LoopConfig(), settings.part
     days = contact.reference_days(work)
-    first, count = (int(one) for one in settings.part.split("/"))
-    ready = None
-    for later in (False, True):  # sizes of the later ones follow from the earlier ones
-        listed = (contact.jobs(work, 0, False, settings.scales, settings.seeds, settings.pairs) if later else
-                  contact.jobs(work, settings.nulls, settings.base, (), 0, 0))
+    ready: list[Prepared] = []
+
+    def judge(listed: Sequence[contact.Job]) -> None:
         for number, job in enumerate(listed):
-            if number % count != first - 1 or (work / "verdicts" / f"{job.label}.json").exists():
+            if (work / "verdicts" / f"{job.label}.json").exists():
                 continue
-            if ready is None:
-                ready = prepare(reference_of(days, config), days[0].spec, config)
-            one = contact.judge(job, ready, work, config, bool(job.effects) and number % settings.full == 0)
+            if not ready:
+                ready.append(prepare(reference_of(days, config), days[0].spec, config))
+            full = job.stage != "base" and bool(job.effects) and number % settings.full == 0
+            one = contact.judge(job, ready[0], work, config, full)
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
+
+    judge(contact.null_jobs(settings.nulls, part))
+    while settings.base and (listed := contact.probe_jobs(work, part)):
+        judge(listed)
+    if settings.scales:
+        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part))
+    if settings.pairs:
+        judge(contact.pair_jobs(work, settings.pairs, part))
     contact.figures(work)
 
 

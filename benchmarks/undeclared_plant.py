@@ -1,6 +1,6 @@
 """Verdicts of the closed loop on logs of the contact plant: which logs are driven, and what is counted.
 
-First every effect is driven at its base size; how far it stands out there gives the size at which it would be noticed
+First every effect is driven at its base size and then at others, until it stands out about as far as what is noticed
 with 80 % power. Logs at 2 and 4 times that size, and with pairs of effects, follow. What a log contains is written into
 a file beside it that the loop never reads.
 """
@@ -31,9 +31,12 @@ from sysid.report import write_report
 DAYS = 6
 POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
-SMALLEST = 0.05
-"""Of the base size, below which no size goes."""
-PAIRS = 10
+NEAR, FAR = (0.3, 3.0), (0.1, 10.0)
+"""How far an effect may stand out, of what 80 % power needs, where its size is taken for found, and at all used."""
+PROBES = 5
+"""Sizes at which an effect is driven at most."""
+REACH = 100.0
+"""Factor on the base size, up or down, beyond which no size is tried."""
 SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
     "command_scale": ("command_scale.linear", 1.0, 1.0),
     "drive_gain_difference": ("drive_gain_difference.difference", 0.0, 1.0),
@@ -71,42 +74,91 @@ def reference_days(work: Path) -> list[Log]:
     return days
 
 
-def jobs(work: Path, nulls: int, base: bool, scales: Sequence[float], seeds: int, pairs: int) -> list[Job]:
-    """All logs of a benchmark; those that are scaled need the verdicts at base size."""
-    out = [Job(f"null_{n:03d}", {}, 20000 + n) for n in range(nulls)]
-    names = sorted(EFFECTS)
-    if base:
-        out += [Job(f"{name}_base", {name: EFFECTS[name].base}, 30000 + 50 * i, stage="base")
-                for i, name in enumerate(names)]
-    sizes = power_sizes(work) if scales or pairs else {}
-    for i, name in enumerate(names):
-        for j, scale in enumerate(scales):
-            for seed in range(seeds):
-                if name in sizes:
-                    out.append(Job(f"{name}_x{scale:g}_{seed}", {name: scale * sizes[name]},
-                                   30001 + 50 * i + 10 * j + seed, scale, "scaled"))
-    known = [name for name in names if EFFECTS[name].known and name in sizes]
-    random = np.random.default_rng(7)
-    for n in range(pairs if len(known) > 1 else 0):
-        first, second = random.choice(known, 2, replace=False)
-        out.append(Job(f"pair_{n:02d}", {str(first): 4 * sizes[first], str(second): 4 * sizes[second]}, 60000 + n, 4.0,
-                       "pair"))
+def mine(number: int, part: str) -> bool:
+    """Whether the process I of N, `part` "I/N", has this log or effect."""
+    first, count = (int(one) for one in part.split("/"))
+    return number % count == first - 1
+
+
+def null_jobs(nulls: int, part: str) -> list[Job]:
+    """Logs with nothing in them."""
+    return [Job(f"null_{n:03d}", {}, 20000 + n) for n in range(nulls) if mine(n, part)]
+
+
+def probe_jobs(work: Path, part: str) -> list[Job]:
+    """The next log of each effect that brings its size nearer to where it would be noticed with 80 % power."""
+    out = []
+    for i, name in enumerate(sorted(EFFECTS)):
+        points = seen_at(work, name)
+        size = next_size(EFFECTS[name].base, points) if mine(i, part) else None
+        if size is not None:
+            label = f"{name}_probe_{len(points)}" if points else f"{name}_base"
+            out.append(Job(label, {name: size}, 30000 + 50 * i + 40 + len(points), stage="base"))
     return out
 
 
-def power_sizes(work: Path) -> dict[str, float]:
-    """Size of each effect that would be noticed with 80 % power, from how it stands out at its base size.
+def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str) -> list[Job]:
+    """Logs with one effect each, at multiples of that size."""
+    sizes = power_sizes(work)
+    return [Job(f"{name}_x{scale:g}_{seed}", {name: scale * sizes[name]}, 30001 + 50 * i + 10 * j + seed, scale,
+                "scaled")
+            for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part)
+            for j, scale in enumerate(scales) for seed in range(seeds)]
 
-    What stands out grows with the square of a small effect.
-    """
+
+def pair_jobs(work: Path, pairs: int, part: str) -> list[Job]:
+    """Logs with two effects each, at four times that size; the sizes of all effects must be there."""
+    sizes = power_sizes(work)
+    known = [name for name in sorted(EFFECTS) if EFFECTS[name].known and name in sizes]
+    random, out = np.random.default_rng(7), []
+    for n in range(pairs if len(known) > 1 else 0):
+        first, second = random.choice(known, 2, replace=False)
+        effects = {str(first): 4 * sizes[first], str(second): 4 * sizes[second]}
+        out.append(Job(f"pair_{n:02d}", effects, 60000 + n, 4.0, "pair"))
+    return [job for n, job in enumerate(out) if mine(n, part)]
+
+
+Point = tuple[float, float]
+"""Size of an effect, and how far it stood out there: 1 where 80 % would be noticed."""
+
+
+def seen_at(work: Path, name: str) -> list[Point]:
+    """The sizes at which an effect was driven to find its size, smallest first."""
+    points = []
+    for path in (work / "verdicts").glob(f"{name}_*.json"):
+        one = json.loads(path.read_text())
+        if one["stage"] == "base":
+            [size] = json.loads((work / "truth" / path.name).read_text()).values()
+            found = max(one["worth"] / one["worth_limit"], one["excess"][0] / one["excess_limit"], 0.01)
+            points.append((size, found / (1 + POWER / np.sqrt(one["worth_limit"])) ** 2))
+    return sorted(points)
+
+
+def next_size(base: float, points: Sequence[Point]) -> float | None:
+    """Where to drive an effect next; None where a size is close enough, or none is in reach."""
+    if not points:
+        return base
+    near = min(points, key=lambda point: abs(np.log(point[1])))
+    if NEAR[0] < near[1] < NEAR[1] or len(points) >= PROBES:
+        return None
+    below = [size for size, found in points if found < 1]
+    above = [size for size, found in points if found > 1]
+    if below and above and max(below) < min(above):
+        return float(np.sqrt(max(below) * min(above)))
+    size, found = max(points) if below else min(points)
+    size *= float(np.clip(found**-0.5, 1 / 8, 3.0))  # what stands out grows with the square of the size
+    return size if abs(np.log(size / base)) < np.log(REACH) else None
+
+
+def power_sizes(work: Path) -> dict[str, float]:
+    """Size of each effect that would be noticed with 80 % power; without those for which no such size was found."""
     sizes = {}
-    for name, entry in EFFECTS.items():
-        path = work / "verdicts" / f"{name}_base.json"
-        if path.exists():
-            one = json.loads(path.read_text())
-            found = max(one["worth"] / one["worth_limit"], one["excess"][0] / one["excess_limit"], 1e-9)
-            needed = (1 + POWER / np.sqrt(one["worth_limit"])) / np.sqrt(found)
-            sizes[name] = entry.base * float(np.clip(needed, SMALLEST, 4.0))
+    for name in EFFECTS:
+        points = seen_at(work, name)
+        if points:
+            size, found = min(points, key=lambda point: abs(np.log(point[1])))
+            if next_size(EFFECTS[name].base, points) is None and FAR[0] < found < FAR[1]:
+                sizes[name] = size * float(np.clip(found**-0.5, 0.5, 2.0))
     return sizes
 
 
@@ -166,10 +218,10 @@ def figures(work: Path) -> None:
     """Write benchmarks/results/undeclared.json from all verdicts in the work folder."""
     cases = list(read_cases(work))
     found = {**of_nulls([one for truth, one in cases if not truth])}
-    for scale in sorted({one["scale"] for truth, one in cases if truth and one["stage"] != "pair"}):
+    for scale in sorted({one["scale"] for _, one in cases if one["stage"] == "scaled"}):
         inside = [(next(iter(truth)), one) for truth, one in cases
-                  if truth and one["stage"] != "pair" and one["scale"] == scale]
-        found.update(of_singles(inside, f"_{scale:g}x" if scale else "_base"))
+                  if one["stage"] == "scaled" and one["scale"] == scale]
+        found.update(of_singles(inside, f"_{scale:g}x"))
     found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
     found.update(of_parameters(cases))
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]

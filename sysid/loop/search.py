@@ -35,6 +35,11 @@ class Thresholds:
     """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
     step: float = 0.15
     """Least further share of the excess that it explains."""
+    own: float = 0.5
+    """Least share of what the effects before it left that a smaller one must explain."""
+    agree: float = 0.3
+    """Largest relative change of its size, from a fit without the others, at which it is there for its own sake; its
+    gain may change by 1.5 times as much."""
     rounds: int = 3
     worthwhile: float = 0.15
     """Least scanned gain of an effect that is refitted, as a share of the best one's."""
@@ -61,6 +66,8 @@ class Candidate:
     """Family-wise, of that gain."""
     share: float
     refit: Refit
+    own: bool = False
+    """Small beside the first, but as large and as useful without it, and most of what the others left."""
 
 
 @dataclass
@@ -145,8 +152,12 @@ def search(
         candidates.sort(key=lambda one: -one.gain)
         found.rounds.append(candidates)
         likely = [one for one in candidates if one.p < thresholds.alpha]
-        if not likely or (found.accepted and likely[0].gain < thresholds.second * found.accepted[0].gain):
+        if not likely:
             break
+        if found.accepted:
+            likely[0].own = _own(likely[0], found, explained(current), refitter, thresholds)
+            if not likely[0].own and likely[0].gain < thresholds.second * found.accepted[0].gain:
+                break
         found.accepted.append(likely[0])
         found.classes.append(_class_of(likely[0], candidates, hypotheses, similar, thresholds))
         current = likely[0].refit
@@ -154,6 +165,23 @@ def search(
             break
     _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial)
     return found
+
+
+def _own(one: Candidate, found: Search, share: float, refitter: Refitter, thresholds: Thresholds) -> bool:
+    """Whether a further effect is there for its own sake, however small it is beside the first.
+
+    What mends the form of another effect depends on it: alone it is of another size, or gains far more or less. `share`
+    is what the effects before it explain.
+    """
+    if one.share - share < thresholds.own * (1 - share):
+        return False
+    q = one.refit.split[-1]
+    alone = next((other.refit for other in found.rounds[0] if other.hypothesis.key == one.hypothesis.key), None)
+    if alone is None:
+        [alone] = refitter.fit_all([Start((one.hypothesis,), found.base.u, q)], POLISH)
+    ratio = (found.base.cost - alone.cost) / one.gain
+    near = float(np.linalg.norm(alone.q - q)) <= thresholds.agree * float(np.linalg.norm(q))
+    return near and 1 / (1 + 1.5 * thresholds.agree) < ratio < 1 + 1.5 * thresholds.agree
 
 
 def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray], float]) -> float:
@@ -174,10 +202,13 @@ def _decide(
     """
     keep = found.accepted[:1]
     for one in found.accepted[1:]:
-        if one.share - keep[-1].share <= thresholds.step:
+        if not one.own and one.share - keep[-1].share <= thresholds.step:
             break  # what came after was fitted beside it
         keep.append(one)
-    found.accepted, found.classes = keep, found.classes[: len(keep)]
+    named = {one.hypothesis.effect for one in keep}
+    found.accepted = keep  # what is named beside an effect is told apart from it
+    found.classes = [[name for name in members if name == members[0] or name not in named]
+                     for members in found.classes[: len(keep)]]
     if keep:
         found.final, found.share = keep[-1].refit, keep[-1].share
     before, after = excess(found.base), excess(found.final)

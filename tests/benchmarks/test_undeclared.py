@@ -1,0 +1,60 @@
+"""How the benchmark of undeclared effects finds the size of an effect that is noticed with 80 % power."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+pytest.importorskip("mujoco")
+
+from benchmarks import undeclared_plant as contact  # noqa: E402
+
+LIMIT = 4.0
+
+
+def write(work, name, number, size, found):
+    """A verdict at one size, where the effect stands out `found` times as far as 80 % power needs."""
+    worth = LIMIT * found * (1 + contact.POWER / LIMIT**0.5) ** 2
+    one = {"stage": "base", "worth": worth, "worth_limit": LIMIT, "excess": [-1.0, 0.0], "excess_limit": 0.1}
+    for folder, content in (("verdicts", one), ("truth", {name: size})):
+        (work / folder).mkdir(exist_ok=True)
+        (work / folder / f"{name}_probe_{number}.json").write_text(json.dumps(content))
+
+
+def search(work, name, base, strength):
+    """Sizes tried until the search ends; `strength` is how far an effect of a size stands out."""
+    tried = []
+    while (size := contact.next_size(base, contact.seen_at(work, name))) is not None:
+        write(work, name, len(tried), size, strength(size))
+        tried.append(size)
+    return tried
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("factor", [0.05, 0.3, 1.0, 30.0])
+def test_the_size_of_an_effect_that_grows_linearly_is_found_from_any_base(tmp_path, factor):
+    name, right = "slope", 0.5
+    tried = search(tmp_path, name, right * factor, lambda size: (size / right) ** 2)
+    assert len(tried) <= contact.PROBES
+    assert contact.power_sizes(tmp_path)[name] == pytest.approx(right, rel=0.05)
+
+
+@pytest.mark.quick
+def test_the_size_of_an_effect_with_a_threshold_is_bracketed(tmp_path):
+    name = "command_dead_zone"
+    search(tmp_path, name, 0.1, lambda size: 0.02 + 4e3 * max(size - 0.02, 0.0) ** 2)  # 1 at 0.0357
+    assert 0.028 < contact.power_sizes(tmp_path)[name] < 0.045
+
+
+@pytest.mark.quick
+def test_an_effect_that_is_never_noticed_has_no_size(tmp_path):
+    assert 1 < len(search(tmp_path, "backlash", 0.1, lambda size: 0.02)) <= contact.PROBES
+    assert "backlash" not in contact.power_sizes(tmp_path)
+
+
+@pytest.mark.quick
+def test_every_log_belongs_to_one_process():
+    both = [[job.label for job in contact.null_jobs(7, part)] for part in ("1/2", "2/2")]
+    assert sorted(both[0] + both[1]) == [job.label for job in contact.null_jobs(7, "1/1")]
+    assert not set(both[0]) & set(both[1])
