@@ -1,8 +1,12 @@
-"""Physics: throughput with parameters different everywhere, kernels of one step, and the error of the time step.
+"""Physics: throughput with parameters different everywhere, what each effect costs, peers, and the time step's error.
 
     python -m benchmarks.physics [--instances 1024 32768 131072] [--dynamics fused]
-    python -m benchmarks.physics --parts kernels     # operations of one compiled step, closed form against mjx.step
     python -m benchmarks.physics --parts timestep    # a figure-eight against one of steps eight times smaller
+    python -m benchmarks.physics --parts effects     # each effect added alone to the physical model
+    python -m benchmarks.physics --parts peers       # mjx and C MuJoCo and MuJoCo Warp on a chair with wheel contacts
+    python -m benchmarks.physics --parts kernels     # operations of one compiled step, closed form against mjx.step
+
+The figures without a suffix are of "loaded": the physical base model with five more effects, one of each place.
 """
 
 from __future__ import annotations
@@ -10,6 +14,9 @@ from __future__ import annotations
 import argparse
 import re
 import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,22 +25,42 @@ import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
 from whill_mjx.config import VehicleConfig
+from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.kinematics import reference_pose
 from whill_mjx.manoeuvres import command_table
 from whill_mjx.model import VehicleModel, build_model
 from whill_mjx.presets import preset
-from whill_mjx.types import VehicleParams, VehicleState
+from whill_mjx.specs import VehicleSpec
+from whill_mjx.types import VehicleParams, VehicleState, parameters_of
 from whill_mjx.vehicle import drive, place
 
 CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
 SPREAD = 0.1  # relative spread of every parameter between instances
+BASE = "whill_cr_physical"
+LOADED = ("acceleration_limit", "actuator_lag", "dry_friction", "slope", "odometry_scale")
+DRIVES = ("pid_drive", "forward_slip", "rolling_contact", "unnamed")  # of the other base model, or not one effect
+DT = VehicleConfig().physics_dt
+
+
+def usual(name: str) -> Any:
+    """An effect three quarters up its usual values: not neutral."""
+    values = {field: about.high for field, about in parameters_of(EFFECTS[name]).items() if about.neutral == np.inf}
+    values |= {field: low + 0.75 * (high - low) for field, (low, high) in EFFECTS[name].typical.items()}
+    return make_effect(name, **values)
+
+
+def vehicle_of(name: str) -> tuple[VehicleSpec, VehicleParams]:
+    """A preset, "loaded", or "+EFFECT": the physical base model with that one effect."""
+    more = LOADED if name == "loaded" else (name[1:],) if name.startswith("+") else ()
+    spec, params = preset(BASE if more else name)
+    return spec, replace(params, effects=(*params.effects, *map(usual, more)))
 
 
 def random_instances(
     vehicle: str, count: int, dynamics: str = "fused"
 ) -> tuple[VehicleModel, VehicleParams, VehicleState]:
     """`count` vehicles at rest with every parameter spread by SPREAD."""
-    spec, params = preset(vehicle)
+    spec, params = vehicle_of(vehicle)
     model = build_model(spec, VehicleConfig(dynamics=dynamics))
     key = jax.random.key(0)
 
@@ -66,16 +93,59 @@ def compiled_roll(vehicle: str, count: int, periods: int, dynamics: str) -> tupl
 
 def measure(
     vehicle: str, count: int, periods: int, repeats: int, dynamics: str = "fused"
-) -> tuple[list[float], float, dict[str, float]]:
-    """Physics steps/s of each repeat, compile seconds, and a check of the end state."""
+) -> tuple[list[float], dict[str, float]]:
+    """Physics steps/s of each repeat; compile seconds, bytes per instance, and a check of the end state."""
     start = time.perf_counter()
     model, compiled, arguments = compiled_roll(vehicle, count, periods, dynamics)
-    compile_s = time.perf_counter() - start
+    about = {"compile_s": time.perf_counter() - start}
     end = compiled(*arguments)
     seconds = time_calls(lambda: compiled(*arguments), repeats)
     steps = count * periods * model.config.substeps
-    check = {"diverged": float(end.diverged.mean()), "farthest_m": float(jnp.abs(end.qpos[:, :2]).max())}
-    return [steps / second for second in seconds], compile_s, check
+    about |= {"diverged": float(end.diverged.mean()), "farthest_m": float(jnp.abs(end.qpos[:, :2]).max())}
+    about |= {f"{name}_bytes_per_instance": total / count for name, total in memory(compiled, arguments).items()}
+    return [steps / second for second in seconds], about
+
+
+def memory(compiled: Any, arguments: tuple) -> dict[str, float]:
+    """Bytes of the parameters, of the state, and of all that the compiled call holds beside the commands."""
+    params, states, commands = (sum(leaf.nbytes for leaf in jax.tree.leaves(part)) for part in arguments)
+    sizes = {"params": params, "state": states}
+    analysis = compiled.memory_analysis()
+    if analysis is not None:
+        held = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
+        sizes["all"] = held - commands
+    return sizes
+
+
+def record_effects(options: argparse.Namespace, on_cpu: bool) -> None:
+    """Print and record what each effect adds to a physics step of the physical base model."""
+    have = {effect.name for effect in preset(BASE)[1].effects}
+    names = options.effects or [name for name in EFFECTS if name not in {*have, *DRIVES}]
+    vehicles = [BASE, *(f"+{name}" for name in names), "loaded"]
+    count, periods = max(min(options.instances), 1024 if on_cpu else 32768), max(options.periods // 4, 1)
+    with ThreadPoolExecutor(2 if on_cpu else 8) as pool:
+        rolls = list(pool.map(lambda vehicle: compiled_roll(vehicle, count, periods, options.dynamics)[1:], vehicles))
+    steps = periods * VehicleConfig().substeps
+    seconds = {}
+    for vehicle, (compiled, arguments) in zip(vehicles, rolls, strict=True):
+        seconds[vehicle] = [one / steps for one in time_calls(partial(compiled, *arguments), options.repeats)]
+    base = float(np.median(seconds.pop(BASE)))
+    print(f"{BASE} at {count} instances: {base * 1e6:.1f} us per step")
+    figures = {"step_us_base": figure([base * 1e6], "us")}
+    for vehicle, times in seconds.items():
+        added = figure([(one - base) * 1e6 for one in times], "us")
+        name = vehicle.removeprefix("+")
+        figures[f"added_us_{name}"] = {**added, "instances": count, "share_of_base": added["value"] * 1e-6 / base}
+        print(f"  {name:26s} {added['value']:+8.1f} us, {added['value'] * 1e-4 / base:+6.1f} %")
+    record("physics", CLAIM, figures)
+
+
+def record_peers(options: argparse.Namespace, on_cpu: bool) -> None:
+    """Print and record the peers."""
+    from benchmarks.physics_peers import measure_peers
+
+    worlds = options.worlds or (64 if on_cpu else 8192)
+    record("physics", CLAIM, measure_peers(worlds, 20 if on_cpu else 100, min(options.repeats, 3)))
 
 
 def kernels_per_step(vehicle: str, dynamics: str) -> int:
@@ -138,15 +208,42 @@ def record_kernels(vehicle: str = "whill_cr_physical") -> None:
     record("physics", CLAIM, figures)
 
 
+def record_speed(options: argparse.Namespace, on_cpu: bool) -> None:
+    """Print and record steps/s for every instance count."""
+    figures = {"dt_s": figure([DT], "s")}
+    best: list[float] = []
+    for vehicle in options.vehicles:
+        suffix = "" if vehicle == "loaded" else f"_{vehicle.removeprefix('whill_cr_')}"
+        suffix += "" if options.dynamics == "fused" else f"_{options.dynamics}"
+        for count in options.instances:
+            rates, about = measure(vehicle, count, options.periods, options.repeats, options.dynamics)
+            entry = {**figure(rates, "physics steps/s"), "vehicle": vehicle, **about}
+            rounded = {name: float(f"{value:.3g}") for name, value in about.items()}
+            print(f"{vehicle:18s} {count:7d} instances: {entry['value'] / 1e6:8.2f} M steps/s, {rounded}")
+            if not on_cpu:
+                figures[f"steps_per_s_{count}{suffix}"] = entry
+                if count == 32768:
+                    figures[f"simulated_s_per_s_32768{suffix}"] = figure([r * DT for r in rates], "s/s")
+            elif suffix:
+                figures[f"cpu_steps_per_s_{count}{suffix}"] = entry
+            elif not best or entry["value"] > max(best):
+                best = rates
+                figures["cpu_steps_per_s"] = {**entry, "instances": count}
+    record("physics", CLAIM, figures)
+
+
 def main() -> None:
     """Print and record the parts asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     on_cpu = jax.devices()[0].platform == "cpu"
     parser.add_argument("--instances", type=int, nargs="+", default=[1024, 2048] if on_cpu else [1024, 32768, 131072])
-    parser.add_argument("--vehicles", nargs="+", default=["whill_cr_paper", "whill_cr_physical"])
+    parser.add_argument("--vehicles", nargs="+", default=["loaded", BASE, "whill_cr_paper"])
     parser.add_argument("--periods", type=int, default=5 if on_cpu else 20)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--parts", nargs="+", choices=("speed", "kernels", "timestep"), default=["speed"])
+    parser.add_argument("--parts", nargs="+", choices=("speed", "effects", "peers", "kernels", "timestep"),
+                        default=["speed"])  # fmt: skip
+    parser.add_argument("--effects", nargs="+", choices=sorted(EFFECTS), help="of the part effects; default: all")
+    parser.add_argument("--worlds", type=int, default=0, help="of the peers; default 8192, on a CPU 64")
     parser.add_argument("--dynamics", choices=("fused", "mjx"), default="fused")
     options = parser.parse_args()
     if "timestep" in options.parts:
@@ -155,30 +252,10 @@ def main() -> None:
         record_kernels()
     if "speed" in options.parts:
         record_speed(options, on_cpu)
-
-
-def record_speed(options: argparse.Namespace, on_cpu: bool) -> None:
-    """Print and record steps/s for every instance count."""
-    figures = {"dt_s": figure([0.005], "s")}
-    best: list[float] = []
-    for vehicle in options.vehicles:
-        suffix = "" if vehicle == "whill_cr_paper" else f"_{vehicle.removeprefix('whill_cr_')}"
-        suffix += "" if options.dynamics == "fused" else f"_{options.dynamics}"
-        for count in options.instances:
-            rates, compile_s, check = measure(vehicle, count, options.periods, options.repeats, options.dynamics)
-            entry = {**figure(rates, "physics steps/s"), "compile_s": compile_s, **check}
-            rate = entry["value"] / 1e6
-            print(f"{vehicle:18s} {count:7d} instances: {rate:8.2f} M steps/s, compile {compile_s:.1f} s, {check}")
-            if not on_cpu:
-                figures[f"steps_per_s_{count}{suffix}"] = entry
-                if count == 32768:
-                    figures[f"simulated_s_per_s_32768{suffix}"] = figure([r * 0.005 for r in rates], "s/s")
-            elif suffix:
-                figures[f"cpu_steps_per_s_{count}{suffix}"] = entry
-            elif not best or entry["value"] > max(best):
-                best = rates
-                figures["cpu_steps_per_s"] = {**entry, "instances": count}
-    record("physics", CLAIM, figures)
+    if "effects" in options.parts:
+        record_effects(options, on_cpu)
+    if "peers" in options.parts:
+        record_peers(options, on_cpu)
 
 
 if __name__ == "__main__":

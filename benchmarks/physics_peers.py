@@ -1,0 +1,131 @@
+"""Other simulators stepping a powered chair on wheel contacts (`benchmarks.plant.chair`), for `benchmarks.physics`.
+
+All peers step the same MuJoCo model: free chassis, two driven ellipsoid wheels, a pivoting front beam on two spheres,
+four contacts with elliptic cones. Every world has its own constant wheel torques. Each prints why it is left out.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from benchmarks.harness import device_name, figure, time_calls
+from benchmarks.plant.chair import Chair, build
+
+TORQUE = 3.0  # N m, largest on either wheel
+
+
+def contact_chair() -> tuple[mujoco.MjModel, mujoco.MjData, list[int]]:
+    """The chair's model, its state settled on its wheels, and the degrees of freedom of the two driven wheels."""
+    model = build(Chair())
+    data = mujoco.MjData(model)
+    for _ in range(round(1.0 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    return model, data, [int(model.joint(f"wheel_{side}").dofadr[0]) for side in ("left", "right")]
+
+
+def torques(model: mujoco.MjModel, wheels: list[int], worlds: int) -> np.ndarray:
+    """Generalised forces (worlds, nv), random and constant on the wheels."""
+    force = np.zeros((worlds, model.nv))
+    force[:, wheels] = np.random.default_rng(0).uniform(-TORQUE, TORQUE, (worlds, 2))
+    return force
+
+
+def mjx_rates(worlds: int, steps: int, repeats: int) -> tuple[list[float], dict[str, Any]]:
+    """Steps/s of `mjx.step` with its contact solver."""
+    from mujoco import mjx
+
+    model, data, wheels = contact_chair()
+    static = mjx.put_model(model, impl="jax")
+    start = mjx.put_data(model, data, impl="jax")
+    force = jnp.asarray(torques(model, wheels, worlds), jnp.float32)
+
+    def one(force: jax.Array) -> jax.Array:
+        begun = start.replace(qfrc_applied=force)
+        end = jax.lax.scan(lambda d, _: (mjx.step(static, d), None), begun, length=steps)[0]
+        return end.qpos
+
+    compiled = jax.jit(jax.vmap(one)).lower(force).compile()
+    seconds = time_calls(lambda: compiled(force), repeats)
+    finite = bool(jnp.isfinite(compiled(force)).all())
+    return [worlds * steps / one for one in seconds], {"worlds": worlds, "finite": finite}
+
+
+def c_rates(worlds: int, steps: int, repeats: int) -> tuple[list[float], dict[str, Any]]:
+    """Steps/s of C MuJoCo on all cores of the host."""
+    from mujoco import rollout
+
+    model, data, wheels = contact_chair()
+    cores = len(os.sched_getaffinity(0))
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    states = np.tile(state, (worlds, 1))
+    force = np.repeat(torques(model, wheels, worlds)[:, None], steps, axis=1)
+    workers = [mujoco.MjData(model) for _ in range(cores)]
+    rates = []
+    with rollout.Rollout(nthread=cores) as pool:
+
+        def call() -> np.ndarray:
+            return pool.rollout(model, workers, states, force, control_spec=mujoco.mjtState.mjSTATE_QFRC_APPLIED)[0]
+
+        end = call()
+        for _ in range(repeats):
+            began = time.perf_counter()
+            call()
+            rates.append(worlds * steps / (time.perf_counter() - began))
+    return rates, {"worlds": worlds, "cores": cores, "finite": bool(np.isfinite(end).all())}
+
+
+def warp_rates(worlds: int, steps: int, repeats: int) -> tuple[list[float], dict[str, Any]]:
+    """Steps/s of MuJoCo Warp, its step captured in one graph."""
+    import mujoco_warp as mjw
+    import warp as wp
+
+    if not wp.is_cuda_available():
+        raise ImportError("Warp finds no GPU")
+    model, data, wheels = contact_chair()
+    m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=worlds)
+    wp.copy(d.qfrc_applied, wp.array(torques(model, wheels, worlds).astype(np.float32), dtype=wp.float32))
+    mjw.step(m, d)
+    with wp.ScopedCapture() as capture:
+        mjw.step(m, d)
+    rates = []
+    for _ in range(repeats):
+        wp.synchronize()
+        began = time.perf_counter()
+        for _ in range(steps):
+            wp.capture_launch(capture.graph)
+        wp.synchronize()
+        rates.append(worlds * steps / (time.perf_counter() - began))
+    return rates, {"worlds": worlds, "finite": bool(np.isfinite(d.qpos.numpy()).all())}
+
+
+def measure_peers(worlds: int, steps: int, repeats: int) -> dict[str, dict[str, Any]]:
+    """Figures of all peers that run here."""
+    dt = build(Chair()).opt.timestep
+    host = f"cpu, {len(os.sched_getaffinity(0))} cores"
+    few = max(worlds // 16, 64)  # C MuJoCo's rate does not depend on it
+    peers: dict[str, tuple[Callable, int, str]] = {
+        "mjx_contact": (mjx_rates, worlds, device_name()),
+        "mujoco_c": (c_rates, few, device_name() if jax.devices()[0].platform == "cpu" else host),
+        "mujoco_warp": (warp_rates, worlds, device_name()),
+    }
+    figures = {}
+    for name, (rates_of, count, device) in peers.items():
+        try:
+            rates, about = rates_of(count, steps, repeats)
+        except (ImportError, NotImplementedError, ValueError, RuntimeError) as error:
+            print(f"peer {name}: left out, {type(error).__name__}: {error}")
+            continue
+        entry = {**figure(rates, "physics steps/s", device), "dt_s": dt, **about}
+        print(f"peer {name}: {entry['value'] / 1e6:.3f} M steps/s of {dt * 1e3:g} ms, "
+              f"{entry['value'] * dt:,.0f} simulated s/s, {about}")  # fmt: skip
+        figures[f"peer_{name}_steps_per_s"] = entry
+    return figures
