@@ -35,6 +35,7 @@ CLAIM = "DreamerV3 on tasks that are not ours; the curve of every seed, [environ
 TINY = dict(
     deter=128, hidden=64, units=64, stoch=8, classes=8, batch_size=8, batch_length=32, lr=1e-3, warmup=100,
     policy_layers=2, value_layers=2, vector_layers=2, imag_last=8, learning_starts=512,
+    patch=4, entropy_scale=3e-3, train_ratio=128.0,
 )  # fmt: skip
 """Upon the preset `cpu`: a network for minutes on a CPU."""
 

@@ -94,6 +94,16 @@ class DreamerConfig:
     """Rate of the running return percentiles."""
     return_percentiles: tuple[float, float] = (0.05, 0.95)
     """Percentiles whose distance scales the advantage."""
+    representation: Literal["reconstruct", "barlow"] = "reconstruct"
+    """What shapes the latents besides reward and continue: decoding the observation, or, without a decoder, agreement
+    with the encoder's tokens, dimension by dimension (R2-Dreamer, arXiv 2603.18202)."""
+    barlow_scale: float = 0.05
+    """Weight of that agreement."""
+    barlow_redundancy: float = 5e-4
+    """Weight within it of the correlations between different dimensions."""
+    decode_only: tuple[str, ...] = ()
+    """Names of observations that are targets of the decoder and never seen by the encoder, such as a simulator's depth
+    or the bearing of the goal; acting does not need them."""
     dyn_scale: float = 1.0
     """Weight of the dynamics loss."""
     rep_scale: float = 0.1
@@ -137,6 +147,8 @@ class DreamerConfig:
             (self.depth * self.mults[-1] % self.blocks == 0, "depth", "must give a last stage divisible by blocks"),
             (2 <= self.classes <= 256, "classes", "must lie in 2..256: indices are stored as bytes"),
             (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
+            (self.representation in ("reconstruct", "barlow"), "representation", "must be 'reconstruct' or 'barlow'"),
+            (self.representation != "barlow" or not self.decode_only, "decode_only", "must be () without a decoder"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
             (self.batch_length >= 2, "batch_length", "must be at least 2"),

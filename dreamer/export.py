@@ -114,7 +114,7 @@ def export_policy(
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
         (folder / "policy.onnx").write_bytes(model)
-        _save_arrays(folder / "weights.npz", flatten_weights(weights))
+        save_arrays(folder / "weights.npz", flatten_weights(weights))
         if stablehlo:
             (folder / "policy.stablehlo").write_bytes(_to_stablehlo(step, shapes, contract))
         vehicle_sha256 = contract.vehicle_sha256
@@ -124,7 +124,7 @@ def export_policy(
         description = _describe(contract, shapes, files, vehicle_sha256, parity)
         (folder / "policy.json").write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
         folder.chmod(0o755)
-        _replace_folder(folder, path)
+        replace_folder(folder, path)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return path
@@ -136,7 +136,7 @@ def flatten_weights(weights: Any) -> dict[str, np.ndarray]:
     return {"/".join(_key(part) for part in path) or "value": _plain(leaf) for path, leaf in leaves}
 
 
-def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a .npz by hand: np.savez takes names as keyword arguments, where "file" and others are taken."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
@@ -341,7 +341,7 @@ def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _replace_folder(new: Path, path: Path) -> None:
+def replace_folder(new: Path, path: Path) -> None:
     """Put `new` at `path`: a reader finds the old file, for an instant none, then the new one, never a mixture."""
     if not path.exists():
         os.replace(new, path)

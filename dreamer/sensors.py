@@ -5,6 +5,7 @@ Parameters of the image layers lie flat, those of the vectors under the name `ve
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -20,20 +21,36 @@ from dreamer.types import Params
 
 def check(config: DreamerConfig, obs_shape: ObsShape) -> None:
     """Raise ValueError where the observation does not fit the layers."""
-    pixels = image_shape(obs_shape)
-    if pixels:
-        image.check_shape(config, pixels)
+    for part in (obs_shape, visible(config, obs_shape)):
+        pixels = image_shape(part)
+        if pixels:
+            image.check_shape(config, pixels)
+    unknown = [name for name in config.decode_only if not isinstance(obs_shape, Mapping) or name not in obs_shape]
+    if unknown:
+        raise ValueError(
+            f"DreamerConfig.decode_only = {config.decode_only}: the environment shows no {', '.join(unknown)} "
+            f"(obs_shape = {obs_shape}). Correct the names."
+        )
+
+
+def visible(config: DreamerConfig, obs: Any) -> Any:
+    """What of an observation, or of its shapes, the encoder sees."""
+    if not isinstance(obs, Mapping):
+        return obs
+    return {name: value for name, value in obs.items() if name not in config.decode_only}
 
 
 def token_size(config: DreamerConfig, obs_shape: ObsShape) -> int:
     """Width E of the encoder's output."""
-    pixels = image_shape(obs_shape)
-    return (image.token_size(config, pixels) if pixels else 0) + (config.units if vector_size(obs_shape) else 0)
+    seen = visible(config, obs_shape)
+    pixels = image_shape(seen)
+    return (image.token_size(config, pixels) if pixels else 0) + (config.units if vector_size(seen) else 0)
 
 
 def init_encoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> Params:
     """Parameters of `encode`."""
-    pixels, width = image_shape(obs_shape), vector_size(obs_shape)
+    seen = visible(config, obs_shape)
+    pixels, width = image_shape(seen), vector_size(seen)
     params = image.init_encoder(config, pixels, key) if pixels else {}
     if width:
         params["vector"] = nets.init_mlp(jax.random.fold_in(key, 1), width, config.units, config.vector_layers)
@@ -42,7 +59,8 @@ def init_encoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> 
 
 def encode(config: DreamerConfig, params: Params, obs: Any) -> jax.Array:
     """Tokens (..., E) of an observation with any leading axes. Vectors are squeezed by symlog first."""
-    pixels, vector = image_of(obs), vector_of(obs)
+    seen = visible(config, obs)
+    pixels, vector = image_of(seen), vector_of(seen)
     tokens = [] if pixels is None else [image.encode(config, params, pixels)]
     if vector is not None:
         tokens.append(nets.mlp(params["vector"], dist.symlog(vector).astype(config.dtype)))
@@ -50,7 +68,10 @@ def encode(config: DreamerConfig, params: Params, obs: Any) -> jax.Array:
 
 
 def init_decoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> Params:
-    """Parameters of `reconstruction_losses`."""
+    """Parameters of `representation_losses`."""
+    if config.representation == "barlow":
+        features = config.deter + config.stoch_size
+        return {"project": nets.init_linear(key, features, token_size(config, obs_shape))}
     pixels, width = image_shape(obs_shape), vector_size(obs_shape)
     params = image.init_decoder(config, pixels, key) if pixels else {}
     if width:
@@ -65,6 +86,39 @@ def init_decoder(config: DreamerConfig, obs_shape: ObsShape, key: jax.Array) -> 
 def decode_vector(params: Params, features: jax.Array) -> jax.Array:
     """Predicted symlog of the vectors (..., D) float32 from features (..., F)."""
     return nets.linear(params["vector"]["out"], nets.mlp(params["vector"], features)).astype(jnp.float32)
+
+
+def representation_losses(
+    config: DreamerConfig, params: Params, latent: Latent, obs: Any, tokens: jax.Array
+) -> dict[str, jax.Array]:
+    """Weighted losses by name that make the latents hold what is observed.
+
+    Args:
+        config: sizes and weights.
+        params: from `init_decoder`.
+        latent: states (..., D).
+        obs: observation with the same leading axes.
+        tokens: (..., E) that the encoder made of it.
+    """
+    if config.representation == "barlow":
+        projected = nets.linear(params["project"], latent.features())
+        return {"barlow": config.barlow_scale * barlow_loss(projected, tokens, config.barlow_redundancy)}
+    losses = reconstruction_losses(config, params, latent, obs)
+    return {name: config.recon_scale * error for name, error in losses.items()}
+
+
+def barlow_loss(projected: jax.Array, tokens: jax.Array, redundancy: float) -> jax.Array:
+    """Distance () of the correlation matrix of (..., E) and (..., E) from the identity; the tokens get no gradient."""
+
+    def standard(x: jax.Array) -> jax.Array:
+        x = x.astype(jnp.float32).reshape(-1, x.shape[-1])
+        return (x - jnp.mean(x, 0)) / (jnp.std(x, 0) + 1e-4)
+
+    first, second = standard(projected), standard(jax.lax.stop_gradient(tokens))
+    correlation = first.T @ second / first.shape[0]
+    agreement = jnp.diagonal(correlation)
+    others = jnp.sum(jnp.square(correlation)) - jnp.sum(jnp.square(agreement))
+    return jnp.sum(jnp.square(agreement - 1.0)) + redundancy * others
 
 
 def reconstruction_losses(config: DreamerConfig, params: Params, latent: Latent, obs: Any) -> dict[str, jax.Array]:

@@ -87,7 +87,7 @@ def loss(
     prior = rssm.prior_probs(config, params["dyn"], latent.deter)
     dyn, rep = kl_losses(config, post, prior)
     features = latent.features()
-    recon = sensors.reconstruction_losses(config, params["dec"], latent, batch.obs)
+    represent = sensors.representation_losses(config, params["dec"], latent, batch.obs, tokens)
     reward_logits = head(params["reward"], features)
     reward = dist.cross_entropy(reward_logits, dist.twohot(batch.reward, config.bins))
     continue_logit = head(params["continue"], features)[..., 0]
@@ -95,7 +95,7 @@ def loss(
     losses = {
         "dyn": config.dyn_scale * dyn,
         "rep": config.rep_scale * rep,
-        **{name: config.recon_scale * error for name, error in recon.items()},
+        **represent,
         "reward": config.reward_scale * reward,
         "continue": config.continue_scale * continuation,
     }

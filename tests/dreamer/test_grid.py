@@ -21,6 +21,12 @@ def walk(room, actions):
     return steps
 
 
+def seen(step):
+    """Cells (row, column) of agent, key and door as far as the picture shows them."""
+    channels = np.moveaxis(step.obs["image"][:: grid_env.PIXELS, :: grid_env.PIXELS], -1, 0)
+    return np.array([cell for channel in channels for cell in np.argwhere(channel)])
+
+
 def room(**changes):
     start = dict(agent=jnp.array([0, 0]), key_place=jnp.array([0, 1]), door=jnp.array([1, 1]), has_key=jnp.array(False),
                  count=jnp.array(0), over=jnp.array(False), random=jax.random.PRNGKey(0))  # fmt: skip
@@ -28,17 +34,19 @@ def room(**changes):
 
 
 def test_the_key_pays_once_and_the_door_only_with_it():
-    steps = walk(room(), [1, 3, 2, 0, 3, 2, 3, 1])  # onto the door without the key, back for it, off, on, and to the door
+    steps = walk(room(), [1, 3, 2, 0, 3, 2, 3, 1])  # onto the door without the key, back for it, off, on, to the door
     rewards = [round(float(step.reward), 2) for step in steps]
     assert rewards == [-0.01, -0.01, -0.01, -0.01, 0.99, -0.01, -0.01, 0.99]
     assert [bool(step.is_terminal) for step in steps] == [False] * 7 + [True]
-    assert steps[3].obs["key"].argmax() == 1 and steps[4].obs["key"].sum() == 0  # taken
+    np.testing.assert_array_equal(seen(steps[3]), [[0, 0], [0, 1], [1, 1]])
+    np.testing.assert_array_equal(seen(steps[4]), [[0, 1], [1, 1]])  # the key is taken
+    assert [float(step.obs["holding"][0]) for step in steps] == [0, 0, 0, 0, 1, 1, 1, 1]
     assert steps[-1].metrics["success"] == 1.0
 
 
 def test_walls_hold_and_time_runs_out_without_a_terminal():
-    steps = walk(room(agent=jnp.array([4, 4]), count=jnp.array(grid_env.LIMIT - 2)), [1, 3, 0])
-    assert steps[0].obs["agent"].argmax() == grid_env.CELLS - 1
+    steps = walk(room(agent=jnp.array([3, 3]), count=jnp.array(grid_env.LIMIT - 2)), [1, 3, 0])
+    assert seen(steps[0])[0].tolist() == [3, 3]
     assert bool(steps[1].is_last) and not bool(steps[1].is_terminal)
     assert bool(steps[2].is_first) and float(steps[2].reward) == 0.0 and not bool(steps[2].is_last)
 
@@ -46,6 +54,7 @@ def test_walls_hold_and_time_runs_out_without_a_terminal():
 @pytest.mark.quick
 def test_agent_key_and_door_begin_in_different_cells():
     _, transition = jax.jit(grid_env.make(200).reset)(jax.random.PRNGKey(1))
-    places = np.stack([np.asarray(transition.obs[name]).argmax(-1) for name in ("agent", "key", "door")])
-    assert all(len(set(column)) == 3 for column in places.T)
-    assert len({tuple(column) for column in places.T}) > 150
+    image = np.asarray(transition.obs["image"]).reshape(200, -1, 3)
+    places = image.argmax(1)
+    assert all(len(set(row)) == 3 for row in places) and len({tuple(row) for row in places}) > 150
+    np.testing.assert_array_equal((image > 0).sum(1), grid_env.PIXELS**2)

@@ -13,7 +13,7 @@ from dreamer.train import evaluate, train
 
 ENV = grid_env.make(4)
 # Learning starts with the last of nine iterations: rounding, which grows with every update, has no time to.
-CONFIG = tiny_config(train_ratio=16.0, learning_starts=36, warmup=1)
+CONFIG = tiny_config(patch=4, train_ratio=16.0, learning_starts=36, warmup=1)
 QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
 SEEDS = (3, 5)
 

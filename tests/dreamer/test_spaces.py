@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dreamer_toys import SHAPE, choice_env, corridor_env, tiny_config
+from PIL import Image
 
-from dreamer import agent, behavior, checkpoint, iteration, nets, rssm, sensors, spaces
+from dreamer import agent, behavior, checkpoint, iteration, nets, rssm, sensors, spaces, video
 from dreamer import distributions as dist
 from dreamer.config import preset
 from dreamer.rssm import Latent
@@ -184,6 +185,29 @@ def test_a_corridor_with_classes_and_three_senses_is_learned_to_its_best_return(
     result = evaluate(choice_env(4), config, run.agent.params, jax.random.PRNGKey(1), 6)
     np.testing.assert_allclose(result["return"], np.full(6, 1.0 - 0.05 * 2), atol=1e-5)
     assert run.last_metrics["policy_certainty"] > 0.6 and run.last_metrics["loss_recon_vector"] < 1.0
+
+
+def test_what_follows_is_foreseen_from_the_first_frame_and_the_actions_alone(learned, tmp_path):
+    config, run = learned
+    params = run.agent.params
+    seen = jax.jit(lambda key: video.play(choice_env(6), config, params, key, 4))(jax.random.PRNGKey(4))
+    truth = np.asarray(seen["obs"]["camera"])
+    imagined = np.asarray(jax.jit(lambda: video.predict(config, params, seen, 1, KEY))())
+    moved = truth[-1, :, 0, 0, 0] > 100
+    assert moved.sum() >= 4
+    assert np.abs(imagined - truth / 255)[1:, moved].mean() < 0.1
+    still = {**seen, "prev_action": jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), seen["prev_action"].shape)}
+    back = np.asarray(jax.jit(lambda: video.predict(config, params, still, 1, KEY))())
+    assert back[-1, moved].mean() < 0.4 < truth[-1, moved].mean() / 255  # told that it went back, it imagines so
+    pictures = video.frames(truth, imagined, 1)
+    assert pictures.shape == (4, 48, 6 * 16, 3) and pictures[0, 16, 5].tolist() == [0, 255, 0]
+    np.testing.assert_array_equal(pictures[:, :16, :16], truth[:, 0])
+    for name in ("a.gif", "a.png"):
+        path = video.write(tmp_path / name, pictures)
+        with Image.open(path) as image:
+            assert image.size == (192, 96) and getattr(image, "n_frames", 1) == (4 if name == "a.gif" else 1)
+    with pytest.raises(ValueError, match="suffix"):
+        video.write(tmp_path / "a.mp4", pictures)
 
 
 def test_every_sense_is_stored_with_its_own_step_and_comes_back_from_the_checkpoint(learned):

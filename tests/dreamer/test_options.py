@@ -1,0 +1,73 @@
+"""Options that are off unless asked for: no decoder, and targets that only the decoder sees."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dreamer_toys import SHAPE, tiny_config
+
+from dreamer import agent, sensors
+from dreamer.config import DreamerConfig
+from dreamer.rssm import Latent
+
+KEY = jax.random.PRNGKey(0)
+CONFIG = tiny_config()
+SHAPES = {"camera": SHAPE, "depth": (16, 16, 1), "goal": (2,)}
+
+
+def shapes_of(config, obs_shape):
+    params = jax.eval_shape(lambda k: agent.init_params(config, obs_shape, 2, k), KEY)
+    return jax.tree.map(lambda leaf: leaf.shape, params)
+
+
+@pytest.mark.quick
+def test_agreement_is_nothing_where_every_dimension_is_its_own_copy_and_costs_one_where_it_is_not():
+    tokens = jnp.asarray(np.linalg.qr(np.random.default_rng(0).normal(size=(64, 5)) - 0.0)[0])
+    tokens = tokens - tokens.mean(0)
+    tokens = jnp.asarray(np.linalg.qr(np.asarray(tokens))[0], jnp.float32)  # centred and uncorrelated
+    assert float(sensors.barlow_loss(3.0 * tokens + 7.0, tokens, 5e-4)) == pytest.approx(0.0, abs=1e-4)
+    shuffled = jnp.roll(tokens, 1, -1)  # every dimension agrees with another one
+    assert float(sensors.barlow_loss(shuffled, tokens, 0.1)) == pytest.approx(5.0 + 0.1 * 5.0, rel=1e-3)
+    gradient = jax.grad(lambda t: sensors.barlow_loss(shuffled, t, 0.1))(tokens)
+    np.testing.assert_array_equal(gradient, 0.0)
+
+
+@pytest.mark.quick
+def test_without_a_decoder_there_are_no_parameters_of_one():
+    config = dataclasses.replace(CONFIG, representation="barlow")
+    with_decoder, without = shapes_of(CONFIG, SHAPE), shapes_of(config, SHAPE)
+    width = sensors.token_size(config, SHAPE)
+    assert set(without["dec"]) == {"project"} and without["dec"]["project"]["w"] == (config.deter + 16, width)
+    assert {k: v for k, v in without.items() if k != "dec"} == {k: v for k, v in with_decoder.items() if k != "dec"}
+    latent, tokens = Latent(jnp.zeros((3, 2, 32)), jnp.zeros((3, 2, 16))), jnp.ones((3, 2, width))
+    params = sensors.init_decoder(config, SHAPE, KEY)
+    assert set(sensors.representation_losses(config, params, latent, None, tokens)) == {"barlow"}
+
+
+@pytest.mark.quick
+def test_what_only_the_decoder_sees_changes_neither_the_encoder_nor_what_acting_needs():
+    config = dataclasses.replace(CONFIG, decode_only=("depth", "goal"))
+    plain, helped = shapes_of(CONFIG, SHAPE), shapes_of(config, SHAPES)
+    for part in ("enc", "dyn", "policy", "value", "reward", "continue"):
+        assert helped[part] == plain[part]
+    assert helped["dec"]["vector"]["out"]["w"][1] == 2
+    assert helped["dec"]["patch"]["w"][1] == plain["dec"]["patch"]["w"][1] * 4 // 3  # depth is a fourth channel
+    params = sensors.init_encoder(config, SHAPES, KEY)
+    camera = jnp.full((1, *SHAPE), 9, jnp.uint8)
+    both = {"camera": camera, "depth": jnp.ones((1, 16, 16, 1), jnp.uint8), "goal": jnp.ones((1, 2))}
+    np.testing.assert_array_equal(
+        sensors.encode(config, params, both), sensors.encode(config, params, {"camera": camera})
+    )
+    np.testing.assert_array_equal(sensors.encode(config, params, both), sensors.encode(config, params, camera))
+
+
+@pytest.mark.quick
+def test_targets_without_a_decoder_or_of_unknown_name_are_refused():
+    with pytest.raises(ValueError, match="decode_only"):
+        DreamerConfig(representation="barlow", decode_only=("depth",))
+    with pytest.raises(ValueError, match="shows no bearing"):
+        sensors.check(dataclasses.replace(CONFIG, decode_only=("bearing",)), SHAPES)
+    with pytest.raises(ValueError, match="there must be observations"):
+        sensors.check(dataclasses.replace(CONFIG, decode_only=("goal",)), {"goal": (2,)})
