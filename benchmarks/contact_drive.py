@@ -1,0 +1,67 @@
+"""How near the fitted vehicle drives to the contact plant: `python -m benchmarks.contact_drive [--seeds 2000 2001]`.
+
+The plant (`benchmarks.plant`, real wheel contacts, no code of ours) drives the reference paper's five manoeuvres, three
+times each with disturbances and sensor noise. The vehicle is fitted to them with one manoeuvre held out, then drives
+the same commands from the start pose alone. It is scored against the plant's drive without disturbances and noise:
+largest distance and heading difference at any time of any of the five, the held-out one among them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from benchmarks.plant.make import make_log
+from sysid.fit import FitConfig, fit_log, predict
+from sysid.log import Log, load_log
+
+CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
+FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
+
+
+def logs(seed: int, folder: Path) -> tuple[Log, Log]:
+    """One chair's drives as measured, and the same without disturbances and noise."""
+    measured = make_log(folder / "measured", seed=seed, manoeuvres=FIVE)
+    clean = make_log(folder / "clean", seed=seed, noise=0.0, manoeuvres=FIVE, replicates=1)
+    return load_log(measured), load_log(clean)
+
+
+def largest_errors(seed: int, iterations: int) -> dict[str, tuple[float, float]]:
+    """Largest distance [m] and heading difference [rad] of each manoeuvre."""
+    with tempfile.TemporaryDirectory() as folder:
+        measured, clean = logs(seed, Path(folder))
+    fit = fit_log(measured, FitConfig(iterations=iterations))
+    errors = {}
+    for trial, driven in zip(clean.trials, predict(fit, clean.trials)[1], strict=True):
+        true, ours = trial.ground_truth, driven.ground_truth
+        assert true is not None and ours is not None
+        turn = np.angle(np.exp(1j * (ours.yaw - true.yaw)))
+        errors[trial.manoeuvre] = float(np.hypot(ours.x - true.x, ours.y - true.y).max()), float(np.abs(turn).max())
+        held_out = any(one.held_out for one in measured.trials if one.manoeuvre == trial.manoeuvre)
+        print(f"{seed} {trial.manoeuvre:13s} {errors[trial.manoeuvre][0]:.4f} m, {errors[trial.manoeuvre][1]:.4f} rad"
+              f"{', held out' if held_out else ''}")  # fmt: skip
+    return errors
+
+
+def main() -> None:
+    """Fit every chair, print and record."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[2000], help="days of the plant")
+    parser.add_argument("--iterations", type=int, default=20)
+    options = parser.parse_args()
+    found = [largest_errors(seed, options.iterations) for seed in options.seeds]
+    position = [max(error[0] for error in one.values()) for one in found]
+    yaw = [max(error[1] for error in one.values()) for one in found]
+    by_name = {name: [max(one[name][i] for one in found) for i in (0, 1)] for name in FIVE}
+    record("physics", CLAIM, {
+        "contact_five_manoeuvres_m": {**figure(position, "m"), "largest": max(position), "manoeuvres": by_name},
+        "contact_five_manoeuvres_rad": {**figure(yaw, "rad"), "largest": max(yaw)},
+    })  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
