@@ -34,10 +34,12 @@ from dreamer.types import FunctionalEnv
 CLAIM = "DreamerV3 on tasks that are not ours; the curve of every seed, [environment steps, return of each seed]"
 TINY = dict(
     deter=128, hidden=64, units=64, stoch=8, classes=8, batch_size=8, batch_length=32, lr=1e-3, warmup=100,
-    policy_layers=2, value_layers=2, vector_layers=2, imag_last=8, learning_starts=512,
-    patch=4, entropy_scale=3e-3, train_ratio=128.0,
+    policy_layers=2, value_layers=2, vector_layers=2, imag_last=8, learning_starts=512, train_ratio=128.0,
 )  # fmt: skip
 """Upon the preset `cpu`: a network for minutes on a CPU."""
+TINY_GRID = dict(patch=4, entropy_scale=3e-3)
+TINY_CART = dict(batch_size=16, batch_length=16, free_nats=0.2)
+"""Five numbers that change slowly fit into one free nat, below which the prior would learn nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +74,8 @@ def make_config(options: argparse.Namespace, task: Task) -> DreamerConfig:
     if options.unroll is not None:
         given["scan_unroll"] = options.unroll
     if options.preset == "tiny":
-        return preset("cpu", **{**TINY, **given})  # type: ignore[arg-type]
+        own = TINY_GRID if options.task == "grid" else TINY_CART
+        return preset("cpu", **{**TINY, **own, **given})  # type: ignore[arg-type]
     return preset(options.preset, **given)
 
 
@@ -98,32 +101,46 @@ def run(options: argparse.Namespace) -> None:
     task = make_task(options)
     config = make_config(options, task)
     seeds = tuple(range(options.first_seed, options.first_seed + options.seeds))
-    out = options.out / f"{label(options)}_{options.steps}_{seeds[0]}-{seeds[-1]}"
     began = time.monotonic()
+    runs = [
+        (group, train_group(options, task, config, group, began))
+        for group in ([(seed,) for seed in seeds] if options.separate else [seeds])
+    ]
+    figures = summary(options, task, config, runs)
+    for name, entry in figures.items():
+        print(f"{name}: {entry['value']:.4g} {entry['unit']} {[round(x, 3) for x in entry['repeats']]}", flush=True)
+    if any(not lines or lines[-1]["env_steps"] * task.repeat < options.steps for _, lines in runs):
+        print("stopped by the clock; the same command goes on.")
+    if figures and not options.dry:
+        print(f"written to {record('dreamer_control', CLAIM, figures)}")
+
+
+def train_group(
+    options: argparse.Namespace, task: Task, config: DreamerConfig, seeds: tuple[int, ...], began: float
+) -> list[dict[str, float]]:
+    """Train these seeds as one program, or go on with them, and return all lines of the log."""
+    out = options.out / f"{label(options)}_{options.steps}_{'-'.join(map(str, seeds))}"
 
     def evaluation(params: Any, decisions: int) -> dict[str, float]:
         result = evaluate(
             task.test, config, params, jax.random.PRNGKey(77), options.episodes, max_steps=task.max_decisions
         )
         each = np.atleast_2d(result["return"]).mean(-1)
-        text = " ".join(f"{value:.4g}" for value in each)
-        print(f"{decisions * task.repeat} steps, {time.monotonic() - began:.0f} s: return {text}", flush=True)
+        text = ", ".join(f"seed {seed} {value:.4g}" for seed, value in zip(seeds, each, strict=True))
+        print(f"{decisions * task.repeat} steps, {time.monotonic() - began:.0f} s: return of {text}", flush=True)
         return {f"return_{seed}": float(value) for seed, value in zip(seeds, each, strict=True)}
 
-    result = train(
-        task.train, config, out, options.steps // task.repeat, seeds, eval_fn=evaluation,
-        eval_every=max(1, options.eval_every // task.repeat), checkpoint_every_s=options.checkpoint_s, log_every_s=10.0,
-        on_metrics=progress(task, began), progress=False,
-        time_limit_s=None if options.minutes is None else 60 * options.minutes,
+    left = None if options.minutes is None else max(0.0, 60 * options.minutes - (time.monotonic() - began))
+    log = out / "metrics.jsonl"
+    if left == 0.0 and not log.exists():
+        return []
+    train(
+        task.train, config, out, options.steps // task.repeat, seeds[0] if options.separate else seeds,
+        eval_fn=evaluation, eval_every=max(1, options.eval_every // task.repeat),
+        checkpoint_every_s=options.checkpoint_s, log_every_s=10.0, on_metrics=progress(task, began), progress=False,
+        time_limit_s=left,
     )  # fmt: skip
-    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    figures = summary(options, task, config, seeds, lines)
-    for name, entry in figures.items():
-        print(f"{name}: {entry['value']:.4g} {entry['unit']} {[round(x, 3) for x in entry['repeats']]}", flush=True)
-    if result.env_steps * task.repeat < options.steps:
-        print(f"stopped at {result.env_steps * task.repeat} of {options.steps} steps; the same command goes on.")
-    if figures and not options.dry:
-        print(f"written to {record('dreamer_control', CLAIM, figures)}")
+    return [json.loads(line) for line in log.read_text().splitlines()]
 
 
 def progress(task: Task, began: float) -> Any:
@@ -143,29 +160,37 @@ def label(options: argparse.Namespace) -> str:
 
 
 def summary(
-    options: argparse.Namespace, task: Task, config: DreamerConfig, seeds: tuple[int, ...], lines: list[dict]
+    options: argparse.Namespace, task: Task, config: DreamerConfig, runs: list[tuple[tuple[int, ...], list[dict]]]
 ) -> dict[str, dict[str, Any]]:
-    """Figures of a run: the return of every seed at its last evaluation, with the curve; speed and time."""
-    evaluated = [line for line in lines if f"eval/return_{seeds[0]}" in line]
-    if not evaluated:
+    """Figures of the runs: returns at the last evaluation that all seeds have, with the curves; speed and time."""
+    curves: dict[int, dict[int, float]] = {}  # of each seed: return by environment steps
+    updates: dict[int, int] = {}
+    for seeds, lines in runs:
+        for line in lines:
+            for seed in seeds:
+                if f"eval/return_{seed}" in line:
+                    at = int(line["env_steps"]) * task.repeat
+                    curves.setdefault(seed, {})[at] = line[f"eval/return_{seed}"]
+                    updates[at] = int(line["updates"])
+    every = [seed for seeds, _ in runs for seed in seeds]
+    shared = sorted(set.intersection(*(set(curves.get(seed, {})) for seed in every)))
+    if not shared:
         return {}
-    curve = [
-        [int(line["env_steps"]) * task.repeat, [round(line[f"eval/return_{seed}"], 3) for seed in seeds]]
-        for line in evaluated
-    ]
-    name = label(options)
-    rates = [line["updates_per_s"] for line in lines if line["updates_per_s"] > 0][1:] or [0.0]
-    last = evaluated[-1]
+    name, last = label(options), shared[-1]
+    together = len(runs[0][0])
+    rates = [line["updates_per_s"] * together for _, lines in runs for line in lines[1:] if line["updates_per_s"] > 0]
+    minutes = [lines[-1]["wall_s"] / 60 for _, lines in runs if lines]
     return {
         f"{name}_return": {
-            **figure([last[f"eval/return_{seed}"] for seed in seeds], "-"), "steps": curve[-1][0],
-            "curve": curve, "seeds": list(seeds), "episodes": options.episodes, "updates": int(last["updates"]),
-            "train_ratio": config.train_ratio, "instances": options.instances,
+            **figure([curves[seed][last] for seed in every], "-"), "steps": last, "seeds": every,
+            "curve": [[at, [round(curves[seed][at], 3) for seed in every]] for at in shared],
+            "episodes": options.episodes, "updates": updates[last], "train_ratio": config.train_ratio,
+            "instances": options.instances,
         },
         f"{name}_random_return": figure([random_return(task.test, task.max_decisions)], "-"),
-        f"{name}_minutes": {**figure([lines[-1]["wall_s"] / 60], "min"), "seeds_in_one_program": len(seeds)},
+        f"{name}_minutes": {**figure(minutes, "min"), "seeds_in_one_program": together},
         f"{name}_updates_per_s": {
-            **figure([statistics.median(rates) * len(seeds)], "1/s"), "seeds_in_one_program": len(seeds),
+            **figure([statistics.median(rates or [0.0])], "1/s"), "seeds_in_one_program": together,
         },
     }  # fmt: skip
 
@@ -187,6 +212,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--minutes", type=float, help="stop and save after so long")
     parser.add_argument("--checkpoint-s", type=float, default=600.0, help="seconds between checkpoints")
     parser.add_argument("--out", type=Path, default=Path("runs/control"))
+    parser.add_argument("--separate", action="store_true", help="one seed after the other, each a program of its own")
     parser.add_argument("--dry", action="store_true", help="print only")
     return parser.parse_args()
 
