@@ -2,7 +2,8 @@
 
 Parts: "crowd" is 32 boxes and a textured ground (the goal marker is one of the boxes), by the jnp renderer and, on
 NVIDIA GPUs, by the kernel; "best" the same with anti-aliasing and hard shadows; "map" 200 pieces of real corridor walls
-and 8 people; "peer" MuJoCo Warp's ray tracer on the crowd, where it is installed; "tilings" compares tile sizes.
+and 8 people, by the kernel with the walls sorted by distance and as they are; "peer" MuJoCo Warp's ray tracer on the
+crowd, where it is installed; "tilings" compares tile sizes. The kernel comes first, the slower jnp renderer last.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ CLAIM = "Images of 64x64: 32 boxes and a textured ground; a real corridor with 2
 LENS = pinhole(1.2)
 BEST = Quality(antialias=True, shadows=True)
 TILINGS = (
-    Tiling(8, 8),
     Tiling(8, 16),
     Tiling(16, 16),
     Tiling(16, 16, warps=2),
@@ -40,7 +40,10 @@ TILINGS = (
     Tiling(8, 16, fast=False),
     Tiling(8, 16, words=True),
     Tiling(8, 16, cull=False),
+    Tiling(8, 8),
 )
+JNP_CALLS = 4
+"""Calls per repeat of the jnp renderer on an accelerator at most: one call of it lasts long enough."""
 
 
 @dataclass(frozen=True)
@@ -128,32 +131,23 @@ def main(options: Options) -> None:
     on_cpu = jax.devices()[0].platform == "cpu"
     worlds = options.worlds or (512 if on_cpu else 16384)
     calls = 2 if on_cpu else options.calls
-    tiling = Tiling(options.rows, options.columns, options.warps)
-    kernel = partial(_draw_kernel, tiling=tiling)
     jobs: list[tuple[str, Any, Any]] = []
+    if not on_cpu:
+        jobs += kernel_jobs(options)
+    jnp_name = "cpu_frames_per_s" if on_cpu else "jnp_frames_per_s"
     if "crowd" in options.parts:
-        jobs.append(("cpu_frames_per_s" if on_cpu else "jnp_frames_per_s", _draw, crowded_scene))
-        if not on_cpu:
-            jobs.append(("frames_per_s_32box_16384", kernel, crowded_scene))
+        jobs.append((jnp_name, _draw, crowded_scene))
     if "best" in options.parts:
-        jobs.append(("cpu_frames_per_s_aa_shadow" if on_cpu else "jnp_frames_per_s_aa_shadow",
-                     partial(_draw, quality=BEST), crowded_scene))
-        if not on_cpu:
-            jobs.append(("frames_per_s_aa_shadow", partial(kernel, quality=BEST), crowded_scene))
+        jobs.append((f"{jnp_name}_aa_shadow", partial(_draw, quality=BEST), crowded_scene))
     if "map" in options.parts:
-        near = partial(_draw, quality=Quality(keep=options.keep))
-        jobs.append(("cpu_frames_per_s_map" if on_cpu else "jnp_frames_per_s_map", near, map_scene))
-        if not on_cpu:
-            jobs.append(("frames_per_s_map", kernel, map_scene))
-    if "tilings" in options.parts and not on_cpu:
-        for one in TILINGS:
-            switches = f"{'' if one.fast else '_exact'}{'_words' if one.words else ''}{'' if one.cull else '_all'}"
-            name = f"frames_per_s_tile_{one.rows}x{one.columns}_{one.warps}{switches}"
-            jobs.append((name, partial(_draw_kernel, tiling=one), crowded_scene))
+        jobs.append((f"{jnp_name}_map", partial(_draw, quality=Quality(keep=options.keep)), map_scene))
     for name, draw, make in jobs:
-        if not on_cpu and not name.startswith("jnp"):
+        print(f"{name}: compiling", flush=True)
+        jnp_only = name.startswith(("jnp", "cpu"))
+        if not jnp_only:
             check(name, draw, make)
-        rates, cost = measure(name, draw, make, options, worlds, calls)
+        some = min(calls, JNP_CALLS) if jnp_only else calls
+        rates, cost = measure(name, draw, make, options, worlds, some)
         stem = name.removeprefix("cpu_").removeprefix("jnp_")
         prefix = name[: len(name) - len(stem)]
         figures = {name: figure(rates, "frames/s"), f"{prefix}compile_s_{stem}": figure([cost["compile_s"]], "s"),
@@ -167,16 +161,43 @@ def main(options: Options) -> None:
             record("camera", CLAIM, {"peer_mujoco_warp_frames_per_s": figure(rates, "frames/s")})
 
 
+def kernel_jobs(options: Options) -> list[tuple[str, Any, Any]]:
+    """Name of the figure, function and scene of each measurement of the kernel."""
+    tiling = Tiling(options.rows, options.columns, options.warps)
+    kernel = partial(_draw_kernel, tiling=tiling)
+    jobs: list[tuple[str, Any, Any]] = []
+    if "crowd" in options.parts:
+        jobs.append(("frames_per_s_32box_16384", kernel, crowded_scene))
+    if "best" in options.parts:
+        jobs.append(("frames_per_s_aa_shadow", partial(kernel, quality=BEST), crowded_scene))
+    if "map" in options.parts:
+        unsorted = dataclasses.replace(tiling, sort=False)
+        jobs.append(("frames_per_s_map", kernel, map_scene))
+        jobs.append(("frames_per_s_map_unsorted", partial(_draw_kernel, tiling=unsorted), map_scene))
+    if "tilings" in options.parts:
+        for one in TILINGS:
+            switches = f"{'' if one.fast else '_exact'}{'_words' if one.words else ''}{'' if one.cull else '_all'}"
+            name = f"frames_per_s_tile_{one.rows}x{one.columns}_{one.warps}{switches}"
+            jobs.append((name, partial(_draw_kernel, tiling=one), crowded_scene))
+    return jobs
+
+
 def check(name: str, draw, make) -> None:
     """Compare a kernel with the jnp renderer on this device; RuntimeError when more than silhouettes differ."""
     data = jax.jit(jax.vmap(make))(jax.random.split(jax.random.key(1), 64))
-    quality = BEST if "aa_shadow" in name else Quality()
-    one = np.asarray(jax.jit(jax.vmap(partial(_draw, quality=quality)))(*data)).astype(int)
+    one = _reference(make, BEST if "aa_shadow" in name else Quality())
     other = np.asarray(jax.jit(jax.vmap(draw))(*data))
     share = (np.abs(one - other).max(-1) > 1).mean()
     print(f"{name}: {share:.2e} of the pixels differ from the jnp renderer by more than one grey level", flush=True)
     if share > 0.01:
         raise RuntimeError(f"{name}: {share:.1%} of the pixels differ from the jnp renderer; at most 1 % may.")
+
+
+@cache
+def _reference(make, quality: Quality) -> np.ndarray:
+    """Images int of the jnp renderer, for `check`."""
+    data = jax.jit(jax.vmap(make))(jax.random.split(jax.random.key(1), 64))
+    return np.asarray(jax.jit(jax.vmap(partial(_draw, quality=quality)))(*data)).astype(int)
 
 
 def _draw(position, rotation, scene, quality=None):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,10 @@ def furnished(count=6):
     return dataclasses.replace(scene, finish=finish)
 
 
+def unfinished(count=6):
+    return dataclasses.replace(furnished(count), finish=None)
+
+
 def both(scene, lens, quality, tiling, size=32):
     one = jax.jit(lambda s: render(EYE, TURN, lens, s, size, size, quality))(scene)
     other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, size, size, quality, tiling, interpret=True))(scene)
@@ -64,13 +69,26 @@ def both(scene, lens, quality, tiling, size=32):
         (crowd(70), Quality(), pinhole(1.2, 32, 32), Tiling(8, 16)),
         (crowd(12), BEST, pinhole(1.2, 32, 32), Tiling(16, 16, words=True)),
         (furnished(), Quality(shadows=True), DISTORTED, Tiling(16, 16)),
+        (unfinished(40), BEST, pinhole(1.2, 32, 32), Tiling(16, 16, sort=False)),
     ],
-    ids=["plain", "several chunks", "antialias and shadows", "furnished"],
+    ids=["plain", "several chunks", "antialias and shadows", "furnished", "rounds in the sun"],
 )
 def test_kernel_draws_what_the_jnp_renderer_draws(scene, quality, lens, tiling):
     difference, image = both(scene, lens, quality, tiling)
     assert image.std() > 20
     assert (difference > 1).mean() < 5e-3  # a silhouette may fall to either side
+
+
+def test_order_of_the_primitives_does_not_change_the_image():
+    scene, lens = crowd(70), pinhole(1.2, 16, 16)
+
+    def draw(tiling):
+        kernel = partial(render_pallas, height=16, width=16, tiling=tiling, interpret=True)
+        return np.asarray(jax.jit(lambda s: kernel(EYE, TURN, lens, s))(scene))
+
+    images = [draw(Tiling(8, 8, sort=sort)) for sort in (True, False)]
+    np.testing.assert_array_equal(*images)
+    assert images[0].std() > 20
 
 
 def test_kernel_draws_sizes_that_tiles_do_not_divide():
@@ -92,7 +110,11 @@ def test_a_batch_of_kernels_equals_single_ones_and_bad_poses_are_black():
     assert not images[1].any()
 
 
-@pytest.mark.parametrize("scene, quality", [(crowd(12), Quality()), (furnished(40), BEST)], ids=["plain", "all"])
+@pytest.mark.parametrize(
+    "scene, quality",
+    [(crowd(12), Quality()), (furnished(40), BEST), (unfinished(40), Quality(shadows=True))],
+    ids=["plain", "all", "rounds in the sun"],
+)
 def test_kernel_lowers_for_cuda(scene, quality):
     scenes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((4, *leaf.shape), leaf.dtype), scene)
     draw = jax.jit(jax.vmap(lambda s: render_pallas(EYE, TURN, DISTORTED, s, 32, 32, quality)))

@@ -1,7 +1,7 @@
 """The camera in jnp, for any device: scene and camera pose of one instance -> image, depth, labels, normals.
 
-Written so that XLA fuses the loop over boxes into one kernel on CPUs and GPUs. A face has one colour under a distant
-sun; it is looked up after the loop. There is no [P, H, W] array and no division in the loop.
+Written so that XLA fuses the loop over boxes into one kernel on CPUs and GPUs. A flat face has one colour under a
+distant sun; it is looked up after the loop. There is no [P, H, W] array and no division in the loop.
 """
 
 from __future__ import annotations
@@ -160,6 +160,10 @@ class Arrays:
         return self.parts.labels
 
     @property
+    def first_bent(self) -> int | None:
+        return None if self.tables.bent is None else 4 * self.parts.first_round
+
+    @property
     def picture(self) -> Any:
         return None if self.atlas is None else self._picture
 
@@ -209,8 +213,10 @@ class Arrays:
         return self.tables.dark.reshape(-1)[code]  # type: ignore[union-attr]
 
     def row(self, code) -> list:
-        picked = self.tables.rows[code]  # type: ignore[index]
-        return [picked[..., index] for index in range(picked.shape[-1])]
+        return list(jnp.moveaxis(self.tables.rows[code], -1, 0))  # type: ignore[index]
+
+    def bent(self, place) -> list:
+        return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]
 
     def shadow(self, x, y, z) -> jax.Array:
         tables = self.tables

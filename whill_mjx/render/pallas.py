@@ -1,8 +1,8 @@
 """The camera as a Pallas kernel for NVIDIA GPUs (Triton): the same definition as `image.render`, with culling.
 
 One program draws one tile. It compares the tile with the rectangles of 32 primitives at a time, one per lane, which
-gives the bits of one integer; then it meets only the primitives whose bit is set. More than 32 come in front-to-back
-order, and those that lie behind all that the tile already shows are left out.
+gives the bits of one integer; then it meets only the primitives whose bit is set. Of more than 32, those that lie
+behind all that the tile already shows are left out; front-to-back order leaves out most.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ class Tiling:
     """Compare tiles with rectangles; False meets every primitive."""
     fast: bool = True
     """Use the GPU's approximate reciprocal (1 unit in the last place), and sums instead of conversions to integers."""
+    sort: bool = True
+    """Bring more than 32 primitives of a kind into front-to-back order before; the images are the same."""
     words: bool = False
     """Write four-byte words that XLA unpacks, instead of three bytes per pixel."""
 
@@ -76,6 +78,7 @@ class Inputs:
     words: Any  # (labels * 4,)
     dark: Any
     rows: Any  # (labels * 4 * 18,)
+    bent: Any  # (K * 4 * 8,)
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
 
@@ -103,7 +106,7 @@ def render_pallas(
     from jax.experimental.pallas import triton as plt
 
     tiling = tiling or Tiling()
-    inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality)
+    inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
     static: dict[str, Any] = {
         "bits": parts_of(scene).bits,
@@ -155,7 +158,7 @@ def render_pallas(
     return unpack_colours(image) if tiling.words else image
 
 
-def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality) -> tuple[Inputs, Callable]:
+def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort: bool) -> tuple[Inputs, Callable]:
     """Arrays for the kernel, and the function that makes the view of them there."""
     view, finite = make_view(position, rotation, intrinsics, scene)
     parts = parts_of(scene)
@@ -169,7 +172,7 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality) -> t
     if parts.rounds is not None:
         kinds["round"] = (tables.round, parts.rounds.mask, tables.round_shadow)  # type: ignore[assignment]
         corners["round"] = culling.round_corners(parts.rounds)
-    listed = {name: _listed(view, corners[name], sun, *rest) for name, rest in kinds.items()}
+    listed = {name: _listed(view, corners[name], sun, *rest, sort) for name, rest in kinds.items()}
 
     seed = view.looks.seed.astype(jnp.uint32)
     integers = jnp.stack([jax.lax.bitcast_convert_type(seed, jnp.int32), finite.astype(jnp.int32)])
@@ -199,16 +202,17 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality) -> t
     atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
     dark = None if tables.dark is None else tables.dark.reshape(-1)
     rows = None if lit_words(scene) or tables.rows is None else tables.rows.reshape(-1)
-    return Inputs(jnp.concatenate(flat), integers, tables.words.reshape(-1), dark, rows, atlas, listed), rebuild
+    bent = None if tables.bent is None else tables.bent.reshape(-1)
+    return Inputs(jnp.concatenate(flat), integers, tables.words.reshape(-1), dark, rows, bent, atlas, listed), rebuild
 
 
-def _listed(view: View, corners, sun, table, mask, shadow) -> Listed:
-    """Rectangles of one kind, padded to whole chunks and in front-to-back order where there are several."""
+def _listed(view: View, corners, sun, table, mask, shadow, sort: bool) -> Listed:
+    """Rectangles of one kind, padded to whole chunks; with `sort` in front-to-back order where there are several."""
     count = table.shape[0]
     extra = -count % CHUNK
     boxes = culling.bounds(view, corners, mask, culling.EDGES)
     order = None
-    if count > CHUNK:
+    if sort and count > CHUNK:
         order = jnp.argsort(boxes.near)
         boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
         order = jnp.pad(order.astype(jnp.int32), (0, extra))
@@ -300,6 +304,10 @@ class Refs:
     def picture(self) -> Any:
         return None if self.atlas_shape is None else self._picture
 
+    @property
+    def first_bent(self) -> int | None:
+        return None if self.data.bent is None else 4 * self.starts["round"]
+
     def nearest(self, rays: Rays) -> jax.Array:
         bits, invert = self.bits, self.invert
         reach_z = jnp.abs(rays.inverse_z)
@@ -364,6 +372,9 @@ class Refs:
 
     def row(self, code) -> list:
         return [self.data.rows[code * 18 + index] for index in range(18)]
+
+    def bent(self, place) -> list:
+        return [self.data.bent[place * 8 + index] for index in range(8)]
 
     def ratio(self, x, y) -> jax.Array:
         if jnp.ndim(y) == 0:

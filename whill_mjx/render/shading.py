@@ -70,12 +70,15 @@ class Stage(Protocol):
 
     @property
     def lit_words(self) -> bool:
-        """Whether the words already hold the light of the faces."""
+        """Whether the words already hold the light of the flat faces."""
+
+    @property
+    def first_bent(self) -> int | None:
+        """Where `lit_words`: the first code of a round, whose words hold no light; None without rounds."""
 
     @property
     def picture(self) -> Any:
         """Function (number, s, t) -> colour of a picture of the atlas; None without one."""
-
 
     def nearest(self, rays: Rays) -> Any:
         """Key of the nearest solid."""
@@ -106,6 +109,9 @@ class Stage(Protocol):
 
     def row(self, code) -> list:
         """Numbers of a face: see `tables.face_rows`."""
+
+    def bent(self, place) -> list:
+        """Numbers of a face of a round, by its code less `first_bent`: see `tables.bent_rows`."""
 
     def shadow(self, x, y, z) -> Any:
         """Bool: is a point hidden from the sun?"""
@@ -167,7 +173,7 @@ def pixel_view(view: View, stage: Stage, row, column, shift=(0.5, 0.5)) -> Rays:
 
 def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> list:
     """Colours of what the rays meet: paint, texture, light, grain, darker foot, tiles of the ground, sky and fog."""
-    if not stage.lit_words or quality != Quality():
+    if not stage.lit_words or stage.first_bent is not None or quality != Quality():
         rays, hit = stage.settle((rays, hit))
     looks, origin = view.looks, view.position
     box, seen = hit.solid, hit.seen
@@ -193,6 +199,11 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
     word = stage.word(hit.code)
     if stage.lit_words and shadow is not None:
         word = jnp.where(shadow, stage.dark_word(hit.code), word)
+    glow = noise
+    if stage.lit_words and stage.first_bent is not None:
+        row = stage.bent(jnp.maximum(hit.code - stage.first_bent, 0))
+        light = _light(view, face_normal(row, x, y, z), (x, y, z), shadow)[0]  # white: it has no lamps
+        glow = stage.settle(noise * jnp.where(hit.code >= stage.first_bent, light, 1.0))
     if not stage.lit_words:
         row = stage.row(jnp.where(box, hit.code, 4 * GROUND))
         light = stage.settle(_light(view, face_normal(row, x, y, z), (x, y, z), shadow))
@@ -204,7 +215,7 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
         tile = looks.ground[0, channel] + mix * (looks.ground[1, channel] - looks.ground[0, channel])
         sky = looks.sky_horizon[channel] + height * (looks.sky_zenith[channel] - looks.sky_horizon[channel])
         if stage.lit_words:
-            thing, ground = paint * noise, tile * (lit * noise)
+            thing, ground = paint * glow, tile * (lit * noise)
         else:
             thing = paint * noise * light[channel] * factors[channel]
             ground = tile * noise * light[channel] * factors[channel]

@@ -82,6 +82,7 @@ class Tables:
     round: jax.Array | None  # (K, 12)
     words: jax.Array  # (labels, 4) uint32 colour of each face
     dark: jax.Array | None  # (labels, 4) uint32 colour of each face in shadow
+    bent: jax.Array | None  # (K * 4, 8) geometry of each face of the rounds, whose words hold no light
     rows: jax.Array | None  # (labels * 4, 18) geometry and texture of each face
     upright_shadow: jax.Array | None  # (P, 11)
     block_shadow: jax.Array | None  # (K, 18)
@@ -100,6 +101,7 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
         None if rounds is None else round_table(view.position, view.rotation, rounds),
         words,
         dark if shadows and lit else None,
+        bent_rows(view.position, rounds).reshape(-1, 8) if rounds is not None and lit else None,
         face_rows(view.position, parts, scene) if rows or not lit else None,
         upright_shadow_table(sun, parts.boxes) if shadows else None,
         block_shadow_table(sun, blocks) if shadows and blocks is not None else None,
@@ -108,12 +110,15 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
 
 
 def lit_words(scene: Scene) -> bool:
-    """Whether every face has one colour under the sun, so that its light can be looked up with its colour."""
-    return scene.finish is None and (scene.solids is None or scene.solids.rounds is None)
+    """Whether every flat face has one colour under the sun, so that its light can be looked up with its colour."""
+    return scene.finish is None
 
 
 def face_words(position: jax.Array, parts: Parts, looks: Looks, lit: bool) -> tuple[jax.Array, jax.Array]:
-    """(labels, 4) uint32: colour of the x, y and z face that is turned to the camera, and the same in shadow."""
+    """(labels, 4) uint32: colour of the x, y and z face that is turned to the camera, and the same in shadow.
+
+    Where `lit`, they hold the light of the flat faces; those of rounds are the paint, for their light bends.
+    """
     boxes = parts.boxes
     if not lit:
         kinds = [kind for kind in (boxes, parts.blocks, parts.rounds) if kind is not None]
@@ -141,7 +146,10 @@ def face_words(position: jax.Array, parts: Parts, looks: Looks, lit: bool) -> tu
     def under(strength):
         light = looks.ambient + strength * jnp.maximum(cosine, 0.0)
         packed = _pack(light[..., None] * colour[:, None, :])
-        return jnp.zeros((parts.labels, 4), jnp.uint32).at[MARKER:, :3].set(packed)
+        words = jnp.zeros((parts.labels, 4), jnp.uint32).at[MARKER : parts.first_round, :3].set(packed)
+        if parts.rounds is not None:
+            words = words.at[parts.first_round :].set(_pack(parts.rounds.colour)[:, None])
+        return words
 
     return under(looks.diffuse), under(0.0)
 
@@ -193,15 +201,22 @@ def _box_rows(position, centre, half, rotation, scale) -> jax.Array:
 
 
 def _round_rows(position, rounds: Rounds, scale) -> jax.Array:
-    """(K, 4, 16) rows of rounds: faces 0 and 1 curved, 2 and 3 the flat end that is turned to the camera."""
+    """(K, 4, 16) rows of rounds."""
     axis, aside = rounds.axis, across(rounds.axis)
     factor = jnp.where(scale > 0, _inverse(scale), 1.0)[:, None]
     offsets = [-jnp.sum(way * rounds.centre, 1, keepdims=True) for way in (aside, axis)]
-    maps = [jnp.concatenate(pair, 1) * factor for pair in zip((aside, axis), offsets, strict=True)]
+    maps = jnp.concatenate([part * factor for pair in zip((aside, axis), offsets, strict=True) for part in pair], 1)
+    maps = jnp.broadcast_to(maps[:, None], (maps.shape[0], 4, 8))
+    return jnp.concatenate([bent_rows(position, rounds), maps], 2)
+
+
+def bent_rows(position: jax.Array, rounds: Rounds) -> jax.Array:
+    """(K, 4, 8), the first numbers of `face_rows`: faces 0 and 1 curved, 2 and 3 the flat end turned to the camera."""
+    axis = rounds.axis
     bend = jnp.stack([rounds.half, 1.0 / jnp.maximum(rounds.radius, 1e-6)], 1)
-    curved = jnp.concatenate([axis, rounds.centre, bend, *maps], 1)
+    curved = jnp.concatenate([axis, rounds.centre, bend], 1)
     side = jnp.sum((position - rounds.centre) * axis, 1, keepdims=True)
-    flat = jnp.concatenate([jnp.where(side > 0, axis, -axis), jnp.zeros((axis.shape[0], 5)), *maps], 1)
+    flat = jnp.concatenate([jnp.where(side > 0, axis, -axis), jnp.zeros((axis.shape[0], 5))], 1)
     return jnp.stack([curved, curved, flat, flat], 1)
 
 
