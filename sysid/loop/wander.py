@@ -129,18 +129,31 @@ def coordinates(evidence: Evidence, trials: Sequence[int] | np.ndarray) -> list[
 
 
 def _pooled(columns: Sequence[Columns], days: Sequence[list[tuple[np.ndarray, np.ndarray]]]) -> Wander:
-    """Covariances beyond the noise, each drawn towards what all hypotheses have in common."""
-    count = len(days)
+    """Covariances beyond the noise, each drawn towards what all hypotheses have in common.
+
+    A day that tells little of an effect, because its drives hardly excite it, counts for little.
+    """
     ratios = [float(q @ information @ q) / len(q) for day in days for q, information in day]
     common = max(float(np.median(ratios)) / 0.455, 1.0)  # 0.455: median of chi squared with one degree of freedom
     covariance, shapes = [], []
     for position in range(len(columns)):
         each = np.stack([day[position][0] for day in days])  # (D, k)
-        noise = np.mean([np.linalg.inv(day[position][1]) for day in days], axis=0)
-        seen = (each.T @ each + ASSUMED_DAYS * common * noise) / (count + ASSUMED_DAYS)
+        noises = np.stack([np.linalg.inv(day[position][1]) for day in days])  # (D, k, k)
+        weight = _weights(noises)
+        count = 1 / np.square(weight).sum()  # as many days as these weights amount to
+        noise = np.einsum("d,dij->ij", weight, noises)
+        mean = np.einsum("d,di,dj->ij", weight, each, each)
+        seen = (count * mean + ASSUMED_DAYS * common * noise) / (count + ASSUMED_DAYS)
         value, vector = np.linalg.eigh(seen - noise)
-        beyond = (vector * np.maximum(value, 0.0)) @ vector.T
-        covariance.append(beyond)
-        total = np.sqrt(np.maximum(np.diag(each.T @ each) / count, 1e-30))
-        shapes.append(each / total)
-    return Wander(tuple(covariance), tuple(shapes), count + ASSUMED_DAYS)
+        covariance.append((vector * np.maximum(value, 0.0)) @ vector.T)
+        total = np.sqrt(np.maximum(np.diag(mean), 1e-30))
+        shapes.append(each * np.sqrt(len(days) * weight)[:, None] / total)
+    return Wander(tuple(covariance), tuple(shapes), len(days) + ASSUMED_DAYS)
+
+
+def _weights(noises: np.ndarray) -> np.ndarray:
+    """(D,) weights of days, of sum 1, from the covariances (D, k, k) of their estimates: as the variance of a squared
+    estimate asks where an effect wanders by as much as the noise of a middling day."""
+    size = np.einsum("dii->di", noises)
+    weight = 1 / np.square(1 + size / np.median(size, 0)).mean(1)
+    return weight / weight.sum()

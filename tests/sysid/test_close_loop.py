@@ -10,9 +10,11 @@ from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after,
 from sysid.log import load_log
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.drives import make_drives
+from sysid.loop.evidence import Columns
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.report import make_report, replay, write_run
+from sysid.loop.wander import _pooled
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
 from sysid.synthetic import write_dataset
@@ -150,6 +152,19 @@ def test_wander_is_what_days_show(sloping):
     assert sizes["track_width", 1.0] < 0.5
     assert sizes["slope", 1.0] < 0.5
     assert max(sizes.values()) > 0
+
+
+@pytest.mark.quick
+def test_a_day_that_does_not_excite_an_effect_says_little_of_how_it_wanders():
+    rng = np.random.default_rng(0)
+    columns = [Columns(0, 1.0, (0,))]
+    alike = [[(np.array([q]), np.array([[100.0]]))] for q in rng.normal(0.0, 0.3, 40)]
+    usual = float(np.sqrt(_pooled(columns, alike).covariance[0][0, 0]))
+    assert usual == pytest.approx(0.3, rel=0.3)
+    blind = [*alike[:6], [(np.array([5.0]), np.array([[0.1]]))]]  # 5 is 1.6 times its noise
+    assert np.sqrt(_pooled(columns, blind).covariance[0][0, 0]) < 2 * usual
+    loud = [*alike[:6], [(np.array([5.0]), np.array([[100.0]]))]]  # here it is 50 times its noise
+    assert np.sqrt(_pooled(columns, loud).covariance[0][0, 0]) > 4 * usual
 
 
 @pytest.mark.quick
