@@ -54,6 +54,7 @@ def together(options: argparse.Namespace) -> None:
 
     def evaluation(params: Any, number: int, episodes: int) -> list[dict[str, float]]:
         found = evaluate(held_out, learner, params, jax.random.key(number), episodes)
+        found = {name: np.atleast_2d(value) for name, value in found.items()}
         return [mean_figures({name: value[i] for name, value in found.items()}) for i in range(len(options.seeds))]
 
     def inside(params: Any, env_steps: int) -> dict[str, float]:
@@ -63,8 +64,10 @@ def together(options: argparse.Namespace) -> None:
                 for name, value in one.items()}
 
     env = functional_env(make_training_env(task, vehicle, preset.instances))
-    result = train(env, learner, options.out, steps, tuple(options.seeds), eval_fn=inside, eval_every=preset.eval_every,
-                   progress=False, time_limit_s=60 * options.minutes if options.minutes else None)
+    seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
+    limit = 60 * options.minutes if options.minutes else None
+    result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
+                   checkpoint_every_s=1e9, progress=False, time_limit_s=limit)
     if result.env_steps < steps:
         print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
         return
