@@ -152,14 +152,21 @@ def next_size(base: float, points: Sequence[Point]) -> float | None:
 
 def power_sizes(work: Path) -> dict[str, float]:
     """Size of each effect that would be noticed with 80 % power; without those for which no such size was found."""
-    sizes = {}
-    for name in EFFECTS:
-        points = seen_at(work, name)
-        if points:
-            size, found = min(points, key=lambda point: abs(np.log(point[1])))
-            if next_size(EFFECTS[name].base, points) is None and FAR[0] < found < FAR[1]:
-                sizes[name] = size * float(np.clip(found**-0.5, 0.5, 2.0))
-    return sizes
+    found = {name: size_between(EFFECTS[name].base, seen_at(work, name)) for name in EFFECTS}
+    return {name: size for name, size in found.items() if size is not None}
+
+
+def size_between(base: float, points: Sequence[Point]) -> float | None:
+    """The size at which an effect stands out by 1, once the search for it is over."""
+    if not points or next_size(base, points) is not None:
+        return None
+    above = min((point for point in points if point[1] >= 1), default=None)
+    below = max((point for point in points if point[1] < 1 and (above is None or point[0] < above[0])), default=None)
+    if above and below:
+        rate = np.log(above[1] / below[1]) / np.log(above[0] / below[0])
+        return float(below[0] * below[1] ** (-1 / rate))
+    size, found = above or below or points[0]
+    return size * found**-0.5 if FAR[0] < found < FAR[1] else None
 
 
 def judge(job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool) -> dict[str, Any]:
