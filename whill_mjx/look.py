@@ -28,6 +28,9 @@ from whill_mjx.scene import box, footprint, stack_boxes
 from whill_mjx.task import TASKS
 from whill_mjx.types import VehicleParams
 
+VIDEOS = (".mp4", ".gif")
+"""Endings of videos."""
+
 
 @dataclass(frozen=True)
 class Look:
@@ -127,12 +130,23 @@ def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
     plain = dataclasses.replace(scene, finish=None)
     frame = jax.jit(lambda scene: render_frame(*start, lens, scene, height, width, normals=True))(plain)
     good = jax.jit(lambda scene: render(*start, lens, scene, height, width, best))(scene)
-    depth = np.repeat((255.0 / (1.0 + np.asarray(frame.depth) / 2.0))[..., None], 3, -1).astype(np.uint8)
+    depth = depth_picture(np.asarray(frame.depth))
     label = np.asarray(frame.label).astype(int)
     colours = np.random.default_rng(3).integers(40, 256, (label.max() + 1, 3)).astype(np.uint8)[label]
     normal = (np.asarray(frame.normal) * 127.0 + 128.0).astype(np.uint8)
     top = [np.asarray(image) for image in (frame.rgb, good, jax.jit(moving)(scene))]
     return np.vstack([np.hstack(top), np.hstack([depth, colours, normal])])
+
+
+def depth_picture(depth: np.ndarray) -> np.ndarray:
+    """Grey picture (H, W, 3) uint8 of a depth (H, W): nearest white, each doubling as much darker, the sky black."""
+    seen = np.isfinite(depth)
+    if not seen.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    double = np.log2(np.maximum(np.where(seen, depth, 0.0), 1e-3))
+    near, far = double[seen].min(), double[seen].max()
+    grey = np.where(seen, 255.0 - 215.0 * (double - near) / max(far - near, 1e-6), 0.0)
+    return np.repeat(grey[..., None], 3, -1).astype(np.uint8)
 
 
 def film_of(options: Look) -> list[np.ndarray]:
@@ -182,12 +196,14 @@ def main(options: Look) -> None:
     known = (*TASKS, "gallery")
     if options.scene not in (*known, "all"):
         raise ValueError(f"unknown scene {options.scene!r} (known: {', '.join(known)}, all).")
+    if options.out.suffix not in (".png", *VIDEOS):
+        raise ValueError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
     if options.scene == "all":
         for name in known:
             out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
             main(dataclasses.replace(options, scene=name, out=out))
         return
-    if options.out.suffix in (".mp4", ".gif"):
+    if options.out.suffix in VIDEOS:
         frames = film_of(options)
         write_video(options.out, frames, options.scale)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")

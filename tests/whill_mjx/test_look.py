@@ -1,0 +1,35 @@
+"""The pictures that `whill_mjx.look` writes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from whill_mjx.look import Look, depth_picture, main, write_png
+
+
+@pytest.mark.quick
+def test_nearer_is_brighter_and_the_sky_is_black():
+    grey = depth_picture(np.array([[1.0, 2.0, 4.0, np.inf]]))[0, :, 0].astype(int)
+    assert grey[0] == 255 and grey[2] == 40 and grey[3] == 0
+    assert grey[1] == pytest.approx((grey[0] + grey[2]) / 2, abs=1)
+    assert not depth_picture(np.full((2, 3), np.inf)).any()
+    assert depth_picture(np.array([[0.0, 3.0]]))[0, 0, 0] == 255  # inside a box
+
+
+@pytest.mark.quick
+def test_a_png_holds_the_colours_it_was_given(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    write_png(tmp_path / "new" / "a.png", image)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new" / "a.png"))[..., ::-1], image)
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("options, words", [({"scene": "moon"}, "unknown scene 'moon'"), ({"out": "a.jpg"}, ".png")])
+def test_unknown_scenes_and_endings_are_refused(tmp_path, options, words):
+    out = tmp_path / options.get("out", "a.png")
+    with pytest.raises(ValueError, match=words):
+        main(Look(scene=options.get("scene", "gallery"), out=out))
+    assert not list(tmp_path.iterdir())
