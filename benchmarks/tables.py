@@ -17,7 +17,7 @@ single times.
 
 | script | what it measures |
 |---|---|
-| `python -m benchmarks.physics` | physics steps/s of the free chassis, cost of each effect, error of the time step, peers |
+| `python -m benchmarks.physics` | physics steps/s, cost of each effect, error of the time step, peers |
 | `python -m benchmarks.contact_drive` | the fitted vehicle against the contact plant on the five manoeuvres |
 | `python -m benchmarks.camera` | 64x64 RGB frames/s of the camera, by the GPU kernel and in plain JAX |
 | `python -m benchmarks.environment` | control steps/s of the obstacle course, image included |
@@ -51,7 +51,7 @@ HEADLINES = (  # file, figure, factor, what it says
     ("environment", "control_steps_per_s_course", 1e-6, "M control steps/s of the obstacle course, image included"),
     ("learner", "updates_per_s_12m", 1.0, "DreamerV3 updates/s, size12m, batch 16 x 64"),
     ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (one seed)"),
-    ("dreamer_control", "balance_image_size12m_return", 1.0, "return of 1,000: cart-pole balance from pixels, 100,000 steps"),
+    ("dreamer_control", "balance_image_size12m_return", 1.0, "of 1,000: cart-pole balance from pixels, 100,000 steps"),
     ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),
     ("course", "cpu_minutes", 1.0, "minutes of training for that (the fit and the installation come on top)"),
     ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay, asphalt"),
