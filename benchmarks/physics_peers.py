@@ -91,6 +91,7 @@ def warp_rates(worlds: int, steps: int, repeats: int) -> tuple[list[float], dict
     if not wp.is_cuda_available():
         raise ImportError("Warp finds no GPU")
     model, data, wheels = contact_chair()
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp knows no other
     m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=worlds)
     wp.copy(d.qfrc_applied, wp.array(torques(model, wheels, worlds).astype(np.float32), dtype=wp.float32))
     mjw.step(m, d)
