@@ -15,6 +15,8 @@ from whill_mjx.scene import Marker, Scene, box, default_looks, stack_boxes
 from whill_mjx.solids import Solids, block, person, post, rod, stack_blocks, stack_rounds
 
 CARDBOARD, WALL = (0.62, 0.44, 0.26), (0.78, 0.76, 0.72)
+FLOOR_TILE = 0.6
+"""Side of a floor tile, by its colour and by its grout [m]."""
 
 
 def gallery() -> Scene:
@@ -44,8 +46,9 @@ def gallery() -> Scene:
     half, blue = jnp.array([0.02, 0.3, 0.3]), jnp.array((0.04, 0.16, 0.9))
     marker = Marker(jnp.array([8.9, 0.3, 1.05]), half, jnp.zeros(()), blue)
     solids = Solids(stack_blocks([part for *_, part in blocks]), rounds)
-    scene = Scene(stack_boxes([part for *_, part in boxes]), marker, default_looks(), solids)
-    named: list[tuple[Any, float]] = [("plain", 1.0), ("tiles", 0.6), ("plain", 1.0)]
+    looks = dataclasses.replace(default_looks(), tile=jnp.array(FLOOR_TILE))
+    scene = Scene(stack_boxes([part for *_, part in boxes]), marker, looks, solids)
+    named: list[tuple[Any, float]] = [("plain", 1.0), ("tiles", FLOOR_TILE), ("plain", 1.0)]
     named += [(name, scale) for name, scale, _ in boxes + blocks]
     labels = label_count(scene)
     named += [("plain", 1.0)] * (labels - len(named))
