@@ -1,8 +1,8 @@
 """Verdicts of the closed loop on logs of the contact plant: which logs are driven, and what is counted.
 
 First every effect is driven at its base size and then at others, until it stands out about as far as what is noticed
-with 80 % power. Logs at 2 and 4 times that size, and with pairs of effects, follow. What a log contains is written into
-a file beside it that the loop never reads.
+with 80 % power. Logs at 2 and 4 times that size (or the largest with which the chair still drives its manoeuvres), and
+with pairs of effects, follow. What a log contains is written into a file beside it that the loop never reads.
 """
 
 from __future__ import annotations
@@ -98,10 +98,10 @@ def probe_jobs(work: Path, part: str) -> list[Job]:
 
 
 def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str) -> list[Job]:
-    """Logs with one effect each, at multiples of that size."""
+    """Logs with one effect each, at multiples of that size, as far as the chair still drives with it."""
     sizes = power_sizes(work)
-    return [Job(f"{name}_x{scale:g}_{seed}", {name: scale * sizes[name]}, 30001 + 50 * i + 10 * j + seed, scale,
-                "scaled")
+    return [Job(f"{name}_x{scale:g}_{seed}", {name: capped(name, scale * sizes[name])},
+                30001 + 50 * i + 10 * j + seed, scale, "scaled")
             for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part)
             for j, scale in enumerate(scales) for seed in range(seeds)]
 
@@ -113,9 +113,14 @@ def pair_jobs(work: Path, pairs: int, part: str) -> list[Job]:
     random, out = np.random.default_rng(7), []
     for n in range(pairs if len(known) > 1 else 0):
         first, second = random.choice(known, 2, replace=False)
-        effects = {str(first): 4 * sizes[first], str(second): 4 * sizes[second]}
+        effects = {str(name): capped(name, 4 * sizes[name]) for name in (first, second)}
         out.append(Job(f"pair_{n:02d}", effects, 60000 + n, 4.0, "pair"))
     return [job for n, job in enumerate(out) if mine(n, part)]
+
+
+def capped(name: str, size: float) -> float:
+    """A size with which the chair still drives."""
+    return min(size, EFFECTS[name].most)
 
 
 Point = tuple[float, float]

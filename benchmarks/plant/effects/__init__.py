@@ -6,6 +6,7 @@ that name; `other_form` whether it is written there with another law than here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from benchmarks.plant.base import Effect
@@ -26,6 +27,8 @@ class Entry:
     """The catalogue has an effect of this name."""
     signed: bool = False
     """Sizes below zero make sense."""
+    most: float = math.inf
+    """Size beyond which the chair no longer drives its manoeuvres: stalled motors, ice, a play that shakes it."""
 
     @property
     def form(self) -> str:
@@ -40,8 +43,8 @@ EFFECTS: dict[str, Entry] = {
     "jerk_limit": Entry(command.JerkLimit, 0.15, "s"),
     "command_scale": Entry(command.CommandScale, 0.02, "-", other_form=False, signed=True),
     "actuator_lag": Entry(actuation.ActuatorLag, 0.04, "s"),
-    "torque_saturation": Entry(actuation.TorqueSaturation, 2.0, "N m"),
-    "supply_sag": Entry(actuation.SupplySag, 0.15, "-"),
+    "torque_saturation": Entry(actuation.TorqueSaturation, 2.0, "N m", most=3.5),
+    "supply_sag": Entry(actuation.SupplySag, 0.15, "-", most=0.4),
     "drive_gain_difference": Entry(actuation.DriveGainDifference, 0.06, "-", other_form=False, signed=True),
     "dry_friction": Entry(force.DryFriction, 1.0, "N m"),
     "wheel_radius_difference": Entry(world.WheelRadiusDifference, 0.006, "-", other_form=False, signed=True),
@@ -49,14 +52,14 @@ EFFECTS: dict[str, Entry] = {
     "payload_shift": Entry(world.PayloadShift, 15.0, "kg"),
     "yaw_scrub": Entry(force.YawScrub, 0.008, "m"),
     "omni_roller_friction": Entry(force.OmniRollerFriction, 0.03, "-"),
-    "caster_kick": Entry(force.CasterKick, 10.0, "N"),
-    "traction_limit": Entry(world.TractionLimit, 0.2, "-"),
+    "caster_kick": Entry(force.CasterKick, 10.0, "N", most=30.0),
+    "traction_limit": Entry(world.TractionLimit, 0.2, "-", most=0.5),
     "rolling_resistance_speed": Entry(force.RollingResistanceSpeed, 0.02, "(s/m)^1.5"),
-    "quadratic_drag": Entry(force.QuadraticDrag, 12.0, "N s^2/m^2", other_form=False),
+    "quadratic_drag": Entry(force.QuadraticDrag, 12.0, "N s^2/m^2", other_form=False, most=40.0),
     "side_force": Entry(force.SideForce, 10.0, "N", other_form=False, signed=True),
     "slope": Entry(world.Slope, 0.02, "rad", other_form=False, signed=True),
     "wind": Entry(force.Wind, 8.0, "N", signed=True),
-    "backlash": Entry(actuation.Backlash, 0.01, "rad"),
+    "backlash": Entry(actuation.Backlash, 0.01, "rad", most=0.02),
     "odometry_scale": Entry(sensing.OdometryScale, 0.01, "-", other_form=False, signed=True),
     "sensor_delay": Entry(sensing.SensorDelay, 0.04, "s"),
     "clock_offset": Entry(sensing.ClockOffset, 0.04, "s", signed=True),
