@@ -45,7 +45,7 @@ TITLES = {
 }
 PICTURES = "course_*.png"
 HEADLINES = (  # file, figure, factor, what it says
-    ("physics", "steps_per_s_32768", 1e-6, "M physics steps/s: physical model, five more effects, 32,768 chairs"),
+    ("physics", "steps_per_s_32768", 1e-9, "G physics steps/s: physical model, five more effects, 32,768 chairs"),
     ("camera", "frames_per_s_32box_16384", 1e-6, "M camera frames/s, 64x64 RGB, 32 boxes, 16,384 worlds, GPU kernel"),
     ("camera", "jnp_frames_per_s", 1e-6, "M the same in plain JAX"),
     ("environment", "control_steps_per_s_course", 1e-6, "M control steps/s of the obstacle course, image included"),
