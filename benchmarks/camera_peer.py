@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import jax
 import numpy as np
+
+from benchmarks.warp_graph import graph_rates
 
 
 def warp_rates(worlds: int, calls: int, repeats: int, make_scene: Callable) -> list[float]:
@@ -33,17 +34,7 @@ def warp_rates(worlds: int, calls: int, repeats: int, make_scene: Callable) -> l
         mjw.refit_bvh(m, d, context)
         mjw.render(m, d, context)
 
-    draw()
-    with wp.ScopedCapture() as capture:
-        draw()
-    rates = []
-    for _ in range(repeats):
-        wp.synchronize()
-        start = time.perf_counter()
-        for _ in range(calls):
-            wp.capture_launch(capture.graph)
-        wp.synchronize()
-        rates.append(worlds * calls / (time.perf_counter() - start))
+    rates = graph_rates(draw, worlds, calls, repeats)
     print(f"peer: {sorted(rates)[len(rates) // 2]:,.0f} frames/s")
     return rates
 

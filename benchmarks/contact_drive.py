@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import figure, record
+from benchmarks.physics import CLAIM
 from benchmarks.plant.make import make_log
 from sysid.fit import FitConfig, fit_log, predict
 from sysid.log import Log, load_log
 
-CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
 FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
 
 
