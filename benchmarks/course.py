@@ -3,6 +3,8 @@
     python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
     python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
+    python -m benchmarks.course together --change mirror=false --out runs/ablation/unmirrored
+    python -m benchmarks.course ablation --runs runs/ablation/*   # one figure for all seeds of a name NAME_SEED
     python -m benchmarks.course planner
 """
 
@@ -19,10 +21,11 @@ import jax
 import numpy as np
 
 from benchmarks.harness import RESULTS, device_name, figure, record
+from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx.train import TrainOptions, main, mean_figures
-from whill_mjx.training import find_preset, functional_env, make_training_env
+from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
 
@@ -48,7 +51,9 @@ def together(options: argparse.Namespace) -> None:
     task = dataclasses.replace(preset.task, layout=options.layout)
     steps = options.steps or preset.total_steps
     rows = min(preset.learner.replay_capacity, steps + 2 * preset.instances)
-    learner = dataclasses.replace(preset.learner, replay_capacity=rows)
+    changes = {name: json.loads(value) for name, value in (one.split("=", 1) for one in options.change)}
+    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
+    learner = dataclasses.replace(preset.learner, replay_capacity=rows, **changes)
     vehicle = options.vehicle or "whill_cr_ramp"
     held_out = functional_env(make_training_env(task, vehicle, preset.eval_episodes), shaped=False)
 
@@ -63,7 +68,7 @@ def together(options: argparse.Namespace) -> None:
         return {f"{name}_{seed}": value for seed, one in zip(options.seeds, each, strict=True)
                 for name, value in one.items()}
 
-    env = functional_env(make_training_env(task, vehicle, preset.instances))
+    env = functional_env(make_training_env(task, vehicle, preset.instances), targets=TRUTH in learner.decode_only)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
     result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
@@ -72,7 +77,7 @@ def together(options: argparse.Namespace) -> None:
         print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
         return
     lines = [json.loads(line) for line in (options.out / "metrics.jsonl").read_text().splitlines()]
-    last = evaluation(result.agent.params, 1077, 1000)
+    last = evaluation(result.agent.acting, 1077, 1000)
     for seed, policy in zip(options.seeds, last, strict=True):
         folder = options.out / f"seed_{seed}"
         folder.mkdir(exist_ok=True)
@@ -105,6 +110,36 @@ def collect(options: argparse.Namespace) -> None:
     record("course", CLAIM, figures)
     for name, entry in figures.items():
         print(f"{name:40s} {entry['value']:.4g} {entry['unit']:8s} {entry['repeats']}")
+
+
+def ablation(options: argparse.Namespace) -> None:
+    """Record how well trainings with other settings drive late in the run, whether or not they were finished.
+
+    A folder is called NAME_SEED. A seed's value is the median return of the evaluations in the last quarter of its
+    steps; the settings that differ from the size's defaults stand beside it.
+    """
+    groups: dict[str, dict[int, tuple[Path, list[dict[str, Any]]]]] = {}
+    for path in options.runs:
+        name, _, seed = path.name.rpartition("_")
+        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        groups.setdefault(name, {})[int(seed)] = path, lines
+    figures = {}
+    for name, seeds in groups.items():
+        values, last = [], []
+        for seed, (path, lines) in sorted(seeds.items()):
+            key = next(key for key in (f"eval/{options.metric}", f"eval/{options.metric}_{seed}")
+                       if any(key in line for line in lines))  # fmt: skip
+            last.append(int(lines[-1]["env_steps"]))
+            late = [line[key] for line in lines if key in line and line["env_steps"] >= 0.75 * last[-1]]
+            values.append(statistics.median(late))
+            config = json.loads((path / "config.json").read_text())
+        usual = json.loads(json.dumps(dataclasses.asdict(learner_preset("size12m"))))
+        changed = {field: value for field, value in config.items() if field in usual and value != usual[field]}
+        ending = "" if options.metric == "return" else f"_{options.metric.removesuffix('_return')}"
+        entry = {**figure(values, "-", options.device), "seeds": sorted(seeds), "steps": last, "changed": changed}
+        figures[f"ablation_{name}{ending}_return"] = entry
+        print(f"{name}{ending}: {[round(value) for value in values]} at {last} steps, {changed}")
+    record("course", CLAIM, figures)
 
 
 def load_run(path: Path) -> dict[str, Any]:
@@ -239,10 +274,16 @@ def parse() -> argparse.Namespace:
     side.add_argument("--vehicle", type=Path)
     side.add_argument("--steps", type=int)
     side.add_argument("--minutes", type=float, help="stop by then; the same command goes on")
+    side.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the learner")
     side.set_defaults(call=together)
     several = commands.add_parser("collect")
     several.add_argument("--runs", type=Path, nargs="+", required=True)
     several.set_defaults(call=collect)
+    tried = commands.add_parser("ablation")
+    tried.add_argument("--runs", type=Path, nargs="+", required=True)
+    tried.add_argument("--metric", default="return", help="name of the evaluation's return in the log")
+    tried.add_argument("--device", required=True, help="on which they were made")
+    tried.set_defaults(call=ablation)
     ceiling = commands.add_parser("planner")
     ceiling.add_argument("--episodes", type=int, default=200)
     ceiling.set_defaults(call=planner)

@@ -44,13 +44,15 @@ TITLES = {
     "bridge": "Bridge",
 }
 PICTURES = "course_*.png"
+NOTES = RESULTS.parent / "notes"
+"""Written by hand: what was predicted and why it came out so; NOTES/FILE.md goes below the table of FILE."""
 HEADLINES = (  # file, figure, factor, what it says
     ("physics", "steps_per_s_32768", 1e-9, "G physics steps/s: physical model, five more effects, 32,768 chairs"),
     ("camera", "frames_per_s_32box_16384", 1e-6, "M camera frames/s, 64x64 RGB, 32 boxes, 16,384 worlds, GPU kernel"),
     ("camera", "jnp_frames_per_s", 1e-6, "M the same in plain JAX"),
     ("environment", "control_steps_per_s_course", 1e-6, "M control steps/s of the obstacle course, image included"),
     ("learner", "updates_per_s_12m", 1.0, "DreamerV3 updates/s, size12m, batch 16 x 64"),
-    ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (one seed)"),
+    ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (median of 5 seeds)"),
     ("dreamer_control", "balance_image_size12m_return", 1.0,
      "of 1,000: balancing a cart-pole from pixels, 100,000 steps (median of 3 seeds)"),
     ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),
@@ -132,6 +134,9 @@ def page(results: Path) -> str:
             commands = sorted({entry.get("command", content["command"]) for entry in content["figures"].values()})
             made = "Made by " + "; ".join(f"`{command}`" for command in commands) + "."
             parts.append(f"## {title}\n{content['claim']}.\n\n{table(content)}\n\n{made}\n")
+            note = NOTES / f"{stem}.md"
+            if note.exists():
+                parts.append(note.read_text())
             if stem == "course":
                 parts += [f"![{picture.stem}](results/{picture.name})\n" for picture in sorted(results.glob(PICTURES))]
             if "confusion" in content:

@@ -29,6 +29,13 @@ class AgentState:
     """Slowly following copy of the critic."""
     opt: optim.OptState
     return_norm: ReturnNorm
+    average: Params | None = None
+    """Slowly following copy of `params`, if the configuration asks for one."""
+
+    @property
+    def acting(self) -> Params:
+        """Parameters to evaluate and export: the average, where there is one."""
+        return self.params if self.average is None else self.average
 
     @property
     def updates(self) -> jax.Array:
@@ -59,7 +66,8 @@ def init_agent(config: DreamerConfig, obs_shape: ObsShape, action_dim: ActionSpe
     params = init_params(config, obs_shape, action_dim, key)
     zero = jnp.zeros((), jnp.float32)
     slow_value = jax.tree.map(jnp.copy, params["value"])  # its own memory: both are donated
-    return AgentState(params, slow_value, optim.init(params), ReturnNorm(zero, jnp.copy(zero)))
+    average = jax.tree.map(jnp.copy, params) if config.average_rate else None
+    return AgentState(params, slow_value, optim.init(params), ReturnNorm(zero, jnp.copy(zero)), average)
 
 
 def init_carry(config: DreamerConfig, batch: int, action_dim: ActionSpec) -> Carry:
@@ -168,8 +176,50 @@ def update(
     objective = partial(loss, config, agent=agent, batch=batch, key=key)
     gradients, (latent, norm, metrics) = jax.grad(lambda params: objective(params=params), has_aux=True)(agent.params)
     params, opt = optim.update(config, agent.params, gradients, agent.opt)
-    slow_value = jax.tree.map(
-        lambda slow, fast: slow + config.slow_rate * (fast - slow), agent.slow_value, params["value"]
-    )
+    slow_value = _follow(agent.slow_value, params["value"], config.slow_rate)
+    average = None if agent.average is None else _follow(agent.average, params, config.average_rate)
     metrics["gradient_norm"] = optim.global_norm(gradients)
-    return AgentState(params, slow_value, opt, norm), jax.lax.stop_gradient(latent), metrics
+    return AgentState(params, slow_value, opt, norm, average), jax.lax.stop_gradient(latent), metrics
+
+
+def update_model(
+    config: DreamerConfig, agent: AgentState, batch: Batch, key: jax.Array
+) -> tuple[AgentState, Latent, dict[str, jax.Array]]:
+    """One gradient step of the world model alone: policy, critic and return percentiles stay as they are.
+
+    Returns:
+        As `update`.
+    """
+    model = _model_of(agent.params)
+
+    def objective(params: Params) -> tuple[jax.Array, tuple[Latent, dict[str, jax.Array]]]:
+        losses, latent, metrics = world_model.loss(config, params, batch, key)
+        means = {name: jnp.mean(value) for name, value in losses.items()}
+        total = sum(means.values(), jnp.zeros(()))
+        return total, (latent, {**metrics, "loss": total, **{f"loss_{name}": x for name, x in means.items()}})
+
+    gradients, (latent, metrics) = jax.grad(objective, has_aux=True)(model)
+    mine = optim.OptState(_model_of(agent.opt.mu), _model_of(agent.opt.nu), agent.opt.count)
+    model, mine = optim.update(config, model, gradients, mine)
+    opt = optim.OptState({**agent.opt.mu, **mine.mu}, {**agent.opt.nu, **mine.nu}, mine.count)
+    metrics["gradient_norm"] = optim.global_norm(gradients)
+    agent = dataclasses.replace(agent, params={**agent.params, **model}, opt=opt)
+    return agent, jax.lax.stop_gradient(latent), metrics
+
+
+def restart(agent: AgentState) -> AgentState:
+    """The agent with a new optimiser and average.
+
+    Bias corrections and warm-up hang on the count of updates. Policy and critic have had none in pretraining, so that a
+    count which goes on would make their first steps many times too large.
+    """
+    average = None if agent.average is None else agent.params
+    return dataclasses.replace(agent, opt=optim.init(agent.params), average=average)
+
+
+def _model_of(params: Params) -> Params:
+    return {name: params[name] for name in world_model.PARTS}
+
+
+def _follow(slow: Params, fast: Params, rate: float) -> Params:
+    return jax.tree.map(lambda a, b: a + rate * (b - a), slow, fast)

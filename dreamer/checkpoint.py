@@ -1,6 +1,6 @@
 """Checkpoints of a run: written whole or not at all, checked on reading, the last two kept.
 
-    FOLDER/<env_steps>/state      arrays, by orbax
+    FOLDER/<env_steps>/state      arrays, by orbax; in pretraining <env_steps>.<what is done of it>
                        meta.json  configuration, counters, and length and checksum of every file
 """
 
@@ -35,7 +35,13 @@ Rows = tuple[str, int, int]
 
 
 def save(
-    folder: Path, state: Any, config: DreamerConfig, env_steps: int, wall_s: float = 0.0, rows: Rows | None = None
+    folder: Path,
+    state: Any,
+    config: DreamerConfig,
+    env_steps: int,
+    wall_s: float = 0.0,
+    rows: Rows | None = None,
+    pretraining: int = 0,
 ) -> Path:
     """Write a checkpoint and return its path; older ones beyond the last two are removed afterwards.
 
@@ -47,11 +53,12 @@ def save(
         wall_s: time trained so far [s].
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
             used ones, so that a replay that is not full costs no more than it holds.
+        pretraining: steps and updates made so far where no counted step has been; part of the name.
     """
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
-    target = folder / f"{env_steps:012d}"
+    target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
     if not parallel.is_first_process():
         return target

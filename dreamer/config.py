@@ -66,13 +66,22 @@ class DreamerConfig:
     train_ratio: float = 512.0
     """Replayed steps per control step, control steps summed over instances."""
     learning_starts: int = 1024
-    """Control steps with random actions before the first update (and at least batch_length + 1 per instance)."""
+    """Control steps with random actions before the first update (and at least batch_length + 1 per instance); those of
+    `pretrain_steps` count too."""
     replay_capacity: int = 1_000_000
     """Control steps kept, summed over instances."""
     online: bool = True
     """Train on each fresh sequence once before sampling uniformly."""
     steps_per_iter: int = 1
     """Steps of each instance in one dispatch."""
+
+    pretrain_steps: int = 0
+    """Uncounted control steps with random actions, summed over instances, before the counted ones; 0: none."""
+    pretrain_updates: int = 0
+    """Updates of the world model alone on these steps, before the first counted one."""
+
+    mirror: bool = False
+    """Remember every step a second time as the environment's mirror shows it. Steps and ratio count the real ones."""
 
     horizon: float = 333.0
     """Effective horizon [steps]; discount 1 - 1/horizon, contained in the continue head."""
@@ -123,6 +132,8 @@ class DreamerConfig:
     """Updates over which the learning rate rises linearly."""
     lr_decay: int = 0
     """Updates by which it has fallen linearly to a twentieth, for runs of known length; 0 keeps it."""
+    average_rate: float = 0.0
+    """Rate at which an average of the parameters follows them, for evaluations and exports; 0 keeps none."""
     agc: float = 0.3
     """Adaptive clipping: largest update norm relative to the parameter norm, per tensor."""
     agc_min_norm: float = 1e-3
@@ -151,9 +162,20 @@ class DreamerConfig:
             (self.representation != "barlow" or not self.decode_only, "decode_only", "must be () without a decoder"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
+            (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),
             (self.batch_length >= 2, "batch_length", "must be at least 2"),
             (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),
             (self.steps_per_iter >= 1, "steps_per_iter", "must be at least 1"),
+            (
+                (self.pretrain_steps > 0) == (self.pretrain_updates > 0) and self.pretrain_steps >= 0,
+                "pretrain_steps",
+                f"must be positive together with pretrain_updates ({self.pretrain_updates}), or both 0",
+            ),
+            (
+                self.pretrain_steps <= self.replay_capacity,
+                "pretrain_steps",
+                f"must fit replay_capacity ({self.replay_capacity}): what is overwritten is not learned from",
+            ),
             (self.kernel == 5, "kernel", "must be 5: the 2x2-block form of the convolutions is written for it"),
         )
         for ok, field, rule in rules:

@@ -2,22 +2,20 @@
 
 The folder is described in docs/policy_file.md. The vehicle reads `policy.onnx`, the archive is `weights.npz`; both are
 plain data, nothing in the file can execute code. The writer checks its own work: it replays the ONNX network beside
-the JAX one and records the largest difference of their actions in `policy.json`.
+the JAX one and records the largest difference of their actions in `policy.json`. `export_agent` writes agents that see
+and do something else than a vehicle in the same way.
 """
 
-import contextlib
 import dataclasses
 import datetime
 import hashlib
 import json
-import logging
 import math
 import os
 import shutil
-import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +23,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dreamer import agent, sensors, spaces, world_model
+from dreamer.config import DreamerConfig
+from dreamer.network import OPSET, Carry, Network, Shapes, parity, to_onnx
+from dreamer.spaces import ActionSpec, Discrete, ObsShape
+from dreamer.types import Params
+
 SCHEMA = 1
 KIND = "micromobility-policy"
-OPSET = 18
-"""ONNX operator set of the file. 18 is readable by onnxruntime 1.14 and newer, so also by a vehicle's older system."""
-IR_VERSION = 8
-"""ONNX file version that belongs to opset 18."""
-ACTION_TOLERANCE = 1e-5
-"""Largest difference of two actions in [-1, 1] that still counts as float32 rounding of one step."""
-FLIP_SHARE = 0.02
-"""Share of steps in which an argmax may fall to the other side of a tie. A wrong export differs at every step."""
+AGENT_KIND = "dreamer-onnx-policy"
+SINGLE = "observation"
+"""Name of an observation that the environment does not name."""
 
-Carry = dict[str, jax.Array]
 Step = Callable[[Carry, jax.Array], tuple[Carry, jax.Array]]
 
 
@@ -107,8 +105,14 @@ def export_policy(
     path = Path(path)
     shapes = {name: jax.ShapeDtypeStruct(np.shape(value), value.dtype) for name, value in carry.items()}
     _check_signature(step, shapes, contract)
-    model = _to_onnx(step, shapes, contract)
-    parity = _parity(model, step, shapes, contract, check_steps)
+
+    def named_step(carry: Carry, obs: dict[str, jax.Array]) -> tuple[Carry, tuple[jax.Array, ...]]:
+        carry, action = step(carry, obs["image"])
+        return carry, (action.astype(jnp.float32),)
+
+    network = Network(named_step, shapes, {"image": _image_shape(contract)})
+    model = to_onnx(network)
+    checked = parity(model, network, check_steps)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -120,14 +124,104 @@ def export_policy(
         vehicle_sha256 = contract.vehicle_sha256
         if vehicle_file is not None:
             vehicle_sha256 = _copy_vehicle(Path(vehicle_file), folder / "vehicle.toml", vehicle_sha256)
-        files = {item.name: _sha256(item.read_bytes()) for item in sorted(folder.iterdir())}
-        description = _describe(contract, shapes, files, vehicle_sha256, parity)
-        (folder / "policy.json").write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
-        folder.chmod(0o755)
-        replace_folder(folder, path)
+        _finish(folder, path, _describe(contract, vehicle_sha256), network, checked)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return path
+
+
+def export_agent(
+    path: str | Path,
+    config: DreamerConfig,
+    params: Params,
+    obs_shape: ObsShape,
+    action_dim: ActionSpec,
+    *,
+    task: str = "",
+    check_steps: int = 200,
+) -> Path:
+    """Write the policy of an agent as ONNX, whatever it sees and does, and return its folder.
+
+    Each observation is an input by its name (`observation`, where it has none), those that only the decoder sees are
+    not. The action is what the environment receives; of classes there is a second output, their probabilities.
+    `dreamer.policy.Policy.load` reads it. A vehicle needs a contract of units and rates: `export_policy`.
+
+    Args:
+        path: folder to write; an existing policy file there is replaced as a whole.
+        config: sizes of the agent.
+        params: of one agent.
+        obs_shape: as the environment declares it.
+        action_dim: as the environment declares it.
+        task: name of the task, for the reader.
+        check_steps: recurrent steps on random observations over which ONNX and JAX are compared.
+
+    Raises:
+        ValueError: parameters, observations and actions do not fit, two tensors have one name, or the ONNX network acts
+            differently; nothing is written.
+    """
+    path, actions = Path(path), spaces.actions(action_dim)
+    bias = params["policy"]["out"]["b"]
+    if bias.shape != (actions.outputs,):
+        raise ValueError(f"params: the policy's last bias has the shape {bias.shape}, but {actions} needs "
+                         f"({actions.outputs},). Give the action_dim of the training, and of several seeds one agent "
+                         "(dreamer.seeds.pick).")
+    network = _network_of(config, params, obs_shape, actions)
+    model = to_onnx(network)
+    checked = parity(model, network, check_steps)
+    described = {name: list(one) for name, one in obs_shape.items()} if isinstance(obs_shape, Mapping) else obs_shape
+    table = {
+        "schema": SCHEMA,
+        "kind": AGENT_KIND,
+        "observation": sensors.visible(config, described),
+        "action": {"kind": type(actions).__name__.lower(), "size": actions.width},
+        "task": task,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        (folder / "policy.onnx").write_bytes(model)
+        save_arrays(folder / "weights.npz", flatten_weights(params))
+        _finish(folder, path, table, network, checked)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return path
+
+
+def _network_of(
+    config: DreamerConfig, params: Params, obs_shape: ObsShape, actions: spaces.Box | spaces.Discrete
+) -> Network:
+    """The policy of an agent as a function of named arrays."""
+    seen = sensors.visible(config, obs_shape)
+    several = isinstance(seen, Mapping)
+
+    def step(carry: Carry, obs: dict[str, jax.Array]) -> tuple[Carry, tuple[jax.Array, ...]]:
+        carry, action = agent.policy_step(config, params, carry, obs if several else obs[SINGLE])
+        if not isinstance(actions, Discrete):
+            return carry, (actions.to_env(action),)
+        raw = world_model.head(params["policy"], jnp.concatenate([carry["deter"], carry["stoch"]]))
+        return carry, (actions.to_env(action), actions.probs(config, raw))
+
+    inputs = jax.eval_shape(lambda: spaces.zeros({name: seen[name] for name in sorted(seen)} if several else seen))
+    carry = {name: jax.ShapeDtypeStruct(x.shape, x.dtype) for name, x in agent.policy_carry(config, actions).items()}
+    outputs = ("action", "probabilities") if isinstance(actions, Discrete) else ("action",)
+    return Network(step, carry, dict(inputs) if several else {SINGLE: inputs}, outputs)
+
+
+def _finish(folder: Path, path: Path, table: dict[str, Any], network: Network, checked: dict[str, Any]) -> None:
+    """Describe the network and the files in `folder` in its policy.json, and put the folder at `path`."""
+    inputs, outputs = network.tensors
+    described = {
+        **table,
+        "carry": [{"name": name, "shape": list(shape.shape), "dtype": np.dtype(shape.dtype).name}
+                  for name, shape in network.carry.items()],
+        "onnx": {"opset": OPSET, "inputs": inputs, "outputs": outputs},
+        "files": {item.name: sha256(item.read_bytes()) for item in sorted(folder.iterdir())},
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "parity": checked,
+    }
+    (folder / "policy.json").write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
+    folder.chmod(0o755)
+    replace_folder(folder, path)
 
 
 def flatten_weights(weights: Any) -> dict[str, np.ndarray]:
@@ -161,7 +255,7 @@ def _image_shape(contract: PolicyContract) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((contract.height, contract.width, 3), jnp.uint8)
 
 
-def _check_signature(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: PolicyContract) -> None:
+def _check_signature(step: Step, shapes: Shapes, contract: PolicyContract) -> None:
     """Raise where `step` does not return its own carry and one action."""
     new_carry, action = jax.eval_shape(step, shapes, _image_shape(contract))
     if action.shape != (2,):
@@ -174,73 +268,7 @@ def _check_signature(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contra
                          "Cast the state back inside step.")
 
 
-def tensor_names(names: list[str]) -> tuple[list[str], list[str]]:
-    """Return the ONNX input and output names; ONNX wants each name once, so a state differs on its way in and out."""
-    return ["image", *(f"carry_{name}" for name in names)], ["action", *(f"next_{name}" for name in names)]
-
-
-def _to_onnx(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: PolicyContract) -> bytes:
-    """Return the network as a serialised ONNX model of standard operators."""
-    import jax2onnx
-    import onnx
-    import onnx.inliner
-
-    names = list(shapes)
-    inputs, outputs = tensor_names(names)
-
-    def flat_step(image: jax.Array, *values: jax.Array) -> tuple[jax.Array, ...]:
-        carry, action = step(dict(zip(names, values, strict=True)), image)
-        return action.astype(jnp.float32), *(carry[name] for name in names)
-
-    quiet = logging.getLogger("onnx_ir")
-    level = quiet.level
-    quiet.setLevel(logging.ERROR)  # it warns about shapes it leaves out, which no runtime needs
-    try:
-        with _jax_restored():
-            model = jax2onnx.to_onnx(flat_step, [_image_shape(contract), *shapes.values()], model_name="policy",
-                                     opset=OPSET, input_names=inputs)
-    finally:
-        quiet.setLevel(level)
-    model = onnx.inliner.inline_local_functions(model)
-    _name_outputs(model, outputs)
-    model.ir_version = IR_VERSION
-    nodes = model.graph.node
-    foreign = sorted({f"{node.domain}::{node.op_type}" for node in nodes if node.domain not in ("", "ai.onnx")})
-    if foreign:
-        raise ValueError(f"policy.onnx: operators {foreign} are not in the ONNX standard set, so a plain onnxruntime "
-                         "cannot run them. Rewrite those operations in the policy step.")
-    onnx.checker.check_model(model, full_check=False)
-    return model.SerializeToString()
-
-
-@contextlib.contextmanager
-def _jax_restored() -> Iterator[None]:
-    """Put back every attribute of JAX's modules that is exchanged inside.
-
-    jax2onnx replaces functions of jax.numpy while it traces and leaves some in place; its cumsum refuses arguments that
-    JAX's own takes, so that a program would fail at its next trace.
-    """
-    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("jax", "flax") and module]
-    before = [(module, dict(vars(module))) for module in modules]
-    try:
-        yield
-    finally:
-        for module, attributes in before:
-            for name, value in attributes.items():
-                if vars(module).get(name) is not value:
-                    setattr(module, name, value)
-
-
-def _name_outputs(model: Any, names: list[str]) -> None:
-    """Give the graph's outputs their names; one value may be two outputs (the action is often part of the carry)."""
-    import onnx
-
-    for output, name in zip(model.graph.output, names, strict=True):
-        model.graph.node.append(onnx.helper.make_node("Identity", [output.name], [name], name=f"output_{name}"))
-        output.name = name
-
-
-def _to_stablehlo(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: PolicyContract) -> bytes:
+def _to_stablehlo(step: Step, shapes: Shapes, contract: PolicyContract) -> bytes:
     from jax import export
 
     try:
@@ -251,61 +279,8 @@ def _to_stablehlo(step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract:
                          "install. Run `pip install flatbuffers` or export with stablehlo=False.") from error
 
 
-def _parity(model: bytes, step: Step, shapes: dict[str, jax.ShapeDtypeStruct], contract: PolicyContract,
-            steps: int) -> dict[str, Any]:
-    """Return the largest action differences of ONNX and JAX over random images.
-
-    The difference of one step, both from JAX's state, tells whether the export is right, and is what is judged. The
-    difference after many steps, each from its own state, is noted as well: a recurrent network can amplify rounding,
-    most of all on noise, which it was never trained on. Where an argmax latent falls on a tie, rounding decides and
-    both continue on different states: such a step is counted as a flip and the states are made equal again.
-    """
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    names = list(shapes)
-    inputs, _ = tensor_names(names)
-
-    def onnx_step(carry: list[np.ndarray], image: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        action, *carry = session.run(None, dict(zip(inputs, [image, *carry], strict=True)))
-        return action, carry
-
-    jax_step = jax.jit(step)
-    carry: Any = {name: np.zeros(shape.shape, shape.dtype) for name, shape in shapes.items()}
-    own_carry = list(carry.values())
-    rng = np.random.default_rng(0)
-    worst, drift, flips = 0.0, 0.0, 0
-    for _ in range(steps):
-        image = rng.integers(0, 256, (contract.height, contract.width, 3), np.uint8)
-        one_action, one_carry = onnx_step([np.asarray(carry[name]) for name in names], image)
-        own_action, own_carry = onnx_step(own_carry, image)
-        carry, action = jax_step(carry, image)
-        jax_carry = [np.asarray(carry[name]) for name in names]
-        if _distance(jax_carry, own_carry) > 0.5:
-            own_carry = jax_carry
-        else:
-            drift = float(np.maximum(drift, _distance([action], [own_action])))
-        if _distance(jax_carry, one_carry) > 0.5:
-            flips += 1
-        else:
-            worst = float(np.maximum(worst, _distance([action], [one_action])))
-    if not worst <= ACTION_TOLERANCE or flips > FLIP_SHARE * steps:  # a NaN fails too
-        raise ValueError(f"policy.onnx: a step of it differs from JAX by up to {worst:.2g} with {flips} latent flips "
-                         f"in {steps} steps; at most {ACTION_TOLERANCE} and {FLIP_SHARE:.0%} flips are rounding. "
-                         "Export in float32 with a deterministic step and jax_default_matmul_precision='highest'.")
-    return {"steps": steps, "max_abs_action_difference": worst, "max_abs_action_drift": drift, "latent_flips": flips}
-
-
-def _distance(a: list[Any], b: list[Any]) -> float:
-    """Return the largest difference of two lists of arrays; NaN where one has it."""
-    differences = [np.abs(np.asarray(x, np.float64) - y).max(initial=0) for x, y in zip(a, b, strict=True)]
-    return float(np.max(differences, initial=0.0))
-
-
-def _describe(contract: PolicyContract, shapes: dict[str, jax.ShapeDtypeStruct], files: dict[str, str],
-              vehicle_sha256: str, parity: dict[str, Any]) -> dict[str, Any]:
-    """Return policy.json as a dict."""
-    inputs, outputs = tensor_names(list(shapes))
+def _describe(contract: PolicyContract, vehicle_sha256: str) -> dict[str, Any]:
+    """Return what policy.json says about the vehicle."""
     return {
         "schema": SCHEMA,
         "kind": KIND,
@@ -314,22 +289,16 @@ def _describe(contract: PolicyContract, shapes: dict[str, jax.ShapeDtypeStruct],
                    "low": [float(x) for x in contract.action_low], "high": [float(x) for x in contract.action_high]},
         "rate_hz": float(contract.rate_hz),
         "action_repeat": int(contract.action_repeat),
-        "carry": [{"name": name, "shape": list(shape.shape), "dtype": np.dtype(shape.dtype).name}
-                  for name, shape in shapes.items()],
-        "onnx": {"opset": OPSET, "inputs": inputs, "outputs": outputs},
         "camera": dict(contract.camera),
         "task": contract.task,
         "vehicle_sha256": vehicle_sha256,
-        "files": files,
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "parity": parity,
     }
 
 
 def _copy_vehicle(source: Path, target: Path, expected: str) -> str:
     """Copy the vehicle file and return its SHA-256."""
     data = source.read_bytes()
-    digest = _sha256(data)
+    digest = sha256(data)
     if expected and expected != digest:
         raise ValueError(f"{source}: SHA-256 {digest} is not the contract's vehicle_sha256 {expected}. "
                          "Give the vehicle file that the policy was trained with.")
@@ -337,7 +306,8 @@ def _copy_vehicle(source: Path, target: Path, expected: str) -> str:
     return digest
 
 
-def _sha256(data: bytes) -> str:
+def sha256(data: bytes) -> str:
+    """Return the checksum by which policy.json names a file."""
     return hashlib.sha256(data).hexdigest()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
@@ -20,6 +21,17 @@ from dreamer.rssm import Latent
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
 
 Metrics = dict[str, jax.Array]
+Update = Callable[[DreamerConfig, AgentState, Batch, jax.Array], tuple[AgentState, Latent, Metrics]]
+
+
+@struct.dataclass
+class Pretrained:
+    """What was done before the first counted step."""
+
+    steps: jax.Array
+    """() int32 control steps with random actions, summed over instances."""
+    updates: jax.Array
+    """() int32 updates of the world model alone."""
 
 
 @struct.dataclass
@@ -41,15 +53,27 @@ class TrainState:
     """(N,) of the running episodes."""
     episode_length: jax.Array
     """(N,) int32 steps of the running episodes."""
+    pretrained: Pretrained | None = None
+    """None where the configuration asks for no pretraining."""
 
 
 def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array) -> TrainState:
     """State before the first step.
 
     Raises:
-        ValueError: observation, action or replay do not fit.
+        ValueError: observation, action, replay or pretraining do not fit, or there is no mirror.
     """
+    if config.mirror and env.mirror is None:
+        raise ValueError("DreamerConfig.mirror is set, but the environment has no mirror: unset it, or give one.")
     sensors.check(config, env.obs_shape)
+    needed = config.batch_length * env.num_envs
+    if 0 < config.pretrain_steps <= needed:
+        raise ValueError(
+            f"DreamerConfig.pretrain_steps = {config.pretrain_steps}: {env.num_envs} instances must each drive more "
+            f"than batch_length ({config.batch_length}) steps to learn from. Raise it above {needed}, or set it and "
+            "pretrain_updates to 0."
+        )
+    zero = jnp.zeros((), jnp.int32)
     agent_key, env_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state, transition = env.reset(env_key)
     spaces.check(env.obs_shape, transition.obs, env.num_envs)
@@ -57,13 +81,16 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
         agent=agents.init_agent(config, env.obs_shape, env.action_dim, agent_key),
         env_state=env_state,
         transition=transition,
-        carry=agents.init_carry(config, env.num_envs, env.action_dim),
-        replay=replay.init(config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width),
+        carry=agents.init_carry(config, env.num_envs * (1 + config.mirror), env.action_dim),
+        replay=replay.init(
+            config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror
+        ),
         key=key,
-        env_steps=jnp.zeros((), jnp.int32),
-        credit=jnp.zeros((), jnp.int32),
+        env_steps=zero,
+        credit=jnp.copy(zero),
         episode_return=jnp.zeros((env.num_envs,), jnp.float32),
         episode_length=jnp.zeros((env.num_envs,), jnp.int32),
+        pretrained=Pretrained(jnp.copy(zero), jnp.copy(zero)) if config.pretrain_steps else None,
     )
 
 
@@ -98,18 +125,22 @@ def train_iteration(
 
 
 def collect(
-    env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax.Array
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax.Array, always_random: bool = False
 ) -> tuple[TrainState, Metrics]:
-    """One step of every instance, written to the replay. Actions are random until `learning_starts`."""
+    """One step of every instance, written to the replay. Actions are random until learning has started, or always."""
     policy_key, random_key = jax.random.split(key)
-    frame = state.transition
+    frame = with_mirrored(env, state.transition) if config.mirror else state.transition
     carry, action = agents.act(config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key)
     actions = spaces.actions(env.action_dim)
     random_action = actions.random(random_key, action.shape[:1])
-    action = jnp.where(state.env_steps < config.learning_starts, random_action, action)
+    action = jnp.where(started(config, state) & (not always_random), action, random_action)
+    real = action[: env.num_envs]
+    if config.mirror:
+        assert env.mirror is not None
+        action = jnp.concatenate([real, env.mirror.action(real)])
     latent = Latent(carry["deter"], carry["stoch"])
     memory = replay.write(config, state.replay, frame, action, latent)
-    env_state, transition = env.step(state.env_state, actions.to_env(action))
+    env_state, transition = env.step(state.env_state, actions.to_env(real))
     begun = transition.is_first
     episode_return = jnp.where(begun, 0.0, state.episode_return) + transition.reward
     episode_length = jnp.where(begun, 0, state.episode_length + 1)
@@ -130,6 +161,19 @@ def collect(
     return state, metrics
 
 
+def started(config: DreamerConfig, state: TrainState) -> jax.Array:
+    """() bool: `learning_starts` random steps have been made, before the counted ones or among them."""
+    before = 0 if state.pretrained is None else state.pretrained.steps
+    return before + state.env_steps >= config.learning_starts
+
+
+def with_mirrored(env: FunctionalEnv, transition: Transition) -> Transition:
+    """The frames of N instances, and after them the same N as the mirror shows them."""
+    assert env.mirror is not None
+    mirrored = dataclasses.replace(transition, obs=env.mirror.obs(transition.obs))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), transition, mirrored)
+
+
 def learn(
     env: FunctionalEnv, config: DreamerConfig, state: TrainState, key: jax.Array, mesh: Mesh | None = None
 ) -> tuple[TrainState, Metrics]:
@@ -140,26 +184,41 @@ def learn(
     """
     gain, price = credit_rates(config, env.num_envs)
     enough = replay.size(state.replay) > config.batch_length
-    ready = (state.env_steps >= config.learning_starts) & enough
+    ready = started(config, state) & enough
     credit = state.credit + jnp.where(ready, gain, 0)
     updates = credit // price
+    state, metrics = replayed_updates(config, state, updates, key, agents.update, mesh)
+    return dataclasses.replace(state, credit=credit - updates * price), metrics
 
-    def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[AgentState, Replay, Metrics]:
+
+def replayed_updates(
+    config: DreamerConfig, state: TrainState, updates: jax.Array, key: jax.Array, update: Update, mesh: Mesh | None
+) -> tuple[TrainState, Metrics]:
+    """`updates` times () a batch, an `update` on it, and its latents written back; the metrics are sums."""
+
+    def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[tuple[AgentState, Replay], Metrics]:
         agent, memory = carry
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         memory, batch, window = replay.sample(config, memory, sample_key)
-        agent, latent, metrics = agents.update(config, agent, split_batch(mesh, batch), update_key)
-        return agent, replay.write_back(config, memory, window, latent), metrics
+        agent, latent, metrics = update(config, agent, split_batch(mesh, batch), update_key)
+        return (agent, replay.write_back(config, memory, window, latent)), metrics
 
-    def add(i: jax.Array, carry: tuple[AgentState, Replay, Metrics]) -> tuple[AgentState, Replay, Metrics]:
-        agent, memory, metrics = one(i, carry[:2])
-        return agent, memory, jax.tree.map(jnp.add, carry[2], metrics)
-
-    shapes = jax.eval_shape(one, jnp.zeros((), jnp.int32), (state.agent, state.replay))[2]
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    agent, memory, sums = jax.lax.fori_loop(0, updates, add, (state.agent, state.replay, zeros))
+    (agent, memory), sums = sum_over(updates, one, (state.agent, state.replay))
     metrics = {**{f"update/{name}": value for name, value in sums.items()}, "updates": updates}
-    return dataclasses.replace(state, agent=agent, replay=memory, credit=credit - updates * price), metrics
+    return dataclasses.replace(state, agent=agent, replay=memory), metrics
+
+
+def sum_over(
+    count: jax.Array, body: Callable[[jax.Array, Any], tuple[Any, Metrics]], carry: Any
+) -> tuple[Any, Metrics]:
+    """`count` times () `carry, terms = body(i, carry)`: the last carry, and the sums of the terms."""
+
+    def add(i: jax.Array, loop: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        carry, terms = body(i, loop[0])
+        return carry, jax.tree.map(jnp.add, loop[1], terms)
+
+    shapes = jax.eval_shape(body, jnp.zeros((), jnp.int32), carry)[1]
+    return jax.lax.fori_loop(0, count, add, (carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)))
 
 
 def split_batch(mesh: Mesh | None, batch: Batch) -> Batch:
@@ -174,11 +233,13 @@ def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:
     return num_envs * ratio.numerator, config.replayed_per_update * ratio.denominator
 
 
-def compile_iteration(env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None) -> Any:
-    """The compiled iteration, state -> (state, metrics), with the state donated."""
+def compile_iteration(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None, step: Any = train_iteration
+) -> Any:
+    """The compiled iteration, state -> (state, metrics), with the state donated; of `step`, if another one is meant."""
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_iteration(env, config, state, mesh)
+        return step(env, config, state, mesh)
 
     if mesh is None:
         return jax.jit(iterate, donate_argnums=0).lower(state).compile()

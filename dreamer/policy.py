@@ -4,7 +4,8 @@
     action, carry = policy.step(obs, carry)      # carry None begins an episode
 
 A folder holds `policy.json` (sizes, observations, actions) and `weights.npz` (plain arrays); nothing in it can execute
-code. The policy files of vehicles (docs/policy_file.md) are read as well; they run in onnxruntime.
+code. What `dreamer.export` wrote, agents and the policy files of vehicles (docs/policy_file.md), is read as well and
+runs in onnxruntime.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
-        """The policy in a folder that `save` or `export_policy` wrote.
+        """The policy in a folder that `save`, `export_agent` or `export_policy` wrote.
 
         Raises:
             ValueError: no policy, or one of another version; names the file, the rule and the remedy.
@@ -52,14 +53,16 @@ class Policy:
         table = _read_table(path)
         if table["kind"] == export.KIND:
             return _load_exported(path, table)
+        shape = table["observation"]
+        obs_shape = {k: tuple(v) for k, v in shape.items()} if isinstance(shape, dict) else tuple(shape)
+        if table["kind"] == export.AGENT_KIND:
+            return _load_agent(path, table, obs_shape)
         numbers: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table["config"].items()}
         config = DreamerConfig(**numbers)
         with np.load(path / "weights.npz", allow_pickle=False) as arrays:
             params = _nest({name: jnp.asarray(arrays[name]) for name in arrays.files})
         kinds: dict[str, type[Box] | type[Discrete]] = {"box": Box, "discrete": Discrete}
         action = kinds[table["action"]["kind"]](table["action"]["size"])
-        shape = table["observation"]
-        obs_shape = {k: tuple(v) for k, v in shape.items()} if isinstance(shape, dict) else tuple(shape)
         return of_agent(config, params, obs_shape, action)
 
     def step(self, obs: Any, carry: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -135,12 +138,14 @@ def _read_table(path: Path) -> dict[str, Any]:
     name = path / "policy.json"
     try:
         table = json.loads(name.read_text())
-        if (table["kind"], table["schema"]) in ((KIND, SCHEMA), (export.KIND, export.SCHEMA)):
+        known = ((KIND, SCHEMA), (export.KIND, export.SCHEMA), (export.AGENT_KIND, export.SCHEMA))
+        if (table["kind"], table["schema"]) in known:
             return table
         problem = f"kind {table['kind']!r}, schema {table['schema']} is not known here"
     except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"not readable as a policy's description ({error!r})"
-    raise ValueError(f"{name}: {problem}. Give the folder that dreamer.policy.save or export_policy wrote.")
+    raise ValueError(f"{name}: {problem}. Give the folder that dreamer.policy.save, export_agent or export_policy "
+                     "wrote.")
 
 
 def _nest(flat: dict[str, Any]) -> Params:
@@ -153,6 +158,32 @@ def _nest(flat: dict[str, Any]) -> Params:
             branch = branch.setdefault(parent, {})
         branch[last] = value
     return tree
+
+
+def _load_agent(path: Path, table: dict[str, Any], obs_shape: ObsShape) -> Policy:
+    """What `export_agent` wrote, after a check of its files."""
+    import onnxruntime
+
+    for name, wanted in table["files"].items():
+        if not (path / name).is_file() or export.sha256((path / name).read_bytes()) != wanted:
+            raise ValueError(f"{path / name}: missing, or its SHA-256 is not the one in policy.json ({wanted}). Copy "
+                             "or export the policy again.")
+    session = onnxruntime.InferenceSession(str(path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    state = [entry["name"] for entry in table["carry"]]
+    inputs, outputs = table["onnx"]["inputs"], table["onnx"]["outputs"]
+    after = len(outputs) - len(state)
+
+    def call(carry: dict[str, Any], obs: Any) -> tuple[dict[str, Any], Any]:
+        named = obs if isinstance(obs, dict) else {export.SINGLE: obs}
+        arrays = {**named, **{f"carry_{name}": carry[name] for name in state}}
+        results = session.run(outputs, {name: np.asarray(arrays[name]) for name in inputs})
+        return dict(zip(state, results[after:], strict=True)), results[0]
+
+    return Policy(obs_shape, _zero_carry(table), call)
+
+
+def _zero_carry(table: dict[str, Any]) -> dict[str, np.ndarray]:
+    return {entry["name"]: np.zeros(entry["shape"], entry["dtype"]) for entry in table["carry"]}
 
 
 def _load_exported(path: Path, table: dict[str, Any]) -> Policy:
@@ -170,5 +201,4 @@ def _load_exported(path: Path, table: dict[str, Any]) -> Policy:
         return dict(zip(names, values, strict=True)), low + (high - low) * (np.asarray(action, np.float64) + 1) / 2
 
     image = table["image"]
-    zero = {entry["name"]: np.zeros(entry["shape"], entry["dtype"]) for entry in table["carry"]}
-    return Policy((image["height"], image["width"], image["channels"]), zero, call)
+    return Policy((image["height"], image["width"], image["channels"]), _zero_carry(table), call)

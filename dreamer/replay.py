@@ -91,9 +91,9 @@ def rows_for(config: DreamerConfig, num_envs: int) -> int:
     return rows
 
 
-def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int) -> Replay:
-    """An empty memory for actions of so many numbers."""
-    shape = (rows_for(config, num_envs), num_envs)
+def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int, copies: int = 1) -> Replay:
+    """An empty memory for actions of so many numbers, with `copies` streams for each instance."""
+    shape = (rows_for(config, num_envs), copies * num_envs)
     return Replay(
         obs=spaces.zeros(obs_shape, shape),
         reward=jnp.zeros(shape, jnp.float32),

@@ -16,7 +16,10 @@ from dreamer.config import DreamerConfig
 from dreamer.iteration import Metrics, TrainState, init_state, train_iteration
 from dreamer.types import FunctionalEnv, Params
 
-SHARED = ("env_steps", "credit", "replay.written", "replay.online_next", "agent.opt.count")
+SHARED = (
+    "env_steps", "credit", "replay.written", "replay.online_next", "agent.opt.count", "pretrained.steps",
+    "pretrained.updates",
+)  # fmt: skip
 
 
 def axes(state: TrainState) -> Any:
@@ -49,20 +52,24 @@ def init_states(env: FunctionalEnv, config: DreamerConfig, seeds: Sequence[int])
     return jax.vmap(begin, out_axes=axes(shape))(jnp.asarray(seeds, jnp.int32))
 
 
-def train_iterations(env: FunctionalEnv, config: DreamerConfig, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One `train_iteration` of every seed; metrics (S,) by name."""
+def train_iterations(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, step: Any = train_iteration
+) -> tuple[TrainState, Metrics]:
+    """One `train_iteration`, or another `step`, of every seed; metrics (S,) by name."""
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_iteration(env, config, state)
+        return step(env, config, state)
 
     where = axes(state)
     return jax.vmap(iterate, in_axes=(where,), out_axes=(where, 0))(state)
 
 
-def compile_iterations(env: FunctionalEnv, config: DreamerConfig, state: TrainState) -> Callable[[TrainState], Any]:
+def compile_iterations(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, step: Any = train_iteration
+) -> Callable[[TrainState], Any]:
     """The compiled `train_iterations`, with the state donated."""
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_iterations(env, config, state)
+        return train_iterations(env, config, state, step)
 
     return jax.jit(iterate, donate_argnums=0).lower(state).compile()

@@ -14,8 +14,9 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dreamer import checkpoint, parallel, seeds
+from dreamer import checkpoint, parallel, pretrain, seeds
 from dreamer.agent import AgentState
+from dreamer.board import Board
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
 from dreamer.iteration import TrainState, compile_init, compile_iteration, init_state, train_iteration
@@ -42,7 +43,7 @@ class TrainResult:
     env_steps: int
     """Control steps summed over instances."""
     updates: int
-    """Gradient steps."""
+    """Gradient steps of the whole agent."""
     wall_s: float
     """Time of the run [s], all its parts together, compilation included."""
     last_metrics: dict[str, float]
@@ -54,18 +55,20 @@ class Meter:
 
     def __init__(self) -> None:
         self._sums: list[dict[str, jax.Array]] = []
+        self._steps = 0
         self._since = time.monotonic()
 
-    def add(self, metrics: dict[str, jax.Array]) -> None:
-        """Queue one iteration's sums, without waiting for the device."""
+    def add(self, metrics: dict[str, jax.Array], steps: int) -> None:
+        """Queue one iteration's sums and control steps, without waiting for the device."""
         self._sums.append(metrics)
+        self._steps += steps
 
     def wait_for_previous(self) -> None:
         """Let the device be at most one iteration behind the host."""
         if len(self._sums) > 1:
             jax.block_until_ready(self._sums[-2])
 
-    def read(self, config: DreamerConfig, steps_per_iter: int) -> dict[str, float]:
+    def read(self, config: DreamerConfig) -> dict[str, float]:
         """Means since the last reading, and rates; starts anew."""
         fetched = jax.device_get(self._sums)
         # Several seeds: their mean.
@@ -73,8 +76,7 @@ class Meter:
         now = time.monotonic()
         seconds, self._since = max(now - self._since, 1e-9), now
         updates, episodes = sums.pop("updates", 0.0), sums.pop("episodes", 0.0)
-        steps = len(self._sums) * steps_per_iter
-        self._sums = []
+        steps, self._steps, self._sums = self._steps, 0, []
         line = {
             "env_steps_per_s": steps / seconds,
             "updates_per_s": updates / seconds,
@@ -109,11 +111,15 @@ def train(
     stop: StopFn | None = None,
     time_limit_s: float | None = None,
     devices: Sequence[jax.Device] = (),
+    tensorboard: bool = False,
 ) -> TrainResult:
     """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
 
     `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
     again goes on from its last checkpoint as if nothing had happened.
+
+    Where the configuration asks for pretraining, it comes first. Its lines have `env_steps` 0, say in `pretrain_steps`
+    and `pretrain_updates` how far it is, and all their figures are named pretrain/...
 
     Args:
         env: vector environment.
@@ -133,8 +139,10 @@ def train(
             it must come to the same answer in each.
         time_limit_s: end after this call has taken so long [s], as if interrupted; a later call goes on.
         devices: over which instances and batches are split, those of all processes; none takes the first one.
+        tensorboard: write the logged lines to OUT/tensorboard too.
 
     Raises:
+        ImportError: tensorboard is asked for and tensorboardX is not installed.
         ValueError: environment and configuration do not fit, or the checkpoint does not belong to them.
     """
     out = Path(out)
@@ -146,11 +154,17 @@ def train(
     began = time.monotonic()
     steps_per_iter = env.num_envs * config.steps_per_iter
     env_steps = int(state.env_steps)
-    log = _Log(out / "metrics.jsonl", env_steps, on_metrics)
-    if isinstance(seed, int):
-        iterate = compile_iteration(env, config, state, mesh)
-    else:
-        iterate = seeds.compile_iterations(env, config, state)
+    done = pretrain.counters(state)
+    place = pretrain.position(config, {"env_steps": env_steps, **done})
+    counted = place >= 0  # all pretraining is done
+    log = _Log(out / "metrics.jsonl", config, place, on_metrics, tensorboard)
+
+    def compiled(step: Any) -> Any:
+        if isinstance(seed, int):
+            return compile_iteration(env, config, state, mesh, step)
+        return seeds.compile_iterations(env, config, state, step)
+
+    iterate = compiled(train_iteration if counted else pretrain.pretrain_iteration)
     bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
     meter, saved_at = Meter(), time.monotonic()
 
@@ -158,11 +172,12 @@ def train(
         return wall_before + time.monotonic() - began
 
     def write_log(state: TrainState, evaluated: bool) -> None:
-        line = {"env_steps": env_steps, "updates": int(state.agent.updates), "wall_s": wall_s()}
-        line |= meter.read(config, steps_per_iter)
+        line = {"env_steps": env_steps, "updates": int(state.agent.updates) if counted else 0, "wall_s": wall_s()}
+        figures = meter.read(config)
+        line |= done | (figures if counted else {f"pretrain/{name}": value for name, value in figures.items()})
         if evaluated and eval_fn is not None:
             # Several processes evaluate side by side, each on its own device.
-            params = state.agent.params if jax.process_count() == 1 else jax.device_get(state.agent.params)
+            params = state.agent.acting if jax.process_count() == 1 else jax.device_get(state.agent.acting)
             line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, env_steps).items()}
         log.write(line)
         bar.show(env_steps, _headline(line))
@@ -170,15 +185,21 @@ def train(
     logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
     stopped, iterations = False, 0
     try:
-        while env_steps < total_steps and not stopped:
+        while (env_steps < total_steps or not counted) and not stopped:
             state, metrics = iterate(state)
-            env_steps += steps_per_iter
-            meter.add(metrics)
+            begins = False
+            if counted:
+                env_steps += steps_per_iter
+                meter.add(metrics, steps_per_iter)
+            else:
+                before, done = done, pretrain.counters(state)
+                begins = pretrain.position(config, {"env_steps": 0, **done}) == 0
+                meter.add(metrics, done["pretrain_steps"] - before["pretrain_steps"])
             meter.wait_for_previous()
             now = time.monotonic()
-            finished = env_steps >= total_steps
+            finished = (counted or begins) and env_steps >= total_steps
             evaluate_now = eval_fn is not None and (finished or env_steps // eval_every > evaluated_at)
-            if finished or evaluate_now or now - logged_at >= log_every_s:
+            if finished or begins or evaluate_now or now - logged_at >= log_every_s:
                 write_log(state, evaluate_now)
                 logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
                 stopped = evaluate_now and stop is not None and stop(log.last)
@@ -190,13 +211,18 @@ def train(
             if finished or stopped or due:
                 save_state(out, state, config, wall_s())
                 saved_at = time.monotonic()
+            if begins:
+                counted = True
+                iterate = iterate if finished or stopped else compiled(train_iteration)
     except KeyboardInterrupt:
         if jax.process_count() == 1:  # the other processes may not be there to take part
             save_state(out, state, config, wall_s())
         raise
     finally:
         bar.close()
-    return TrainResult(out, state.agent, env_steps, int(state.agent.updates), wall_s(), log.last)
+        log.close()
+    updates = int(state.agent.updates) if counted else 0
+    return TrainResult(out, state.agent, env_steps, updates, wall_s(), log.last)
 
 
 def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: float) -> Path:
@@ -204,7 +230,9 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     rows = state.replay.reward.shape[0]
     used = max(1, min(rows, int(state.replay.written)))
     filled = ("replay.", used, rows) if state.replay.reward.ndim == 2 else None  # of several seeds all is written
-    path = checkpoint.save(out / "checkpoints", state, config, int(state.env_steps), wall_s, rows=filled)
+    env_steps = int(state.env_steps)
+    pretraining = 0 if env_steps else sum(pretrain.counters(state).values())
+    path = checkpoint.save(out / "checkpoints", state, config, env_steps, wall_s, filled, pretraining)
     parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
     return path
 
@@ -241,6 +269,9 @@ def _init(env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], 
 def _headline(line: dict[str, Any]) -> dict[str, str]:
     """The figures a watcher wants to see."""
     names = {
+        "pretrain/env_steps_per_s": "random step/s",
+        "pretrain/updates_per_s": "model upd/s",
+        "pretrain_updates": "model updates",
         "replayed_steps_per_s": "replay/s",
         "updates_per_s": "upd/s",
         "updates_per_env_step": "upd/step",
@@ -252,8 +283,11 @@ def _headline(line: dict[str, Any]) -> dict[str, str]:
 class _Log:
     """metrics.jsonl, without the lines a resumed run is about to write again."""
 
-    def __init__(self, path: Path, env_steps: int, on_metrics: MetricsFn | None) -> None:
-        self._path, self._on_metrics = path, on_metrics
+    def __init__(
+        self, path: Path, config: DreamerConfig, place: int, on_metrics: MetricsFn | None, tensorboard: bool
+    ) -> None:
+        self._path, self._on_metrics, self._config = path, on_metrics, config
+        self._board = Board(path.parent, place) if tensorboard and parallel.is_first_process() else None
         self.last: dict[str, float] = {}
         kept: list[str] = []
         if not parallel.is_first_process():
@@ -263,7 +297,7 @@ class _Log:
                 line = json.loads(text)
             except ValueError:
                 continue  # cut off by the kill
-            if line["env_steps"] <= env_steps:
+            if pretrain.position(config, line) <= place:
                 kept.append(text)
                 self.last = line
         _write_atomically(path, "".join(text + "\n" for text in kept))
@@ -275,8 +309,15 @@ class _Log:
             return
         with self._path.open("a") as file:
             file.write(json.dumps(line) + "\n")
+        if self._board is not None:
+            self._board.write(line, pretrain.position(self._config, line))
         if self._on_metrics is not None:
             self._on_metrics(line)
+
+    def close(self) -> None:
+        """Close the curves."""
+        if self._board is not None:
+            self._board.close()
 
 
 def _write_atomically(path: Path, text: str) -> None:

@@ -36,6 +36,16 @@ class Transition:
 
 
 @dataclass(frozen=True, eq=False)
+class Mirror:
+    """What is seen and done in the mirrored world, where rewards and ends are the same."""
+
+    obs: Callable[[Any], Any]
+    """Observations (N, ...) -> those of the mirrored world."""
+    action: Callable[[jax.Array], jax.Array]
+    """Actions (N, A), one-hot where they are classes -> those of the mirrored world."""
+
+
+@dataclass(frozen=True, eq=False)
 class FunctionalEnv:
     """A vector environment as two pure functions. Compared by identity, so it can be static."""
 
@@ -49,3 +59,5 @@ class FunctionalEnv:
     """key -> state and first frames."""
     step: Callable[[EnvState, jax.Array], tuple[EnvState, Transition]]
     """state, action -> state and next frames; actions are (N, A) in [-1, 1], or classes (N,) int32."""
+    mirror: Mirror | None = None
+    """A symmetry that `DreamerConfig.mirror` learns from; None: there is none."""

@@ -13,9 +13,12 @@ from dreamer.rssm import Latent
 from dreamer.spaces import ObsShape
 from dreamer.types import Params
 
+PARTS = ("enc", "dyn", "dec", "reward", "continue")
+"""Parameters of the world model by name."""
+
 
 def init(config: DreamerConfig, obs_shape: ObsShape, action_width: int, key: jax.Array) -> Params:
-    """Parameters named enc, dyn, dec, reward and continue."""
+    """Parameters named as in `PARTS`."""
     keys = jax.random.split(key, 5)
     features = config.deter + config.stoch_size
     return {

@@ -7,8 +7,7 @@ Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,36 +15,36 @@ import jax
 import numpy as np
 
 from sysid import command_line, gradient, starts, tpe, uncertainty
-from sysid.courses import make_courses
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
-from sysid.objective import Noise, Objective, estimate_noise
-from sysid.prior import SPREAD, Prior, make_prior, moved
-from sysid.report import (
-    KIND,
-    SCHEMA,
-    code_hashes,
-    error_rows,
-    parameter_table,
-    summaries,
-    table,
-    write_html,
-    write_report,
+from sysid.models import (
+    Model,
+    get_parameters,
+    load_model,
+    make_replay,
+    model_space,
+    save_model,
+    set_parameters,
+    with_effects,
 )
+from sysid.objective import Noise, Objective, estimate_noise
+from sysid.prior import SPREAD, Prior, make_prior
+from sysid.profiles import Profile, check_names, profile
+from sysid.report import error_rows, parameter_table, table, write_html, write_report
+from sysid.report_json import make_report, provenance
 from sysid.result import FitResult, Progress
 from sysid.rollout import Plant, predictions, vehicle_plant
 from sysid.series import collect, save
 from sysid.space import Space, make_space
 from whill_mjx.config import VehicleConfig
-from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
-from whill_mjx.types import VehicleParams
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
 FEATURE_ITERATIONS = 20
+GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 
 
@@ -55,11 +54,15 @@ class FitConfig:
 
     preset: Literal["paper", "physical"] = "physical"
     """Base model whose parameters are fitted."""
-    method: Literal["features", "lm", "tpe", "both"] = "features"
-    """features: gradient search on motion in short bins, then on poses. lm: on poses at once. tpe: global search. both:
-    a short global search that gives the gradient search on poses its starts."""
+    method: Literal["features", "lm", "tpe", "cmaes", "both"] = "features"
+    """features: gradient search on motion in short bins, then on poses. lm: on poses at once. tpe, cmaes: global
+    search. both: a short global search that gives the gradient search on poses its starts."""
     trials: int = 192
     """Parameter sets that the global search tries."""
+    storage: str = ""
+    """Where the global search keeps its study, for several processes at once: journal:FILE or a database URL."""
+    study: str = "fit"
+    """Name of the study there."""
     starts: int = 1
     """Starts of the gradient search: the initial values, and random ones or the best of the global search (both: at
     least one of them)."""
@@ -77,12 +80,18 @@ class FitConfig:
     """Names to fit; by default all that a driving log can tell."""
     effects: tuple[str, ...] = ()
     """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
+    profile: tuple[str, ...] = ()
+    """Parameters whose profile likelihood is traced, or `all`: each takes a search of its own."""
     physics_dt: float = 0.005
     """Physics step [s]."""
     vehicle: Path | None = None
     """Vehicle file of an earlier fit: where the search starts, and what is known before (instead of the preset)."""
     spread: float = SPREAD
     """With a vehicle file: standard deviation of a parameter from day to day, as a share of its value (assumed)."""
+    model: str = ""
+    """Another model in place of the simulator's vehicle: an MJCF or URDF file, or FILE.py[:NAME] (docs/fit.md)."""
+    wheels: tuple[str, ...] = ()
+    """With an MJCF or URDF file: joints or actuators of the driven wheels, left and right."""
 
 
 @dataclass(frozen=True)
@@ -104,65 +113,116 @@ class Fit:
     u: np.ndarray  # (P,) fitted unit coordinates
     initial_cost: float
     cost: float
-    """Mean squared residual in noise scales (large ones counted linearly); J in metres where method is "tpe"."""
+    """Mean squared residual in noise scales (large ones counted linearly); J in metres after a global search."""
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
     prior: Prior | None = None
+    model: Model | None = None
+    """What was fitted in place of the simulator's vehicle."""
+    likelihoods: tuple[Profile, ...] = ()
+    """Profile likelihoods of the parameters that `profile` names."""
 
 
-def fit_log(log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None) -> Fit:
+def fit_log(
+    log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None,
+    model: Model | None = None,
+) -> Fit:
     """Fit the training trials of a log.
 
     Args:
         log: its held-out trials are not looked at.
         params: where the search starts; by default the preset's values for the log's vehicle.
+        model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
     """
     config = config or FitConfig()
     began = time.perf_counter()
-    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
-    if not trials:
-        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
-    if config.quick and len(trials) > QUICK_TRIALS:
-        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
-    plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
-    prior_intervals: dict[str, tuple[float, float]] = {}
-    if config.vehicle is not None:
-        params, prior_intervals = _earlier(config.vehicle, log)
-    params = preset_params(log.spec, config.preset) if params is None else params
-    params = with_effects(params, config.effects)
-    space = make_space(params, log.spec, config.parameters or None)
-    objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
+    given = make_problem(log, config, params, model)
+    model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
+    trials = objective.trials
+    wanted = space.names if config.profile == ("all",) else config.profile
+    check_names(space, wanted)
+    if wanted and config.method in GLOBAL:
+        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
+                         "profile starts from. Use --method features, lm or both.")
 
     scan = coarse = search = None
     points = gradient.random_starts(space, config.starts, config.seed)
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
-    if config.method in ("tpe", "both"):
+    if config.method in (*GLOBAL, "both"):
         evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
-        cost = "paper" if config.method == "tpe" else "weighted"
+        cost = "paper" if config.method in GLOBAL else "weighted"
         count = max(min(config.starts, 2) if config.quick else config.starts, 2)
+        problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in trials), "channels": config.channels,
+                   "model": config.preset if model is None else model.name, "step": f"{plant.dt:g}"}
         scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
-                       progress=progress)
+                       progress=progress, storage=config.storage, study=config.study, problem=problem,
+                       method="cmaes" if config.method == "cmaes" else "tpe")
         points = np.concatenate([points[:1], scan.starts])[:count]
     elif config.method == "features":
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
-    if config.vehicle is not None and config.method != "tpe":
+    if config.vehicle is not None and config.method not in GLOBAL:
         share = uncertainty.inflation(objective, points[0])
-        objective = replace(objective, prior=replace(make_prior(space, prior_intervals, config.spread), share=share))
-    if config.method == "tpe":
+        objective = replace(objective, prior=replace(make_prior(space, given.intervals, config.spread), share=share))
+    if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, objective, profiles = _gradient_search(objective, space, points, iterations, config, progress)
+        search, objective, profiles = gradient_search(objective, space, points, iterations, config, progress)
         u, final_cost = search.u, search.cost
         first = objective.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(gradient.robust_cost(first, config.robust)[0]) / objective.counted
-    known = uncertainty.estimate(objective, u, robust=config.robust and config.method != "tpe")
-    fitted = set_values(params, space.names, jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float)))
+    known = uncertainty.estimate(objective, u, robust=config.robust and config.method not in GLOBAL)
+    traced = profile(objective, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
+    fitted = set_parameters(params, space.names, values)
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, objective.prior)
+               profiles, time.perf_counter() - began, plant, objective.prior, model, tuple(traced))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a search is given."""
+
+    plant: Plant
+    params: Any
+    """Where it starts."""
+    space: Space
+    objective: Objective
+    """Over the training trials."""
+    intervals: dict[str, tuple[float, float]]
+    """Of an earlier vehicle file."""
+    model: Model | None
+
+
+def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
+    """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
+    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
+    if not trials:
+        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    if config.quick and len(trials) > QUICK_TRIALS:
+        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
+    intervals: dict[str, tuple[float, float]] = {}
+    if model is None and config.model:
+        model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is not None:
+        if config.vehicle is not None:
+            raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
+                             "--vehicle or --model out.")
+        model = model.with_effects(config.effects)
+        plant, params = model.plant, model.params if params is None else params
+        space = model_space(params, config.parameters or None)
+    else:
+        plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
+        if config.vehicle is not None:
+            params, intervals = _earlier(config.vehicle, log)
+        params = preset_params(log.spec, config.preset) if params is None else params
+        params = with_effects(params, config.effects)
+        space = make_space(params, log.spec, config.parameters or None)
+    objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
+    return Problem(plant, params, space, objective, intervals, model)
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
@@ -177,30 +237,9 @@ def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]
     return params, load_intervals(path)
 
 
-def with_effects(params: Any, names: Sequence[str]) -> Any:
-    """The vehicle with more effects of the catalogue, where they do nothing or next to nothing."""
-    from whill_mjx.effects import EFFECTS, make_effect
-    from whill_mjx.effects.base import PLACES, place_of
-
-    have = {effect.name for effect in params.effects}
-    for name in names:
-        if name not in EFFECTS:
-            raise ValueError(f"no effect {name!r} (known: {', '.join(EFFECTS)}). Correct --effects.")
-    added = [make_effect(name) for name in dict.fromkeys(names) if name not in have]
-    order = list(EFFECTS)
-    added.sort(key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name)))
-    params = VehicleParams(params.body, (*params.effects, *added))
-    about = {name: one for name, one in describe(params).items() if name.partition(".")[0] not in have | {"body"}}
-    endless = [name for name, one in about.items() if not np.isfinite(one.neutral)]
-    if not endless:
-        return params
-    return set_values(params, endless, jax.numpy.asarray([about[name].high for name in endless],
-                                                         jax.numpy.result_type(float)))
-
-
 def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:
     """Objective over the space's parameters; the others keep their values in `params`."""
-    replay, measured = make_courses(plant, trials, lambda values: set_values(params, space.names, values), params)
+    replay, measured = make_replay(plant, params, space, trials)
     return Objective(replay, space, trials, measured, noise)
 
 
@@ -208,9 +247,8 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
     """Replays of trials with the initial and with the fitted vehicle."""
     if not trials:
         return [], []
-    names = fit.space.names
-    replay, _ = make_courses(fit.plant, trials, lambda values: set_values(fit.params, names, values), fit.params)
-    values = np.stack([np.asarray(get_values(one, names)) for one in (fit.initial_params, fit.params)])
+    replay, _ = make_replay(fit.plant, fit.params, fit.space, trials)
+    values = np.stack([np.asarray(get_parameters(one, fit.space.names)) for one in (fit.initial_params, fit.params)])
     simulated = replay.simulate(values)
     initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
     return initial, fitted
@@ -218,15 +256,19 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
 
 def fit_dataset(
     path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
-    progress: Progress | None = None, source: dict[str, Any] | None = None,
+    progress: Progress | None = None, source: dict[str, Any] | None = None, model: Model | None = None,
 ) -> dict[str, Any]:
     """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
+
+    Of another model than the simulator's vehicle, model.toml is written instead of vehicle.toml, and model.xml where
+    it came from an MJCF or URDF file.
 
     Args:
         path: dataset folder; only named in the report when `log` is given.
         quick: overrides `config.quick` where true.
         log: an already loaded log.
         source: more to note in the report's `dataset`.
+        model: as of `fit_log`.
 
     Returns:
         The report.
@@ -239,7 +281,7 @@ def fit_dataset(
     log = load_any(path) if log is None else log
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    fit = fit_log(log, config, progress)
+    fit = fit_log(log, config, progress, model=model)
     trials = (*log.training, *log.held_out)
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
@@ -250,61 +292,14 @@ def fit_dataset(
     save(out, series)
     write_html(out, series)
     intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
-    save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+    if fit.model is None:
+        save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+    else:
+        save_model(out, fit.model, fit.params, intervals, provenance(report))
     return report
 
 
-def make_report(
-    log: Log, config: FitConfig, fit: Fit, rows: list[dict[str, Any]], path: str, source: dict[str, Any] | None = None
-) -> dict[str, Any]:
-    """The report of a fit (keys in `sysid.report`)."""
-    about = describe(fit.params)
-    parameters = [
-        {"name": one.name, "unit": about[one.name].unit, "initial": one.initial, "value": one.value,
-         "interval": [one.low, one.high], "confidence": uncertainty.CONFIDENCE,
-         "bounds": [float(fit.space.low[i]), float(fit.space.high[i])], "identifiable": one.identifiable,
-         "remark": one.remark}
-        for i, one in enumerate(fit.uncertainty.estimates)]
-    fixed = [{"name": name, "value": float(get_values(fit.params, [name])[0]), "reason": reason}
-             for name, reason in fit.space.fixed]
-    searches = [result for result in (fit.scan, fit.coarse, fit.search) if result is not None]
-    ends = fit.coarse if fit.coarse is not None and len(fit.coarse.start_costs) > 1 else fit.search
-    return {
-        "schema": SCHEMA, "kind": KIND,
-        "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
-                    "notes": list(log.notes), "training": [trial.name for trial in log.training],
-                    "held_out": [trial.name for trial in log.held_out], **(source or {})},
-        "code": code_hashes(),
-        "settings": {**asdict(config), "vehicle": None if config.vehicle is None else str(config.vehicle)},
-        "model": {"preset": config.preset, "effects": [effect.name for effect in fit.params.effects]},
-        "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},
-        "parameters": parameters, "fixed": fixed,
-        "prior": None if fit.prior is None else {
-            "file": str(config.vehicle), "assumed_spread": config.spread, "moved": moved(fit.prior, fit.space, fit.u)},
-        "weak_combinations": fit.uncertainty.weak_combinations(),
-        "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
-                   "cost_initial": fit.initial_cost, "cost": fit.cost,
-                   "start_costs": ends.start_costs if ends is not None else [],
-                   "starts_agreeing": starts.agreeing(ends.start_costs) if ends is not None else None,
-                   "delay_profiles": [{"name": name, "values": grid, "cost": costs}
-                                      for name, grid, costs in fit.profiles]},
-        **summaries(rows, log.trials), "errors": rows,
-    }
-
-
-def provenance(report: dict[str, Any]) -> dict[str, Any]:
-    """What the vehicle file says of its origin."""
-    summary = report["summary"]["held_out"] or report["summary"]["training"]
-    errors = {f"{channel}_{metric}": one["fitted"] for channel, metrics in summary.items()
-              for metric, one in metrics.items() if isinstance(one, dict)}
-    return {"made_by": "sysid.fit", "dataset": report["dataset"]["name"], "dataset_sha256": report["dataset"]["sha256"],
-            "preset": report["model"]["preset"], "method": report["settings"]["method"],
-            "seed": report["settings"]["seed"], "cost": report["search"]["cost"],
-            "scored_on": "held_out" if report["summary"]["held_out"] else "training", "rmse": errors,
-            "not_identifiable": [one["name"] for one in report["parameters"] if not one["identifiable"]]}
-
-
-def _gradient_search(
+def gradient_search(
     objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
     progress: Progress | None,
 ) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
@@ -343,7 +338,7 @@ def expected_steps(config: FitConfig) -> int:
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
-    return first + (iterations if config.method != "tpe" else 0)
+    return first + (iterations if config.method not in GLOBAL else 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -372,6 +367,9 @@ class Arguments(FitConfig):
 def main(arguments: Arguments) -> None:
     """Load, fit, write and print the summary."""
     dataset = arguments.dataset
+    if arguments.close_loop and arguments.model:
+        raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
+                         "model. Leave one of the two out.")
     settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
     log = load_any(dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
     for note in log.notes:
@@ -391,7 +389,8 @@ def main(arguments: Arguments) -> None:
                       "deviations")
         print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
-    print(f"wrote {arguments.out / 'report.html'}, report.json, vehicle.toml and the plots")
+    fitted = "vehicle.toml" if not settings.model else "model.toml"
+    print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
     if arguments.close_loop:
         from sysid.close_loop import LoopConfig, run
 

@@ -98,14 +98,13 @@ class Objective:
         cost = np.sqrt(error.sum(-1) / samples).sum(-1)
         return np.where(self._bad(simulated).any(-1) | ~np.isfinite(cost), HUGE, cost)
 
-    def weighted_cost(self, u: np.ndarray) -> np.ndarray:
-        """Mean squared residual (N,), 1 at the noise level."""
-        return np.square(self.residuals(u)).sum((-1, -2)) / self.counted
+    def weighted_cost(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
+        """Mean squared residual (N,), 1 at the noise level; `simulated` is what `simulate(u)` gave, if it is known."""
+        return np.square(self.residuals(u, simulated)).sum((-1, -2)) / self.counted
 
-    def residuals(self, u: np.ndarray) -> np.ndarray:
+    def residuals(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
         """(N, B, K) whitened residuals; masked samples are 0. K counts pose, odometry and start-pose terms."""
-        simulated = self.simulate(u)
-        residual, _ = self._whiten(simulated, None)
+        residual, _ = self._whiten(self.simulate(u) if simulated is None else simulated, None)
         return residual if self.prior is None else _append(residual, self.prior.residual(u))
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

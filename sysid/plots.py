@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +13,11 @@ from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, ideal_replay
 from sysid.series import TrialSeries
 
+if TYPE_CHECKING:
+    from sysid.searches import Trace
+
 MAX_PANELS = 12
+
 SMALLEST_PANEL = 0.2  # m; a turn on the spot would fill the panel with its noise
 COLOURS = {"measured": "black", "ideal": "tab:gray", "initial": "tab:orange", "fitted": "tab:blue"}
 STYLES = {"measured": "-", "ideal": ":", "initial": "--", "fitted": "-"}
@@ -150,3 +155,47 @@ def _error_bars(pyplot: Any, path: Path, rows: list[dict[str, Any]], names: set[
                        rotation=60, ha="right", fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def write_search_plot(path: Path, traces: Sequence[Trace]) -> Path:
+    """Write the best cost and held-out error so far of searches against evaluations and against seconds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot, ticker
+
+    held_out = any(np.isfinite(one.held_out).any() for one in traces)
+    errors = [("cost", "mean squared residual, training")]
+    errors += [("held_out", "position RMSE, held out [m]")] if held_out else []
+    figure, axes = pyplot.subplots(len(errors), 2, figsize=(10.5, 3.6 * len(errors)), squeeze=False,
+                                   layout="constrained")
+    methods = list(dict.fromkeys(one.method for one in traces))
+    for row, (error, label) in zip(axes, errors, strict=True):
+        for axis, (effort, unit) in zip(row, (("evaluations", "simulator evaluations"), ("seconds", "seconds")),
+                                        strict=True):
+            for k, method in enumerate(methods):
+                mine = [one for one in traces if one.method == method]
+                for one in mine:
+                    axis.step(getattr(one, effort), getattr(one, error), where="post", color=f"C{k}", alpha=0.3,
+                              linewidth=0.9)
+                grid, middle = _median_step([(getattr(one, effort), getattr(one, error)) for one in mine])
+                axis.step(grid, middle, where="post", color=f"C{k}", linewidth=2.2, label=method)
+            axis.set_xscale("log")
+            axis.set_yscale("log")
+            axis.xaxis.set_minor_formatter(ticker.NullFormatter())  # it would print labels over one another
+            axis.set_xlabel(unit)
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3, which="both")
+    axes[0, 1].legend(fontsize=8)
+    temporary = path.with_name(path.name + ".tmp")
+    figure.savefig(temporary, dpi=120, format="png")
+    pyplot.close(figure)
+    os.replace(temporary, path)
+    return path
+
+
+def _median_step(steps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Median of step functions (x, y), from where all have begun; each keeps its last value."""
+    grid = np.unique(np.concatenate([x for x, _ in steps]))
+    grid = grid[grid >= max(x[0] for x, _ in steps)]
+    return grid, np.median([y[np.searchsorted(x, grid, side="right") - 1] for x, y in steps], axis=0)

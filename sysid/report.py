@@ -11,6 +11,7 @@
     parameters            name, unit, initial, value, interval, confidence, bounds, identifiable, remark
     fixed                 name, value, reason
     prior                 file, assumed_spread, moved (name, before, after, deviations, within); null without
+    profiles              name, unit, values, cost, statistic, threshold, interval (null where open), remark
     weak_combinations     combinations of parameters that the log does not tell
     search                evaluations, seconds, cost before and after, costs of the starts, number that agree, delays
     code                  SHA-256 over the sources of the packages, their versions and those of what they run on

@@ -32,6 +32,8 @@ def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[
     """
     drawn = choose(series)
     sections = [Section("Summary", summary(report)), Section("Parameters", parameters(report))]
+    if report.get("profiles"):
+        sections.append(Section("Profile likelihoods", profiles(report)))
     if drawn:
         sections += [Section("Trajectories", trajectories(drawn)), Section("Yaw", yaws(drawn)),
                      Section("Residuals", residuals(series, drawn))]
@@ -123,6 +125,29 @@ def parameters(report: dict[str, Any]) -> str:
         parts += [heading("Not fitted"), table(["parameter", "value", "reason"], [
             [one["name"], one["value"], one["reason"]] for one in report["fixed"]])]
     return "".join(parts)
+
+
+def profiles(report: dict[str, Any]) -> str:
+    """Each profile with the parabola of the interval from curvature, and the interval that it gives."""
+    items, rows = [], []
+    fitted = {one["name"]: one for one in report["parameters"]}
+    for one in report["profiles"]:
+        values, statistic = (np.array(one[key], float) for key in ("values", "statistic"))
+        about, top = fitted[one["name"]], 4 * one["threshold"]
+        lines = [Line(values, np.where(statistic <= top, statistic, np.nan), "profile", PALETTE[0], markers=True)]
+        low, high = about["interval"]
+        if about["identifiable"] and high > low:
+            fine = np.linspace(values[0], values[-1], 200)
+            half = np.where(fine < about["value"], about["value"] - low, high - about["value"])
+            parabola = one["threshold"] * ((fine - about["value"]) / np.maximum(half, 1e-12)) ** 2
+            lines.append(Line(fine, np.where(parabola <= top, parabola, np.nan), "curvature", PALETTE[1], "5 3"))
+        items.append(line_chart(lines, f"{one['name']} [{one['unit']}]", "2 x loss of log likelihood",
+                                band=(0.0, one["threshold"]), width=340, height=250))
+        rows.append([one["name"], one["unit"], about["value"], *one["interval"], low, high, one["remark"]])
+    confidence = report["parameters"][0]["confidence"]
+    header = ["parameter", "unit", "fitted", f"profile, {confidence:.0%} from", "to", "curvature from", "to", "remark"]
+    return charts(items, "All other parameters are fitted again at each point. Inside the band, the log allows the "
+                         "value; autocorrelation is accounted for.") + table(header, rows)
 
 
 def trajectories(drawn: Sequence[TrialSeries]) -> str:

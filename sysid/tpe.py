@@ -1,8 +1,8 @@
-"""Global search with Optuna's tree-structured Parzen estimator, asked and told in batches."""
+"""Global search with Optuna, asked and told in batches: tree-structured Parzen estimator, or CMA-ES."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,46 +10,37 @@ import numpy as np
 from sysid.objective import Objective
 from sysid.result import FitResult, Progress
 from sysid.space import Space
+from sysid.studies import BATCH, SharedStudy, open_storage
 
-BATCH = 16
-"""Parameter sets simulated together."""
+__all__ = ["BATCH", "fit"]
 
 
 def fit(
     objective: Objective, space: Space, *, evaluations: int = 500, seed: int = 0, cost: str = "weighted",
-    best: int = 4, progress: Progress | None = None, storage: Any = None,
+    best: int = 4, progress: Progress | None = None, storage: Any = None, method: str = "tpe", study: str = "fit",
+    problem: Mapping[str, str] | None = None,
 ) -> FitResult:
-    """Minimise over `space` by TPE; the initial values are the first candidate.
+    """Minimise over `space`; the initial values are the first candidate.
 
     Args:
         objective: errors in unit coordinates of `space`.
-        evaluations: parameter sets to try.
+        evaluations: parameter sets to try; in a shared study, by all its processes together.
         cost: "weighted" (least squares over all channels) or "paper" (sum of position RMSE).
         best: how many of the best candidates to return in `starts`.
-        storage: Optuna storage for a study that several processes share.
+        storage: of a study that several processes share: journal:FILE, a database URL, or an Optuna storage.
+        method: "tpe" or "cmaes".
+        study: its name there.
+        problem: what the study is about (`sysid.studies.SharedStudy`).
     """
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     costs: Callable[[np.ndarray], np.ndarray] = {
         "weighted": objective.weighted_cost, "paper": objective.paper_cost}[cost]
-    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=2 * BATCH)
-    study = optuna.create_study(sampler=sampler, direction="minimize", storage=storage)
-    study.enqueue_trial(dict(zip(space.names, space.to_unit(space.initial).tolist(), strict=True)))
-    distributions: Any = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in space.names}
-    tried: list[np.ndarray] = []
-    values: list[float] = []
-    while len(tried) < evaluations:
-        asked = [study.ask(distributions) for _ in range(BATCH)]
-        u = np.array([[trial.params[name] for name in space.names] for trial in asked])
-        found = costs(u)
-        for trial, value in zip(asked, found, strict=True):
-            # The logarithm keeps diverged candidates from flattening the rest.
-            study.tell(trial, float(np.log(max(value, 1e-12))))
-        tried += list(u)
-        values += found.tolist()
-        if progress is not None:
-            progress(BATCH, f"J {min(values):.4g}")
+    about = {"cost": cost, "initial values": ", ".join(f"{value:.6g}" for value in space.initial),
+             "bounds": ", ".join(f"{low:.6g} to {high:.6g}" for low, high in zip(space.low, space.high, strict=True)),
+             **(problem or {})}
+    shared = SharedStudy(space.names, space.to_unit(space.initial), method=method, seed=seed,
+                         storage=open_storage(storage), study=study, problem=about)
+    shared.run(costs, evaluations, progress)
+    u, values, initial = shared.table()
     order = np.argsort(values)
-    return FitResult(u=tried[order[0]], cost=values[order[0]], initial_cost=values[0], evaluations=len(tried),
-                     starts=np.array([tried[i] for i in order[:best]]), history=np.minimum.accumulate(values))
+    return FitResult(u=u[order[0]], cost=float(values[order[0]]), initial_cost=float(values[initial]),
+                     evaluations=len(values), starts=u[order[:best]], history=np.minimum.accumulate(values))

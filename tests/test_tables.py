@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from benchmarks import tables
 from benchmarks.harness import figure, record
 from benchmarks.merge import merge
 from benchmarks.tables import MARKS, page, put_between_marks
@@ -17,6 +18,15 @@ def test_a_recorded_figure_appears_on_the_page_with_its_median_and_device(tmp_pa
     record("physics", "it runs", {"dt_s": figure([0.5, 0.25, 4.0], "s", "test device")}, tmp_path)
     text = page(tmp_path)
     assert "| dt_s | 0.5 | s | 0.5, 0.25, 4 | test device |" in text
+
+
+def test_a_note_written_by_hand_stands_below_its_table(tmp_path, monkeypatch):
+    record("camera", "it runs", {"a": figure([1.0], "s", "x")}, tmp_path)
+    monkeypatch.setattr(tables, "NOTES", tmp_path)
+    assert "predicted" not in page(tmp_path)
+    (tmp_path / "camera.md").write_text("| predicted | measured |\n")
+    text = page(tmp_path)
+    assert text.index("| a | 1 |") < text.index("| predicted | measured |")
 
 
 def test_recording_keeps_figures_of_other_names_and_replaces_those_of_the_same(tmp_path):

@@ -31,6 +31,7 @@ from whill_mjx.ppo_run import train_ppo
 from whill_mjx.rollouts import rollout
 from whill_mjx.safe import Step, find_safety
 from whill_mjx.training import (
+    TRUTH,
     Preset,
     dreamer_policy,
     find_preset,
@@ -78,6 +79,9 @@ class TrainOptions:
     """Learning rate; none takes the preset's."""
     train_ratio: float | None = None
     """Replayed steps per environment step; none takes the preset's."""
+    targets: bool = False
+    """Let the world model also tell goal, speeds and free distances, which the simulator knows (`whill_mjx.truth`). The
+    policy still sees the camera alone."""
     instances: int | None = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
@@ -86,6 +90,8 @@ class TrainOptions:
     """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
     export: Literal["last", "best"] = "last"
     """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run."""
+    tensorboard: bool = False
+    """Write the curves of the world model's training for TensorBoard too, to RUN/tensorboard (needs tensorboardX)."""
     devices: int | None = None
     """Devices over which instances and batches are split; none takes all."""
 
@@ -150,6 +156,8 @@ def choose_preset(options: TrainOptions) -> Preset:
         baseline = dataclasses.replace(baseline, lr=options.lr)
     if options.train_ratio is not None:
         learner = dataclasses.replace(learner, train_ratio=options.train_ratio)
+    if options.targets:
+        learner = dataclasses.replace(learner, decode_only=(TRUTH,))
     return dataclasses.replace(
         preset,
         task=dataclasses.replace(preset.task, layout=options.layout),
@@ -204,7 +212,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
     evaluate = keep_best(options.out, preset, evaluation_of(held_out, preset, options.seed))
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
-        functional_env(batch, preset.safety),
+        functional_env(batch, preset.safety, targets=TRUTH in preset.learner.decode_only),
         preset.learner,
         options.out,
         stopper.total_steps(preset.total_steps),
@@ -214,8 +222,9 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
         checkpoint_every_s=options.checkpoint_every_s,
         stop=stopper,
         devices=devices,
+        tensorboard=options.tensorboard,
     )
-    return Trained(jax.device_get(result.agent.params), result.env_steps, result.updates, result.wall_s)
+    return Trained(jax.device_get(result.agent.acting), result.env_steps, result.updates, result.wall_s)
 
 
 def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:

@@ -123,13 +123,14 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
 
 
 def rivals_of(result: Result) -> list[tuple[int, list[tuple[str, Refit | None]]]]:
-    """Rounds with rivals: number, and effects with their refits, the accepted one first."""
+    """Accepted effects with rivals: number, and effects with their refits, the accepted one first."""
     found = result.search
     if found.verdict != "named":
         return []
     out = []
     for number, (best, names) in enumerate(zip(found.accepted, found.classes, strict=True)):
-        tried = {one.hypothesis.effect: one for one in found.rounds[number]}
+        its_round = next(each for each in found.rounds if any(one is best for one in each))  # some accept nothing
+        tried = {one.hypothesis.effect: one for one in its_round}
         near = [name for name, one in tried.items() if one.gain > (1 - TIE) * best.gain]
         every = dict.fromkeys([best.hypothesis.effect, *names, *near])
         if len(every) > 1:
@@ -148,14 +149,15 @@ def refitter_of(result: Result) -> Refitter:
 
 def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[tuple[str, Refit | None]]
               ) -> list[Rival]:
-    """Rivals of round `number`; those that the search took for alike without refitting them are refitted now."""
+    """Rivals of accepted effect `number`; those that the search took for alike and did not refit are refitted now."""
     found, starts = result.search, {}
+    chosen = found.accepted[number].refit
+    before = np.concatenate([[], *chosen.split[:-1]])
     for effect in (name for name, fit in rivals if fit is None):
-        before = found.accepted[number - 1].refit if number else found.base
         mine = [i for i, one in enumerate(result.hypotheses) if one.effect == effect]
         best = max(mine, key=lambda i: found.scan.gain[i])
-        starts[effect] = FitStart((*before.hypotheses, result.hypotheses[best]), before.u,
-                               np.concatenate([before.q, found.scan.q[best]]))
+        starts[effect] = FitStart((*chosen.hypotheses[:-1], result.hypotheses[best]), chosen.u,
+                                  np.concatenate([before, found.scan.q[best]]))
     more = dict(zip(starts, refitter.fit_all(list(starts.values()), POLISH), strict=True)) if starts else {}
     return [Rival(name, more[name] if fit is None else fit) for name, fit in rivals]
 

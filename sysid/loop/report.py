@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.log import Trial
+from sysid.loop.agreement import sizes_apart, with_prior
 from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.refit import Refit
@@ -184,7 +185,7 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     seem to be on days without the effect adds to their variance."""
     from scipy import stats
 
-    covariance = np.linalg.inv(information(final, result))
+    covariance = np.linalg.inv(with_prior(final, result.evidence.precision))
     size = len(final.u)
     scores = np.einsum("bni,bn->bi", final.jacobian, final.residual)
     groups = result.evidence.groups
@@ -197,37 +198,17 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     return final.q - quantile * deviation, final.q + quantile * deviation
 
 
-def information(final: Refit, result: Result) -> np.ndarray:
-    """(P + k, P + k) of the joint fit, with the day-to-day spread as prior."""
-    matrix = final.products(result.evidence.precision)
-    matrix[np.diag_indices(len(matrix))] += 1e-9 * np.diag(matrix).max()
-    return matrix
-
-
 def evidence_for(result: Result, part: slice) -> dict[str, Any]:
     """What each manoeuvre says of an effect by itself, and whether it predicts manoeuvres that were left out."""
     final, base, groups = result.search.final, result.search.base, result.evidence.groups
-    size = len(final.u)
-    index = np.arange(size + part.start, size + part.stop)
     gain = {}
     for group in groups:
         name = result.log.training[group[0]].manoeuvre
         gain[name] = left_out(base, group, result) - left_out(final, group, result)
-    matrix = information(final, result)
-    scales = []
-    for group in groups:
-        chosen = list(group)
-        flat = final.jacobian[chosen].reshape(-1, final.jacobian.shape[-1])
-        column = flat[:, index] @ final.q[part]
-        others = np.delete(flat, index, axis=1)
-        prior = np.delete(np.delete(matrix - flat.T @ flat, index, 0), index, 1)
-        own = np.linalg.solve(others.T @ others + prior, others.T @ column)
-        left = column - others @ own
-        strength = float(left @ left)
-        residual = final.residual[chosen].reshape(-1)
-        scales.append({"manoeuvre": result.log.training[group[0]].manoeuvre,
-                       "factor": 1 + float(left @ residual) / max(strength, 1e-9),
-                       "standard_error": 1 / np.sqrt(max(strength, 1e-9))})
+    apart = zip(groups, *sizes_apart(final, part, groups, result.evidence.precision), strict=True)
+    scales: list[dict[str, Any]] = [
+        {"manoeuvre": result.log.training[group[0]].manoeuvre, "factor": float(factor), "standard_error": float(error)}
+        for group, factor, error in apart]
     seen = [one for one in scales if one["standard_error"] < 0.5]
     weight = np.array([one["standard_error"] ** -2.0 for one in seen])
     factor = np.array([one["factor"] for one in seen])
@@ -241,7 +222,7 @@ def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
     chosen = list(group)
     flat = fit.jacobian[chosen].reshape(-1, fit.jacobian.shape[-1])
     residual = fit.residual[chosen].reshape(-1)
-    matrix = information(fit, result) - flat.T @ flat
+    matrix = with_prior(fit, result.evidence.precision) - flat.T @ flat
     step = np.linalg.solve(matrix + 1e-9 * np.diag(matrix).max() * np.eye(len(matrix)), -flat.T @ residual)
     return float(np.square(residual - flat @ step).sum())
 

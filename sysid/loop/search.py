@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sysid.loop.agreement import beside, disagreement, foretold
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit
@@ -27,6 +28,8 @@ class Thresholds:
     """Family-wise p-value below which something is missing, and below which an effect is it."""
     share: float = 0.6
     """Least share of the excess residual that named effects explain together."""
+    most: float = 0.5
+    """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
     excess: float = 0.06
     """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
     quiet: float = 0.05
@@ -35,11 +38,23 @@ class Thresholds:
     """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
     step: float = 0.15
     """Least further share of the excess that it explains."""
-    own: float = 0.5
+    own: float = 0.3
     """Least share of what the effects before it left that a smaller one must explain."""
-    agree: float = 0.3
-    """Largest relative change of its size, from a fit without the others, at which it is there for its own sake; its
-    gain may change by 1.5 times as much."""
+    agree: float = 0.6
+    """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
+    of it, at which it is there for its own sake."""
+    alone: float = 1.8
+    """Largest factor by which its gain may then change."""
+    differ: float = 0.35
+    """Largest disagreement of manoeuvres on its size."""
+    little: float = 0.1
+    """What one must explain of it that manoeuvres tell of each other."""
+    foretold: float = 0.7
+    """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
+    same: float = 0.2
+    """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
+    loss: float = 0.1
+    """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
     rounds: int = 3
     worthwhile: float = 0.15
     """Least scanned gain of an effect that is refitted, as a share of the best one's."""
@@ -128,10 +143,13 @@ def search(
         return found
     current = base
     similar = imitation(evidence, hypotheses)
-    for number in range(thresholds.rounds):
+    mended = False
+    for number in range(thresholds.rounds + 1):
+        if len(found.accepted) == thresholds.rounds:
+            break
         scans = [far, (first.gain, first.worth, first.q)] if number == 0 else [
             _rescan(evidence, hypotheses, current, refitter, wander)]
-        taken = {one.hypothesis.effect for one in found.accepted}
+        taken = {one.effect for one in current.hypotheses}
         chosen = _starts(hypotheses, scans, first, taken, thresholds)
         at = Start.at(current)
         fits = refitter.fit_all([Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
@@ -154,34 +172,69 @@ def search(
         likely = [one for one in candidates if one.p < thresholds.alpha]
         if not likely:
             break
+        taken_on = likely[0]
         if found.accepted:
-            likely[0].own = _own(likely[0], found, explained(current), refitter, thresholds)
-            if not likely[0].own and likely[0].gain < thresholds.second * found.accepted[0].gain:
-                break
-        found.accepted.append(likely[0])
-        found.classes.append(_class_of(likely[0], candidates, hypotheses, similar, thresholds))
-        current = likely[0].refit
+            for one in likely:
+                one.own = _own(one, found, explained(current), refitter, evidence.groups, thresholds)
+                if one.own:
+                    taken_on = one
+                    break
+            if not taken_on.own and taken_on.gain < thresholds.second * found.accepted[0].gain:
+                if mended or taken_on.share - explained(current) < thresholds.own * (1 - explained(current)):
+                    break
+                mended, current = True, taken_on.refit  # it may hide what comes after; it is named by no one
+                continue
+        found.accepted.append(taken_on)
+        found.classes.append(_class_of(taken_on, candidates, hypotheses, similar, thresholds))
+        current = taken_on.refit
         if wander.p_excess(excess(current)) > thresholds.quiet:
             break
-    _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial)
+    _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial,
+            lambda fit: _most_apart(fit, evidence.groups, refitter.precision))
     return found
 
 
-def _own(one: Candidate, found: Search, share: float, refitter: Refitter, thresholds: Thresholds) -> bool:
+def _own(
+    one: Candidate, found: Search, share: float, refitter: Refitter, groups: Sequence[Sequence[int]],
+    thresholds: Thresholds,
+) -> bool:
     """Whether a further effect is there for its own sake, however small it is beside the first.
 
-    What mends the form of another effect depends on it: alone it is of another size, or gains far more or less. `share`
-    is what the effects before it explain.
+    What mends the form of another effect depends on it: each manoeuvre asks for a size of its own, or alone it is of
+    another size, or gains far more or less. `share` is what the effects before it explain.
     """
-    if one.share - share < thresholds.own * (1 - share):
+    q, left = one.refit.split[-1], 1 - share
+    part = slice(len(one.refit.q) - len(q), len(one.refit.q))
+    if one.share - share < thresholds.little * left:
         return False
-    q = one.refit.split[-1]
+    differ = disagreement(one.refit, part, groups, refitter.precision)
+    inside = beside(one.refit.products(refitter.precision), len(q))
+    size = float(q @ inside @ q)
+    if differ <= thresholds.same and _within(size / one.gain, 1 / thresholds.foretold):
+        told = foretold(one.refit, part, groups, refitter.precision)
+        lost = float(-told[told < 0].sum())
+        if _within(float(told.sum()) / one.gain, 1 / thresholds.foretold) and lost <= thresholds.loss * (
+                told.sum() + lost):
+            return True
+    if one.share - share < thresholds.own * left or differ > thresholds.differ:
+        return False
     alone = next((other.refit for other in found.rounds[0] if other.hypothesis.key == one.hypothesis.key), None)
     if alone is None:
         [alone] = refitter.fit_all([Start((one.hypothesis,), found.base.u, q)], POLISH)
-    ratio = (found.base.cost - alone.cost) / one.gain
-    near = float(np.linalg.norm(alone.q - q)) <= thresholds.agree * float(np.linalg.norm(q))
-    return near and 1 / (1 + 1.5 * thresholds.agree) < ratio < 1 + 1.5 * thresholds.agree
+    change = alone.q - q
+    return (float(change @ inside @ change) <= thresholds.agree**2 * size
+            and _within((found.base.cost - alone.cost) / one.gain, thresholds.alone))
+
+
+def _most_apart(fit: Refit, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:
+    """Largest disagreement of manoeuvres on the size of an effect in a fit."""
+    ends = np.cumsum([0, *(len(one.axes) for one in fit.hypotheses)])
+    return max((disagreement(fit, slice(start, stop), groups, precision)
+                for start, stop in zip(ends[:-1], ends[1:], strict=True)), default=0.0)
+
+
+def _within(ratio: float, factor: float) -> bool:
+    return 1 / factor <= ratio <= factor
 
 
 def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray], float]) -> float:
@@ -193,10 +246,11 @@ def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray
 
 def _decide(
     found: Search, thresholds: Thresholds, wander: Wander, excess: Callable[[Refit], float],
-    anything: Callable[[np.ndarray], float], courses: np.ndarray,
+    anything: Callable[[np.ndarray], float], courses: np.ndarray, apart: Callable[[Refit], float],
 ) -> None:
     """The verdict on what was accepted. An effect is kept for its own sake, not to mend the form of another one.
 
+    Where manoeuvres agree on the sizes (`apart` is the largest disagreement), half of it is enough.
     Where little stands out, shares of it say little, and what replicates do not share (gusts, say) nothing can explain:
     an effect must then leave little to functions without physics.
     """
@@ -216,6 +270,7 @@ def _decide(
     if not keep and wander.p_excess(before) >= thresholds.alpha:
         found.reason = "what stands out in a linear scan does not hold in a refit"
     elif keep and (found.share >= thresholds.share or (
+            found.share >= thresholds.most and apart(found.final) <= thresholds.same) or (
             found.share >= thresholds.share / 2 or wander.p_excess(after) > thresholds.quiet)
             and wander.p_excess(after - wander.unshared(found.final.residual, courses)) > thresholds.quiet
             and _of_what_lasts(found, wander, anything) >= thresholds.share):
@@ -310,10 +365,7 @@ def _candidate(
     one = hypotheses[h]
     gain = max(current.cost - fit.cost, 0.0)
     q = fit.q[-len(one.axes) :]
-    size = fit.jacobian.shape[-1] - len(q)
-    products = fit.products(evidence.precision)
-    cross = products[:size, size:]
-    inside = products[size:, size:] - cross.T @ np.linalg.lstsq(products[:size, :size], cross, rcond=None)[0]
+    inside = beside(fit.products(evidence.precision), len(q))
     moved = np.abs(q) > 1e-9
     inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])

@@ -8,7 +8,7 @@ from dreamer_toys import echo_env, tiny_config
 
 from dreamer import iteration, optim, replay, world_model
 from dreamer.rssm import Latent
-from dreamer.types import Transition
+from dreamer.types import Mirror, Transition
 
 N, T = 3, 4
 CONFIG = tiny_config(batch_size=6, batch_length=T, replay_capacity=20 * N)
@@ -147,3 +147,35 @@ def test_the_model_foresees_the_frame_from_the_right_action_and_not_from_a_shuff
     assert np.mean(kl[-50:]) < 0.1
     assert np.mean(recon[-50:]) < 5.0  # of about 190 for a grey guess
     assert np.mean(mixed_kl[-50:]) > 0.4  # a coin's entropy is 0.69 nat
+
+
+def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothing():
+    plain_env = echo_env(2)
+    mirror = Mirror(lambda obs: 255 - obs, lambda action: -action)
+    env = dataclasses.replace(plain_env, mirror=mirror)
+    config = tiny_config(mirror=True, learning_starts=0)
+    with pytest.raises(ValueError, match="has no mirror"):
+        iteration.init_state(plain_env, config, 0)
+    step = jax.jit(lambda state: iteration.train_iteration(env, config, state))
+    state, updates = iteration.init_state(env, config, 0), 0
+    for _ in range(14):
+        state, metrics = step(state)
+        updates += int(metrics["updates"])
+    rows = int(state.replay.written)
+    assert rows == 14 and state.replay.reward.shape[1] == 4 and int(state.env_steps) == 28
+    assert state.replay.reward.shape[0] == replay.rows_for(config, 2)  # the same time back as without
+    real, mirrored = (jax.tree.map(lambda x: np.asarray(x[:rows]), columns(state.replay, part))
+                      for part in (slice(0, 2), slice(2, 4)))  # fmt: skip
+    np.testing.assert_array_equal(mirrored["action"], -real["action"])
+    np.testing.assert_array_equal(mirrored["obs"], 255 - real["obs"])
+    assert np.abs(real["action"]).max() > 0.1
+    for name in ("reward", "is_first", "is_last", "is_terminal"):
+        np.testing.assert_array_equal(mirrored[name], real[name])
+    gain, price = iteration.credit_rates(config, 2)
+    assert updates == (14 - config.batch_length) * gain // price
+
+
+def columns(memory, part):
+    """Fields of some streams of a replay."""
+    names = ("obs", "action", "reward", "is_first", "is_last", "is_terminal")
+    return {name: getattr(memory, name)[:, part] for name in names}

@@ -87,14 +87,32 @@ def test_credit_buys_exactly_the_ratio(num_envs, ratio):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(straight, tmp_path):
-    train(ENV, CONFIG, tmp_path, 200, 0, **QUIET)
-    resumed = train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+    train(ENV, CONFIG, tmp_path, 200, 0, **QUIET, tensorboard=True)
+    resumed = train(ENV, CONFIG, tmp_path, 400, 0, **QUIET, tensorboard=True)
     assert_equal(resumed.agent, straight.agent)
+    drawn = curve(tmp_path / "tensorboard", "updates_per_env_step")
+    logged = {line["env_steps"]: line["updates_per_env_step"] for line in lines(tmp_path)}
+    assert drawn == pytest.approx(logged) and len(drawn) > 30
     assert [line["env_steps"] for line in lines(tmp_path)] == [line["env_steps"] for line in lines(straight.out)]
     rates = {line["updates_per_env_step"] for line in lines(tmp_path)[30:]}
     assert rates == {2.0}
     times = [line["wall_s"] for line in lines(tmp_path)]
     assert times == sorted(times)
+
+
+def curve(folder, name):
+    """{step: value} of one curve in TensorBoard's files: records of length, checksum, event, checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    points = {}
+    for path in sorted(folder.iterdir()):
+        data, at = path.read_bytes(), 0
+        while at < len(data):
+            size = int.from_bytes(data[at : at + 8], "little")
+            event = Event.FromString(data[at + 12 : at + 12 + size])
+            points |= [(event.step, value.simple_value) for value in event.summary.value if value.tag == name]
+            at += size + 16
+    return points
 
 
 CHILD = """

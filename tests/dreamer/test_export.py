@@ -174,11 +174,12 @@ def test_step_that_onnx_computes_differently_is_refused(tmp_path, monkeypatch):
     def step(carry, image):
         return carry, jnp.tanh(image[0, 0, :2] / 255.0)
 
-    def wrong_model(_, shapes, contract):
-        return original(lambda carry, image: (carry, jnp.tanh(image[0, 0, 1:] / 255.0)), shapes, contract)
+    def wrong_model(network):
+        wrong = lambda carry, obs: (carry, (jnp.tanh(obs["image"][0, 0, 1:] / 255.0),))  # noqa: E731
+        return original(dataclasses.replace(network, step=wrong))
 
-    original = dreamer.export._to_onnx
-    monkeypatch.setattr(dreamer.export, "_to_onnx", wrong_model)
+    original = dreamer.export.to_onnx
+    monkeypatch.setattr(dreamer.export, "to_onnx", wrong_model)
     with pytest.raises(ValueError, match="a step of it differs from JAX"):
         export_policy(tmp_path / "p", step, {"h": np.zeros(2, np.float32)}, {}, CONTRACT, check_steps=5)
     assert not list(tmp_path.iterdir())

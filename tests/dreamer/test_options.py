@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dreamer_toys import SHAPE, tiny_config
+from dreamer_toys import SHAPE, corridor_env, tiny_config
 
 from dreamer import agent, sensors
 from dreamer.config import DreamerConfig
+from dreamer.iteration import init_state, train_iteration
 from dreamer.rssm import Latent
+from dreamer.train import train
 
 KEY = jax.random.PRNGKey(0)
 CONFIG = tiny_config()
@@ -71,3 +73,36 @@ def test_targets_without_a_decoder_or_of_unknown_name_are_refused():
         sensors.check(dataclasses.replace(CONFIG, decode_only=("bearing",)), SHAPES)
     with pytest.raises(ValueError, match="there must be observations"):
         sensors.check(dataclasses.replace(CONFIG, decode_only=("goal",)), {"goal": (2,)})
+
+
+def test_an_average_follows_the_parameters_and_learning_does_not_notice():
+    env = corridor_env(2)
+    config = dataclasses.replace(CONFIG, average_rate=0.25, learning_starts=0)
+    plain = dataclasses.replace(config, average_rate=0.0)
+    step = jax.jit(lambda state: train_iteration(env, config, state)[0])
+    plain_step = jax.jit(lambda state: train_iteration(env, plain, state)[0])
+    state, other = init_state(env, config, 0), init_state(env, plain, 0)
+    assert other.agent.average is None and other.agent.acting is other.agent.params
+    expected, updates = state.agent.params, 0
+    for _ in range(14):
+        state, other = step(state), plain_step(other)
+        done, updates = int(state.agent.updates) - updates, int(state.agent.updates)
+        assert done <= 1
+        if done:
+            expected = jax.tree.map(lambda slow, fast: slow + 0.25 * (fast - slow), expected, state.agent.params)
+    assert updates >= 3
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.agent.average, expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.agent.params, other.agent.params)
+    assert state.agent.acting is state.agent.average
+
+
+def test_evaluations_take_the_average(tmp_path):
+    seen = []
+    config = dataclasses.replace(CONFIG, average_rate=0.25)
+    run = train(corridor_env(2), config, tmp_path, 64, 0, eval_fn=lambda params, _: seen.append(params) or {},
+                progress=False)  # fmt: skip
+    jax.tree.map(np.testing.assert_array_equal, seen[-1], run.agent.average)
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), run.agent.average, run.agent.params)
+    assert any(jax.tree.leaves(changed))
+    with pytest.raises(ValueError, match="average_rate"):
+        DreamerConfig(average_rate=1.0)

@@ -2,18 +2,22 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after, vehicle_before
 from sysid.log import load_log
+from sysid.loop.agreement import disagreement, foretold
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.drives import make_drives
 from sysid.loop.evidence import Columns
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
+from sysid.loop.refit import Refit
 from sysid.loop.report import make_report, replay, write_run
+from sysid.loop.search import Candidate, Thresholds, _own
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
@@ -165,6 +169,45 @@ def test_a_day_that_does_not_excite_an_effect_says_little_of_how_it_wanders():
     assert np.sqrt(_pooled(columns, blind).covariance[0][0, 0]) < 2 * usual
     loud = [*alike[:6], [(np.array([5.0]), np.array([[100.0]]))]]  # here it is 50 times its noise
     assert np.sqrt(_pooled(columns, loud).covariance[0][0, 0]) > 4 * usual
+
+
+def joint_fit(sizes, trials=3, bins=400):
+    """A linear fit of one base parameter and one coordinate of size 1, each manoeuvre with a size of its own."""
+    rng = np.random.default_rng(1)
+    columns = rng.standard_normal((trials * len(sizes), bins, 2))
+    truth = np.repeat(sizes, trials)
+    data = columns[..., 1] * truth[:, None] + rng.standard_normal(columns.shape[:2])
+    q = np.linalg.lstsq(columns.reshape(-1, 2), data.reshape(-1), rcond=None)[0]
+    residual = data - columns @ q
+    groups = [range(trials * k, trials * (k + 1)) for k in range(len(sizes))]
+    fit = Refit((), q[:1], q[1:], float(np.square(residual).sum()), residual, columns, q)
+    gain = float(np.square(data - columns[..., 0] * q[0]).sum()) - fit.cost
+    return fit, groups, gain
+
+
+@pytest.mark.quick
+def test_manoeuvres_agree_on_a_real_effect_and_foretell_one_another():
+    fit, groups, gain = joint_fit((1.0, 1.0, 1.0, 1.0))
+    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) < 0.05
+    told = foretold(fit, slice(0, 1), groups, np.eye(1))
+    assert told.min() > 0
+    assert told.sum() == pytest.approx(gain, rel=0.1)
+
+
+@pytest.mark.quick
+def test_manoeuvres_disagree_on_an_effect_that_only_one_of_them_asks_for():
+    fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
+    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) == pytest.approx(3**0.5, rel=0.1)
+    assert foretold(fit, slice(0, 1), groups, np.eye(1)).sum() < 0.3 * gain
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("sizes", "own"), [((1.0, 1.0, 1.0, 1.0), True), ((4.0, 0.0, 0.0, 0.0), False)])
+def test_a_small_second_effect_is_one_that_manoeuvres_agree_on(sizes, own):
+    fit, groups, gain = joint_fit(sizes)
+    one = Candidate(SimpleNamespace(key="second"), gain, 0.0, 0.6, fit)
+    refitter = SimpleNamespace(precision=np.eye(1))
+    assert _own(one, SimpleNamespace(rounds=[[]]), 0.5, refitter, groups, Thresholds()) is own
 
 
 @pytest.mark.quick

@@ -96,7 +96,7 @@ def test_strips_that_keep_enough_boxes_change_nothing():
     assert full.std() > 20 and (full != kept).any(-1).sum() <= 4  # rays that graze an edge may fall to either side
 
 
-@pytest.mark.parametrize("height, width", [(1, 1), (7, 40), (200, 96)])
+@pytest.mark.parametrize("height, width", [(1, 1), (7, 40), (200, 96), (1024, 1024)])
 def test_every_size_and_zero_boxes_give_an_image(height, width):
     scene = dataclasses.replace(scene_of(), boxes=no_boxes(0))
     image = jax.jit(lambda s: render(EYE, LEVEL, pinhole(1.2, height, width), s, height, width))(scene)

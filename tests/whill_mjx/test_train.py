@@ -16,7 +16,7 @@ from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.intervals import wilson_interval
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.task import Corridor, ObstacleCourse
-from whill_mjx.train import Stopper, TrainOptions, keep_best, main, prepare_vehicle, read_best
+from whill_mjx.train import Stopper, TrainOptions, choose_preset, keep_best, main, prepare_vehicle, read_best
 from whill_mjx.training import find_preset, functional_env
 
 
@@ -216,6 +216,12 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
 
 
 @pytest.mark.quick
+@pytest.mark.quick
+def test_targets_are_for_the_decoder_alone():
+    plain, told = (choose_preset(TrainOptions(preset="paper", targets=asked)).learner for asked in (False, True))
+    assert plain.decode_only == () and told == dataclasses.replace(plain, decode_only=("truth",))
+
+
 def test_wilson_interval_known_values():
     """98 of 100: 0.930 to 0.994 (Wilson, 95 %), from the closed form worked by hand."""
     np.testing.assert_allclose(wilson_interval(98, 100), (0.930, 0.9945), atol=5e-4)

@@ -1,0 +1,53 @@
+"""Derivatives of a replay by differences, for models through which forward mode means nothing.
+
+A contact solver stops after a few iterations and switches between sticking and sliding: the derivative of what it
+computes grows without bound along a drive, though the motion itself hardly changes. Differences over a share of the
+parameter's range see the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from sysid.objective import Replays
+from sysid.rollout import Simulated
+from sysid.space import Space
+
+STEP = 0.01
+"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+
+
+@dataclass(frozen=True)
+class DifferenceReplay:
+    """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
+
+    replay: Replays
+    space: Space
+    step: float = STEP
+
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """As that of the replay."""
+        return self.replay.simulate(values)
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replay and derivatives (a last axis P) for each of values (N, P)."""
+        u = self.space.to_unit(values)
+        count, size = u.shape
+        ends = [np.clip(u[:, None, :] + sign * self.step * np.eye(size), 0.0, 1.0) for sign in (1, -1)]  # (N, P, P)
+        up, down = (self.space.to_values(end) for end in ends)
+        rows = np.concatenate([values, up.reshape(-1, size), down.reshape(-1, size)])
+        found = self.replay.simulate(rows)
+        width = np.einsum("npp->np", up - down)  # of each difference, in the parameter's unit
+
+        def slope(leaf: np.ndarray) -> np.ndarray:
+            leaf = np.asarray(leaf, float)
+            high, low = (leaf[count + k * count * size :][: count * size].reshape(count, size, *leaf.shape[1:])
+                         for k in (0, 1))
+            difference = (high - low) / width.reshape(count, size, *(1,) * (leaf.ndim - 1))
+            return np.moveaxis(difference, 1, -1)
+
+        at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
+        return at, jax.tree.map(slope, found)

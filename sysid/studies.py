@@ -1,0 +1,261 @@
+"""Studies of a global search that several processes share, and that outlive any of them.
+
+A study lives in a journal file (`journal:FILE`; on a file system that all processes see) or in a database by its URL
+(`postgresql://user@host/name`, which needs psycopg2). Every process that searches in it asks for candidates in batches,
+simulates a batch in one replay and tells the costs. A process that is killed leaves candidates that were asked for and
+never told: the next one to look puts them back into the queue. Costs that were told are in the storage.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+BATCH = 16
+"""Candidates that are simulated together, and the population of CMA-ES."""
+LEASE = 600.0
+"""Seconds after which a process on another machine that has not been heard of counts as dead."""
+POLL = 0.2  # s between looks while others finish
+METHODS = ("tpe", "cmaes")
+SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
+
+
+def open_storage(text: str | Any | None) -> Any:
+    """Optuna storage of `journal:FILE` or a URL; None for a study in memory. ValueError where it cannot be opened."""
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    if not text:
+        return None
+    if not isinstance(text, str):
+        return text
+    kind, _, rest = text.partition(":")
+    if kind == "journal" and rest:
+        folder = os.path.dirname(os.path.abspath(rest))
+        os.makedirs(folder, exist_ok=True)
+        lock: Any = _Flock(rest)
+        return optuna.storages.JournalStorage(JournalFileBackend(rest, lock_obj=lock))
+    if "://" not in text:
+        raise ValueError(f"storage {text!r} is neither journal:FILE nor a URL. Give for example "
+                         "journal:runs/study.log or postgresql://user@host/name.")
+    from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+
+    try:
+        for _ in range(5):
+            try:
+                return optuna.storages.RDBStorage(text, engine_kwargs={"pool_pre_ping": True})
+            except DBAPIError as error:  # another process may be making the tables at this moment
+                if "connect" in str(error).lower():
+                    raise
+                time.sleep(POLL)
+        return optuna.storages.RDBStorage(text, engine_kwargs={"pool_pre_ping": True})
+    except ImportError as error:
+        raise ValueError(f"storage {text!r} needs {error.name or error}. Install it: "
+                         "pip install psycopg2-binary.") from None
+    except SQLAlchemyError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ValueError(f"storage {text!r} cannot be opened: {reason}. Check the server, the name and the "
+                         "rights.") from None
+
+
+class SharedStudy:
+    """One process's part in a study."""
+
+    def __init__(
+        self, names: tuple[str, ...], initial: np.ndarray, *, method: str = "tpe", seed: int = 0, storage: Any = None,
+        study: str = "fit", problem: Mapping[str, str] | None = None,
+    ):
+        """Create or join the study.
+
+        Args:
+            names: of the parameters, in unit coordinates.
+            initial: (P,) where the search begins.
+            storage: of `open_storage`.
+            problem: what is searched, as short texts; a study of another problem is refused.
+
+        Raises:
+            ValueError: the study is of another problem, or the method is unknown.
+        """
+        import optuna
+
+        if method not in METHODS:
+            raise ValueError(f"method {method!r} is no global search (known: {', '.join(METHODS)}).")
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self._optuna, self._names, self._storage = optuna, names, storage
+        self._worker = uuid.uuid4().hex[:12]
+        self._study = optuna.create_study(study_name=study if storage is not None else None, storage=storage,
+                                          direction="minimize", load_if_exists=storage is not None)
+        wanted = {"parameters": ", ".join(names), "method": method, **(problem or {})}
+        for key, value in wanted.items():
+            known = self._study.user_attrs.get(f"problem: {key}")
+            if known is not None and known != value:
+                raise ValueError(f"study {study!r} is of another problem: its {key} is {known!r}, here {value!r}. "
+                                 "Choose another --study, or another storage.")
+        begin = not self._study.user_attrs
+        for key, value in wanted.items() if begin else ():
+            self._study.set_user_attr(f"problem: {key}", value)
+        self._beat()
+        # Processes that draw with one seed would draw the same candidates.
+        workers = sorted((value["began"], key) for key, value in self._study.user_attrs.items()
+                         if key.startswith("worker: "))
+        index = [key for _, key in workers].index(f"worker: {self._worker}")
+        start = dict(zip(names, np.clip(initial, 0.0, 1.0).tolist(), strict=True))
+        self._study.sampler = self._labelled(self._sampler(method, seed + 7919 * index, start))
+        if begin:
+            self._study.enqueue_trial(start, user_attrs={"initial": True})
+        self._distributions: Any = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names}
+
+    def run(self, costs: Callable[[np.ndarray], np.ndarray], evaluations: int,
+            progress: Callable[[int, str], None] | None = None) -> None:
+        """Ask, simulate and tell until the study has `evaluations` costs, whoever told them.
+
+        Args:
+            costs: unit coordinates (BATCH, P) -> costs (BATCH,); always called with a whole batch.
+        """
+        best = np.inf
+        while True:
+            self._beat()
+            self.recover()
+            trials = self._study.get_trials(deepcopy=False)
+            done = sum(trial.state.name == "COMPLETE" for trial in trials)
+            in_hand = sum(trial.state.name == "RUNNING" and "worker" in trial.user_attrs for trial in trials)
+            count = min(BATCH, evaluations - done - in_hand)
+            if done >= evaluations:
+                return
+            if count <= 0:
+                time.sleep(POLL)  # others have them in hand
+                continue
+            if done == 0 and count == BATCH:
+                count = 1  # a sampler that knows nothing yet draws at random; the initial values give it the space
+            asked = []
+            for _ in range(count):
+                asked.append(self._study.ask(self._distributions))
+            u = np.array([[trial.params[name] for name in self._names] for trial in asked])
+            found = costs(np.concatenate([u, np.repeat(u[-1:], BATCH - count, axis=0)]))[:count]
+            for trial, value in zip(asked, found, strict=True):
+                # The logarithm keeps diverged candidates from flattening the rest. Another process may have given this
+                # one up and told the same candidate already.
+                self._tell(trial, float(np.log(max(value, 1e-12))))
+            best = min(best, float(found.min()))
+            if progress is not None:
+                progress(count, f"J {best:.4g}")
+
+    def recover(self) -> int:
+        """Queue again what dead processes left; returns how many candidates."""
+        state = self._optuna.trial.TrialState
+        trials = self._study.get_trials(deepcopy=False)
+        dead = self._dead()
+        left = [trial for trial in trials if trial.state == state.RUNNING and self._is_left(trial, dead)]
+        again = {trial.user_attrs.get("retry_of") for trial in trials} if left else set()
+        for trial in left:
+            if trial.number not in again and set(trial.params) == set(self._names):
+                # Queued before it is given up: killed in between, it would be done twice, and never lost.
+                self._study.enqueue_trial(trial.params, user_attrs={"retry_of": trial.number})
+            self._tell(trial.number, None, state.FAIL)
+        return len(left)
+
+    def table(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Unit coordinates (N, P) and costs (N,) of all candidates in the order they were asked, and which of them has
+        the initial values."""
+        trials = self._study.get_trials(deepcopy=False, states=(self._optuna.trial.TrialState.COMPLETE,))
+        trials = sorted(trials, key=lambda trial: trial.number)
+        initial = next((i for i, trial in enumerate(trials) if trial.user_attrs.get("initial")), 0)
+        u = np.array([[trial.params[name] for name in self._names] for trial in trials])
+        return u, np.exp(np.array([trial.value for trial in trials], float)), initial
+
+    def _tell(self, trial: Any, value: float | None, state: Any = None) -> None:
+        """Tell a result, unless another process has told one at this very moment."""
+        try:
+            self._study.tell(trial, value, state=state, skip_if_finished=True)
+        except self._optuna.exceptions.UpdateFinishedTrialError:
+            pass
+
+    def _sampler(self, method: str, seed: int, start: dict[str, float]) -> Any:
+        samplers = self._optuna.samplers
+        if method == "tpe":
+            return samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=2 * BATCH)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # x0 and sigma0 are to go in Optuna 6
+            return samplers.CmaEsSampler(seed=seed, x0=start, sigma0=SIGMA, popsize=BATCH,
+                                         warn_independent_sampling=False)
+
+    def _labelled(self, sampler: Any) -> Any:
+        """The sampler, writing this process's name on a candidate before drawing it: it may be killed meanwhile."""
+        before = sampler.before_trial
+
+        def label(study: Any, trial: Any) -> None:
+            if self._storage is not None:
+                self._storage.set_trial_user_attr(trial._trial_id, "worker", self._worker)
+            before(study, trial)
+
+        sampler.before_trial = label
+        return sampler
+
+    def _beat(self) -> None:
+        if self._storage is None and self._study.user_attrs.get(f"worker: {self._worker}"):
+            return  # nobody else looks
+        about = self._study.user_attrs.get(f"worker: {self._worker}") or {
+            "host": socket.gethostname(), "pid": os.getpid(), "began": time.time()}
+        self._study.set_user_attr(f"worker: {self._worker}", {**about, "seen": time.time()})
+
+    def _dead(self) -> set[str]:
+        """Processes that can tell nothing any more."""
+        found = set()
+        for key, about in self._study.user_attrs.items():
+            if key.startswith("worker: "):
+                here = about["host"] == socket.gethostname()
+                if not (_alive(about["pid"]) if here else time.time() - about["seen"] < LEASE):
+                    found.add(key.removeprefix("worker: "))
+        return found
+
+    def _is_left(self, trial: Any, dead: set[str]) -> bool:
+        worker = trial.user_attrs.get("worker")
+        if worker is not None:
+            return worker in dead
+        begun = trial.datetime_start.timestamp() if trial.datetime_start else 0.0
+        return time.time() - begun > (10.0 if dead else LEASE)  # killed between making it and writing its name
+
+
+class _Flock:
+    """Lock of a journal file that the system releases when its holder is killed; Optuna's own would be waited for."""
+
+    def __init__(self, path: str):
+        self._path, self._file = path, -1
+
+    def acquire(self) -> bool:
+        """Wait for the lock; then cut off a last line whose writer was killed before its end."""
+        self._file = os.open(self._path + ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+        with open(self._path, "r+b") as file:
+            size = file.seek(0, os.SEEK_END)
+            if size and (file.seek(size - 1), file.read(1))[1] != b"\n":
+                file.seek(0)
+                file.truncate(file.read().rfind(b"\n") + 1)
+        return True
+
+    def release(self) -> None:
+        """Let it go."""
+        os.close(self._file)
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process of this machine runs, and is more than a zombie."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return True

@@ -1,0 +1,287 @@
+"""Models of other people: a plain function and a MuJoCo file, fitted to a log of planted parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from cart import cart
+
+from sysid import fit as fit_module
+from sysid.differences import DifferenceReplay
+from sysid.fit import Arguments, FitConfig, fit_log
+from sysid.log import Command, OdometryStream, PoseStream, make_trial
+from sysid.mjcf import mjcf_model
+from sysid.mjcf_file import load_robot, resolve, write_mjcf
+from sysid.models import function_model, load_model, make_parameters, model_space, set_parameters
+from sysid.scenarios import Scenario
+from sysid.synthetic import write_dataset
+from whill_mjx.manoeuvres import command_table
+from whill_mjx.specs import WHILL_CR
+
+DT = 0.02
+FUNCTION = cart("lag", "lag", '{"lag": (0.1, 0.02, 1.0, "s"), "turn": (1.0, 0.5, 1.5)}')
+PLANTED = {"lag": 0.3, "turn": 0.9, "command_delay.delay": 0.13}
+ROBOT = '''
+<mujoco model="robot">
+  <option timestep="0.01" integrator="implicitfast" iterations="20" ls_iterations="20"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="10 10 0.1"/>
+    <body name="base" pos="0 0 0.1">
+      <freejoint/>
+      <geom name="box" type="box" size="0.2 0.15 0.05" mass="8" contype="0" conaffinity="0"/>
+      <geom name="caster" type="sphere" size="0.05" pos="0.2 0 -0.05" mass="0.1" friction="0.01" priority="1"/>
+      <body name="left_wheel" pos="-0.1 0.2 0">
+        <joint name="left" axis="0 1 0" damping="0.05" armature="0.01"/>
+        <geom name="left_tyre" type="sphere" size="0.1" mass="0.5" friction="0.9" priority="1"/>
+      </body>
+      <body name="right_wheel" pos="-0.1 -0.2 0">
+        <joint name="right" axis="0 -1 0" damping="0.05" armature="0.01"/>
+        <geom name="right_tyre" type="sphere" size="0.1" mass="0.5" friction="0.9" priority="1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="left_motor" joint="left" kv="1"/>
+    <velocity name="right_motor" joint="right" kv="1"/>
+  </actuator>
+</mujoco>
+'''
+URDF = '''
+<robot name="cart">
+  <link name="base"><inertial><mass value="8"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.2" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0.2 0 0.25"/><geometry><sphere radius="0.05"/></geometry></collision></link>
+  <link name="left_wheel"><inertial><mass value="0.5"/>
+    <inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin rpy="1.5708 0 0"/><geometry><cylinder radius="0.1" length="0.04"/></geometry></collision></link>
+  <link name="right_wheel"><inertial><mass value="0.5"/>
+    <inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin rpy="1.5708 0 0"/><geometry><cylinder radius="0.1" length="0.04"/></geometry></collision></link>
+  <joint name="left_wheel_joint" type="continuous"><parent link="base"/><child link="left_wheel"/>
+    <origin xyz="-0.1 0.2 0.3" rpy="0 0 0"/><axis xyz="0 1 0"/></joint>
+  <joint name="right_wheel_joint" type="continuous"><parent link="base"/><child link="right_wheel"/>
+    <origin xyz="-0.1 -0.2 0.3"/><axis xyz="0 1 0"/></joint>
+</robot>
+'''
+
+
+@pytest.fixture(scope="module")
+def function_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("function") / "cart.py"
+    path.write_text(FUNCTION)
+    return path
+
+
+@pytest.fixture(scope="module")
+def robot_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "robot.xml"
+    path.write_text(ROBOT)
+    return path
+
+
+@pytest.fixture(scope="module")
+def function_run(function_file, tmp_path_factory):
+    """Run folder and report of `sysid.fit --model cart.py --effects command_delay` on a planted log."""
+    folder = tmp_path_factory.mktemp("planted")
+    model = load_model(str(function_file), WHILL_CR).with_effects(("command_delay",))
+    truth = set_parameters(model.params, list(PLANTED), jnp.array(list(PLANTED.values())))
+    write_dataset(folder / "log", WHILL_CR, truth, replicates=2, scenario=Scenario(v=0.5, omega=0.8, length=3.0),
+                  seed=3, manoeuvres=("straight", "s_curve", "figure_eight"), plant=model.plant)
+    fit_module.main(Arguments(dataset=folder / "log", out=folder / "run", model=str(function_file), iterations=12,
+                              effects=("command_delay",)))
+    return folder
+
+
+def test_a_plain_function_is_fitted_from_the_command_line_with_an_effect_around_it(function_run):
+    report = json.loads((function_run / "run" / "report.json").read_text())
+    found = {one["name"]: one for one in report["parameters"]}
+    assert found.keys() == PLANTED.keys() and report["model"] == {"preset": "function", "effects": ["command_delay"]}
+    for name, truth in PLANTED.items():
+        assert found[name]["value"] == pytest.approx(truth, rel=0.05), name
+    one = report["summary"]["held_out"]["ground_truth"]["trajectory"]
+    assert one["fitted"] < 0.03 * one["initial"]
+
+
+def test_the_fitted_model_is_written_with_units_and_intervals(function_run):
+    content = tomllib.loads((function_run / "run" / "model.toml").read_text())
+    assert content["parameters"]["lag"]["unit"] == "s" and content["parameters"]["command_delay.delay"]["unit"] == "s"
+    low, high = content["parameters"]["turn"]["interval"]
+    assert low < content["parameters"]["turn"]["value"] < high
+    assert not (function_run / "run" / "vehicle.toml").exists()
+
+
+def drive_in_mujoco(path, values, manoeuvre, seed):
+    """A trial driven by C MuJoCo itself, with parameters written into the file and noise of 2 mm and 2 mrad."""
+    robot = load_robot(path)
+    planted = write_mjcf(robot, {resolve(robot, name): value for name, value in values.items()},
+                         path.with_name(f"planted_{manoeuvre}_{seed}.xml"))
+    host = mujoco.MjModel.from_xml_path(str(planted))
+    data = mujoco.MjData(host)
+    for _ in range(100):
+        mujoco.mj_step(host, data)
+    table = command_table(manoeuvre, Scenario(v=0.6, omega=1.2, length=2.0))
+    times = np.arange(0, table[-1, 0], host.opt.timestep)
+    rows = []
+    for k, t in enumerate(times):
+        v, omega = table[np.searchsorted(table[:, 0], t + 1e-6, side="right") - 1, 1:]
+        left, right = (data.qvel[6] * 0.1, -data.qvel[7] * 0.1)
+        forward = data.xmat[1].reshape(3, 3)[:, 0]
+        centre = (data.xpos[2] + data.xpos[3]) / 2
+        if k % 5 == 0:
+            rows.append([t, *centre[:2], np.arctan2(forward[1], forward[0]), (left + right) / 2, (right - left) / 0.4])
+        data.ctrl[:] = (v - 0.2 * omega) / 0.1, -(v + 0.2 * omega) / 0.1
+        mujoco.mj_step(host, data)
+    random = np.random.default_rng(seed)
+    rows = np.array(rows) + np.column_stack([np.zeros(len(rows)), random.normal(0, 2e-3, (len(rows), 5))])
+    t, x, y, yaw, v, omega = rows.T
+    yaw = np.unwrap(yaw)
+    return make_trial(f"{manoeuvre}_{seed}", Command(*table.T), OdometryStream(t, None, None, None, v, omega),
+                      PoseStream(t, x, y, yaw))
+
+
+def test_a_robot_file_is_fitted_to_a_log_that_c_mujoco_drove(robot_file, unicycle_log):
+    """Gain of both servos and friction of both tyres, which slip when turning, from two drives of 4 s."""
+    planted = {"actuator.*_motor.gain": 0.25, "geom.*_tyre.friction": 0.12}
+    trials = tuple(drive_in_mujoco(robot_file, planted, name, 1) for name in ("s_curve", "turn"))
+    log = dataclasses.replace(unicycle_log, trials=trials)
+    model = mjcf_model(robot_file, {"actuator.*_motor.gain": (0.05, 5.0), "geom.*_tyre.friction": (0.03, 1.5)})
+    fit = fit_log(log, FitConfig(method="both", trials=48, starts=2, iterations=8), model=model)
+    found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))
+    for name, truth in planted.items():
+        assert found[name] == pytest.approx(truth, rel=0.1), found
+    assert fit.cost < 0.05 * fit.initial_cost
+
+
+@pytest.mark.quick
+def test_a_fitted_robot_is_written_back_as_a_file_that_has_the_values(robot_file, tmp_path):
+    paths = ["actuator.*_motor.gain", "body.base.mass", "joint.left.damping", "geom.caster.solref"]
+    model = mjcf_model(robot_file, paths)
+    fitted = set_parameters(model.params, ["body.base.mass", "actuator.*_motor.gain"], jnp.array([20.0, 0.5]))
+    written = model.write(tmp_path, fitted)
+    before, after = (mujoco.MjModel.from_xml_path(str(path)) for path in (robot_file, written))
+    base = after.body("base")
+    assert base.mass[0] == pytest.approx(20.0)
+    same = before.body("base")
+    np.testing.assert_allclose(base.inertia, same.inertia * 20.0 / same.mass[0], rtol=1e-5)
+    np.testing.assert_allclose(after.actuator_gainprm[:, 0], 0.5)
+    np.testing.assert_allclose(after.actuator_biasprm[:, 2], -0.5)
+    np.testing.assert_allclose(after.dof_damping, before.dof_damping)
+    np.testing.assert_allclose(after.geom_friction, before.geom_friction)
+
+
+@pytest.mark.quick
+def test_a_urdf_gets_floor_freedom_and_servos_and_stands_still_on_its_wheels(tmp_path):
+    path = tmp_path / "cart.urdf"
+    path.write_text(URDF)
+    robot = load_robot(path)
+    assert robot.track == pytest.approx(0.4) and robot.wheel_radius == pytest.approx(0.1) and not robot.motors
+    np.testing.assert_allclose(robot.point, [-0.1, 0.0, 0.3], atol=1e-6)
+    np.testing.assert_allclose(robot.forward, [1.0, 0.0, 0.0], atol=1e-6)
+    assert abs(robot.rest[2]) < 0.01 and robot.rest[3] > 0.999 and robot.sign == (1.0, 1.0)
+    assert set(mjcf_model(path).params.values) == {"actuator.*_wheel_joint.gain", "geom.*_wheel.friction"}
+
+
+@pytest.mark.quick
+def test_a_robot_is_placed_with_its_axle_at_the_start_and_wheels_that_turn_forwards(robot_file):
+    plant, params = mjcf_model(robot_file).plant, mjcf_model(robot_file).params
+    start = jnp.array([1.0, -2.0, 2.5, 0.5, 0.3])
+    state = plant.place(params, start)
+    np.testing.assert_allclose(plant.observe(state), [1.0, -2.0, 2.5, 0, 0, 0, 0.5, 0.3, 0], atol=1e-5)
+    assert state.inner.qvel[6] == pytest.approx(4.4) and state.inner.qvel[7] == pytest.approx(-5.6)
+    moved = plant.move(state, jnp.array([0.0, 1.0, -1.0, 0.5, 0.3]))
+    np.testing.assert_allclose(plant.observe(moved)[:3], [0.0, 1.0, -1.0], atol=1e-5)
+    np.testing.assert_allclose(plant.observe(moved)[6:8], [0.5, 0.3], atol=1e-5)
+    forward = np.array([np.cos(-1.0), np.sin(-1.0)])
+    sideways = 0.3 * 0.1 * np.array([-forward[1], forward[0]])  # the body's origin lies 0.1 m ahead of the axle
+    np.testing.assert_allclose(moved.inner.qvel[:2], 0.5 * forward + sideways, atol=1e-5)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("parameters", "message"), [
+    (["mass"], "not KIND.NAME.FIELD"), (["body.bse.mass"], "no body 'bse' .known: base, left_wheel"),
+    (["body.base.weight"], "no field 'weight'"), (["joint.left.frictionloss"], "leaves dry friction out"),
+    (["actuator.*_motor.force_limit"], "no limit in the file"), (["joint.left.stiffness"], "bounds cannot be guessed"),
+    ({"body.base.mass": (5.0, 5.0)}, "bounds 5 to 5")])
+def test_a_wrong_path_says_what_is_known(robot_file, parameters, message):
+    with pytest.raises(ValueError, match=message):
+        mjcf_model(robot_file, parameters)
+
+
+@pytest.mark.quick
+def test_wheels_that_cannot_be_told_are_asked_for(robot_file, tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace('name="left"', 'name="a"').replace('name="right"', 'name="b"')
+                    .replace('joint="left"', 'joint="a"').replace('joint="right"', 'joint="b"'))
+    with pytest.raises(ValueError, match="robot.xml: the driven wheels cannot be told .*joints: a, b.*--wheels"):
+        load_robot(path)
+    assert load_robot(path, ("left_motor", "b")).wheels == (6, 7)
+    with pytest.raises(ValueError, match="must be two hinge joints"):
+        load_robot(path, ("a", "c"))
+    path.write_text("<mujoco><worldbody><body></mujoco>")
+    with pytest.raises(ValueError, match="robot.xml: MuJoCo cannot use it"):
+        load_robot(path)
+
+
+@pytest.mark.quick
+def test_motors_get_a_speed_controller_of_their_own(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace("<velocity", "<motor").replace(' kv="1"', ""))
+    model = mjcf_model(path, ["body.base.mass"])
+    assert set(model.params.values) == {"drive.kp", "body.base.mass"}
+    assert model_space(model.params).log.all()
+
+
+@pytest.mark.quick
+def test_differences_give_the_derivatives_that_forward_mode_gives(objective):
+    values = np.array([[0.2, 0.2, 1.0], [0.02, 0.5, 1.5]])  # the second one has parameters on their bounds
+    exact = objective.replay.jacobian(values)
+    differences = DifferenceReplay(objective.replay, objective.space).jacobian(values)
+    np.testing.assert_allclose(differences[0].pose, exact[0].pose, atol=1e-5)
+    known = objective.measured.pose_mask[None, ..., None] > 0
+    for p in range(3):
+        one, other = ((slope.pose * known)[..., p] for slope in (exact[1], differences[1]))
+        assert np.linalg.norm(one - other) < 0.05 * np.linalg.norm(one)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("text", "error", "message"), [
+    ("nowhere.xml", FileNotFoundError, "nowhere.xml: no such model"), ("cart.py:cart", ValueError, "defines no 'cart'"),
+    ("cart.py:step", ValueError, "missing|Model"), ("cart.txt", ValueError, "a model is .xml")])
+def test_a_model_that_is_not_there_ends_with_an_error(function_file, text, error, message):
+    (function_file.parent / "cart.txt").write_text("")
+    with pytest.raises((error, TypeError), match=message):
+        load_model(str(function_file.parent / text), WHILL_CR)
+
+
+@pytest.mark.quick
+def test_effects_that_act_inside_a_vehicle_are_refused_around_a_model(function_file):
+    model = load_model(str(function_file), WHILL_CR)
+    with pytest.raises(ValueError, match="'yaw_scrub' acts inside a vehicle"):
+        model.with_effects(("yaw_scrub",))
+    assert "odometry_lag.time_constant" in model_space(model.with_effects(("odometry_lag",)).params).names
+
+
+@pytest.mark.quick
+def test_a_step_that_returns_something_else_is_refused():
+    with pytest.raises(ValueError, match=r"step returns \(2,\) for a state of \(5,\)"):
+        function_model(lambda p, state, command: command, {"a": (1.0, 0.0, 2.0)}, dt=0.02)
+    with pytest.raises(ValueError, match="parameter 'a': initial value 3"):
+        make_parameters({"a": (3.0, 0.0, 2.0)})
+
+
+@pytest.mark.quick
+def test_a_robot_of_the_command_line_has_the_logs_geometry_and_the_paths_that_were_named(robot_file):
+    model = load_model(str(robot_file), WHILL_CR, ("left", "right_motor"),
+                       ("body.base.mass", "geom.*_tyre.friction", "command_delay.delay"))
+    assert list(model.params.values) == ["body.base.mass", "geom.*_tyre.friction"]
+    delayed = model.with_effects(("command_delay",))
+    space = model_space(delayed.params, ("body.base.mass", "command_delay.delay"))
+    assert space.high[0] == pytest.approx(5 * 8.1) and space.fixed == (("geom.*_tyre.friction", "not selected"),)
+    state = model.plant.place(model.params, jnp.array([0.0, 0.0, 0.0, WHILL_CR.wheel_radius, 0.0]))
+    np.testing.assert_allclose(state.inner.qvel[6:8], [1.0, -1.0], rtol=1e-5)  # rad/s of a wheel of the log's radius

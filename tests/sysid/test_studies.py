@@ -1,0 +1,222 @@
+"""Studies of a global search: batches, CMA-ES, several processes, and processes that are killed."""
+
+from __future__ import annotations
+
+import glob
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import TRUTH, UNICYCLE_SPACE
+
+from sysid import tpe
+from sysid.studies import BATCH, SharedStudy, open_storage
+
+NAMES = ("a", "b")
+GOAL = np.array([0.3, 0.8])
+WORKER = """
+import sys, time
+import numpy as np
+from sysid.studies import SharedStudy, open_storage
+
+storage, evaluations, pause = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+
+def costs(u):
+    time.sleep(pause)
+    return np.square(u - [0.3, 0.8]).sum(-1) + 1e-3
+
+study = SharedStudy(("a", "b"), np.array([0.5, 0.5]), storage=open_storage(storage), study="shared", method=sys.argv[4])
+study.run(costs, evaluations)
+"""
+
+
+def quadratic(u):
+    return np.square(u - GOAL).sum(-1) + 1e-3
+
+
+def start_worker(storage, evaluations, pause, method="tpe"):
+    root = Path(__file__).parents[2]
+    return subprocess.Popen([sys.executable, "-c", WORKER, storage, str(evaluations), str(pause), method], cwd=root)
+
+
+def trials_of(storage):
+    """All trials; a storage that is open already is not opened again, which takes a database a while."""
+    import optuna
+
+    return optuna.load_study(study_name="shared", storage=open_storage(storage)).get_trials(deepcopy=False)
+
+
+def wait_for(condition, seconds=60.0):
+    end = time.time() + seconds
+    while not condition():
+        assert time.time() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def counted(storage, state):
+    try:
+        return sum(trial.state.name == state for trial in trials_of(storage))
+    except (KeyError, ValueError):
+        return 0
+
+
+def check_nothing_is_lost(trials, evaluations):
+    """Every candidate that was drawn has a cost, its own or that of its repetition, and the costs are right."""
+    done = {trial.number: trial for trial in trials if trial.state.name == "COMPLETE"}
+    assert len(done) >= evaluations
+    repeated = {trial.user_attrs["retry_of"]: trial for trial in trials if "retry_of" in trial.user_attrs}
+    for trial in trials:
+        assert trial.state.name in ("COMPLETE", "FAIL")
+        if trial.state.name == "FAIL" and trial.params.keys() == set(NAMES):
+            assert repeated[trial.number].params == trial.params
+    for trial in done.values():
+        u = np.array([trial.params[name] for name in NAMES])
+        assert np.exp(trial.value) == pytest.approx(quadratic(u))
+
+
+def test_a_killed_process_loses_no_trial_of_a_journal(tmp_path):
+    storage = f"journal:{tmp_path / 'study.log'}"
+    first, second = start_worker(storage, 96, 0.3), start_worker(storage, 96, 0.3)
+    wait_for(lambda: counted(storage, "COMPLETE") >= 20 and counted(storage, "RUNNING") >= BATCH)
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    left = [trial.number for trial in trials_of(storage) if trial.state.name == "RUNNING"]
+    third = start_worker(storage, 96, 0.05)
+    assert second.wait(60) == third.wait(60) == 0
+    trials = trials_of(storage)
+    check_nothing_is_lost(trials, 96)
+    given_up = [trial for trial in trials if trial.state.name == "FAIL"]
+    assert given_up and {trial.number for trial in given_up} <= set(left)
+    assert len({trial.user_attrs["worker"] for trial in trials if "worker" in trial.user_attrs}) == 3
+    assert len(trials) < 96 + 3 * BATCH + len(given_up)
+
+
+def test_a_study_that_lost_its_only_process_goes_on_where_it_was(tmp_path):
+    storage = f"journal:{tmp_path / 'study.log'}"
+    alone = start_worker(storage, 10**6, 0.05, "cmaes")
+    wait_for(lambda: counted(storage, "COMPLETE") >= 3 * BATCH)
+    alone.kill()
+    alone.wait()
+    before = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(storage), study="shared", method="cmaes")
+    study.run(quadratic, len(before) + 2 * BATCH)
+    after = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
+    assert before.items() <= after.items()
+    check_nothing_is_lost(trials_of(storage), len(before) + 2 * BATCH)
+
+
+@pytest.fixture
+def postgresql():
+    """URL of a PostgreSQL server of this test's own, reached by a socket in its own folder."""
+    pytest.importorskip("psycopg2", reason="psycopg2 is not installed")
+    programs = [*glob.glob("/usr/lib/postgresql/*/bin"), os.path.dirname(shutil.which("initdb") or "")]
+    programs = [folder for folder in programs if folder and os.access(f"{folder}/pg_ctl", os.X_OK)]
+    if not programs:
+        pytest.skip("PostgreSQL is not installed (Debian: apt-get install postgresql)")
+    as_user = []
+    if os.geteuid() == 0:  # the server refuses to run as root
+        if subprocess.run(["id", "postgres"], capture_output=True).returncode or not shutil.which("runuser"):
+            pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
+        as_user = ["runuser", "-u", "postgres", "--"]
+    folder = tempfile.mkdtemp(prefix="pg", dir="/tmp")  # short: a socket's path has at most 107 characters
+    if as_user:
+        shutil.chown(folder, "postgres")
+
+    def call(*words):
+        done = subprocess.run([*as_user, *words], cwd=folder, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    try:
+        call(f"{programs[0]}/initdb", "-D", f"{folder}/data", "-U", "postgres", "-A", "trust", "--no-sync")
+        call(f"{programs[0]}/pg_ctl", "-D", f"{folder}/data", "-w", "-l", f"{folder}/log", "-o",
+             f"-k {folder} -c listen_addresses='' -c fsync=off", "start")
+        yield f"postgresql+psycopg2:///postgres?host={folder}&user=postgres"
+    finally:
+        subprocess.run([*as_user, f"{programs[0]}/pg_ctl", "-D", f"{folder}/data", "-m", "immediate", "stop"],
+                       cwd="/tmp", capture_output=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_processes_share_a_study_in_postgresql_and_one_may_be_killed(postgresql):
+    first, second = start_worker(postgresql, 64, 0.8), start_worker(postgresql, 64, 0.8)
+    storage = open_storage(postgresql)
+    wait_for(lambda: counted(storage, "COMPLETE") >= 2 and counted(storage, "RUNNING") >= 4)
+    first.kill()
+    first.wait()
+    third = start_worker(postgresql, 64, 0.05)
+    assert second.wait(60) == third.wait(60) == 0
+    check_nothing_is_lost(trials_of(storage), 64)
+
+
+def test_cmaes_finds_the_planted_parameters(objective):
+    result = tpe.fit(objective, objective.space, evaluations=15 * BATCH, seed=1, method="cmaes")
+    assert result.evaluations == 15 * BATCH
+    assert result.cost < 1.5 < result.initial_cost
+    np.testing.assert_allclose(UNICYCLE_SPACE.to_values(result.u), TRUTH, rtol=0.15)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("method", ["tpe", "cmaes"])
+def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_first(method):
+    sizes, first = [], []
+
+    def costs(u):
+        sizes.append(len(u))
+        first.append(u[0])
+        return quadratic(u)
+
+    study = SharedStudy(NAMES, np.array([0.5, 0.6]), method=method, seed=3)
+    study.run(costs, 60)
+    u, values, initial = study.table()
+    assert set(sizes) == {BATCH} and len(sizes) == 5 and len(u) == 60
+    np.testing.assert_allclose(first[0], [0.5, 0.6])
+    np.testing.assert_allclose(u[initial], [0.5, 0.6])
+    np.testing.assert_allclose(values, quadratic(u))
+    assert values.min() < 0.1 * values[initial]
+
+
+@pytest.mark.quick
+def test_a_line_that_was_not_written_to_its_end_is_cut_off(tmp_path):
+    path = tmp_path / "study.log"
+    SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}")).run(quadratic, 5)
+    with open(path, "ab") as file:
+        file.write(b'{"op_code": 6, "worker')
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}"))
+    study.run(quadratic, 9)
+    assert len(study.table()[0]) == 9
+
+
+@pytest.mark.quick
+def test_processes_with_one_seed_draw_different_candidates(tmp_path):
+    storage = open_storage(f"journal:{tmp_path / 'study.log'}")
+    one, other = (SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, seed=5) for _ in range(2))
+    one.run(quadratic, 17)
+    other.run(quadratic, 33)
+    u = one.table()[0]
+    assert len(u) == 33 and len(np.unique(u, axis=0)) == 33
+
+
+@pytest.mark.quick
+def test_a_study_of_another_problem_is_refused(tmp_path):
+    storage = open_storage(f"journal:{tmp_path / 'study.log'}")
+    SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, problem={"data": "monday"})
+    with pytest.raises(ValueError, match="its data is 'monday', here 'tuesday'. Choose another --study"):
+        SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, problem={"data": "tuesday"})
+    with pytest.raises(ValueError, match="its method is 'tpe', here 'cmaes'"):
+        SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, method="cmaes", problem={"data": "monday"})
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("text", "message"), [
+    ("study.log", "neither journal:FILE nor a URL"),
+    ("postgresql:///nowhere?host=/nonexistent", "cannot be opened|needs"), ("nosuch://x", "cannot be opened")])
+def test_a_storage_that_cannot_be_opened_says_why(text, message):
+    with pytest.raises(ValueError, match=message):
+        open_storage(text)

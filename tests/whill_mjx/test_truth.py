@@ -1,0 +1,82 @@
+"""What only the simulator knows, as targets for a world model, and the mirror of left and right."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx import truth
+from whill_mjx.batch import make_batch
+from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.scene import box, footprint, no_boxes, stack_boxes
+from whill_mjx.training import MIRROR, TRUTH, functional_env
+
+ENV, PARAMS = make_env("obstacle_course", "whill_cr", height=16, width=16)
+
+
+def mirrored_state(state):
+    """The same moment in the world mirrored left to right; the chair must be at its start."""
+    boxes, marker = state.scene.boxes, state.scene.marker
+    flip = jnp.array([1.0, -1.0, 1.0])
+    boxes = dataclasses.replace(boxes, centre=boxes.centre * flip, yaw=-boxes.yaw)
+    marker = dataclasses.replace(marker, position=marker.position * flip, yaw=-marker.yaw)
+    looks = dataclasses.replace(state.scene.looks, sun=state.scene.looks.sun * flip)
+    scene = dataclasses.replace(state.scene, boxes=boxes, marker=marker, looks=looks)
+    position = jnp.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0])  # x y z, quaternion of a mirrored turn
+    qpos = state.vehicle.qpos.at[:7].multiply(position)
+    return dataclasses.replace(state, scene=scene, vehicle=dataclasses.replace(state.vehicle, qpos=qpos))
+
+
+@pytest.mark.quick
+def test_free_distances_are_those_of_a_walk_along_each_ray():
+    boxes = stack_boxes([box(2.0, 0.3, 0.6, 0.4, 0.5, jnp.ones(3), 0.4), box(-0.5, 1.5, 0.2, 3.0, 0.5, jnp.ones(3)),
+                         box(0.0, -1.0, 4.0, 0.1, 0.5, jnp.ones(3), mask=False)])  # fmt: skip
+    body = footprint(ENV.model.spec, 0.1, -0.2, 0.7)
+    steps = np.linspace(0.0, truth.RANGE, 30001)
+    expected = []
+    for angle in truth.ANGLES + 0.7:
+        dx = float(body.x) + steps * np.cos(angle) - np.asarray(boxes.centre[:, :1])
+        dy = float(body.y) + steps * np.sin(angle) - np.asarray(boxes.centre[:, 1:2])
+        c, s = np.cos(np.asarray(boxes.yaw))[:, None], np.sin(np.asarray(boxes.yaw))[:, None]
+        half = np.asarray(boxes.half)
+        inside = (np.abs(dx * c + dy * s) <= half[:, :1]) & (np.abs(dy * c - dx * s) <= half[:, 1:2])
+        inside &= np.asarray(boxes.mask)[:, None]
+        met = inside.any(0)
+        expected.append(steps[met.argmax()] if met.any() else truth.RANGE)
+    assert 3 <= sum(value < truth.RANGE for value in expected) < truth.RAYS
+    np.testing.assert_allclose(truth.free_distances(body, boxes), expected, atol=2e-4)
+    np.testing.assert_array_equal(truth.free_distances(body, no_boxes(2)), truth.RANGE)
+
+
+def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
+    state = reset_state(ENV, PARAMS, jax.random.key(3))
+    other = mirrored_state(state)
+    drive = jax.jit(lambda state, action: step_state(ENV, PARAMS, state, action))
+    actions = jax.random.uniform(jax.random.key(1), (12, 2), minval=jnp.array([0.2, -1.0]), maxval=1.0)
+    for action in actions:
+        state, outcome = drive(state, action)
+        other, other_outcome = drive(other, MIRROR.action(action[None])[0])
+    known, other_known = (truth.truth(ENV, one) for one in (state, other))
+    assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], truth.mirrored(known)[4:], atol=0.1)
+    np.testing.assert_allclose(truth.mirrored(known), other_known, atol=2e-3)
+    assert float(outcome.reward) == pytest.approx(float(other_outcome.reward), abs=1e-3)
+    plain = {"noise": jnp.zeros(()), "grain": jnp.zeros(()), "ground": jnp.full((2, 3), 0.4)}  # no tiles
+    scenes = [dataclasses.replace(one.scene.looks, **plain) for one in (state, other)]
+    images = [np.asarray(observe(ENV, dataclasses.replace(one, scene=dataclasses.replace(one.scene, looks=looks))))
+              for one, looks in zip((state, other), scenes, strict=True)]  # fmt: skip
+    difference = np.abs(np.asarray(MIRROR.obs(images[0][None])[0], int) - images[1])
+    assert images[0].std() > 10 and np.abs(images[0].astype(int) - images[1]).mean() > 5
+    assert (difference > 3).mean() < 0.02  # only pixels on an edge
+
+
+def test_the_targets_stand_beside_the_camera_and_are_no_input():
+    batch = make_batch(ENV, PARAMS, 2)
+    env, plain = functional_env(batch, targets=True), functional_env(batch)
+    assert env.obs_shape == {"camera": (16, 16, 3), TRUTH: (truth.SIZE,)} and plain.obs_shape == (16, 16, 3)
+    state, first = jax.jit(env.reset)(jax.random.key(0))
+    np.testing.assert_array_equal(first.obs["camera"], jax.jit(plain.reset)(jax.random.key(0))[1].obs)
+    _, after = jax.jit(env.step)(state, jnp.ones((2, 2)))
+    assert after.obs[TRUTH].shape == (2, truth.SIZE) and np.isfinite(after.obs[TRUTH]).all()
+    assert (np.abs(after.obs[TRUTH] - first.obs[TRUTH]) > 0).any()
