@@ -14,7 +14,7 @@ import socket
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ BATCH = 16
 LEASE = 600.0
 """Seconds after which a process on another machine that has not been heard of counts as dead."""
 POLL = 0.2  # s between looks while others finish
+UNNAMED = 10.0
+"""Seconds after which a candidate without a process's name on it was made by one that died in between."""
 METHODS = ("tpe", "cmaes")
 SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
 
@@ -128,7 +130,7 @@ class SharedStudy:
             done = sum(trial.state.name == "COMPLETE" for trial in trials)
             in_hand = sum(trial.state.name == "RUNNING" and "worker" in trial.user_attrs for trial in trials)
             count = min(BATCH, evaluations - done - in_hand)
-            if done >= evaluations:
+            if done >= evaluations and not self._unsettled(trials):
                 return
             if count <= 0:
                 time.sleep(POLL)  # others have them in hand
@@ -156,9 +158,10 @@ class SharedStudy:
         left = [trial for trial in trials if trial.state == state.RUNNING and self._is_left(trial, dead)]
         again = {trial.user_attrs.get("retry_of") for trial in trials} if left else set()
         for trial in left:
-            if trial.number not in again and set(trial.params) == set(self._names):
+            params = trial.params or trial.system_attrs.get("fixed_params", {})  # the latter where it was a repetition
+            if trial.number not in again and set(params) == set(self._names):
                 # Queued before it is given up: killed in between, it would be done twice, and never lost.
-                self._study.enqueue_trial(trial.params, user_attrs={"retry_of": trial.number})
+                self._study.enqueue_trial(params, user_attrs={"retry_of": trial.number})
             self._tell(trial.number, None, state.FAIL)
         return len(left)
 
@@ -221,7 +224,12 @@ class SharedStudy:
         if worker is not None:
             return worker in dead
         begun = trial.datetime_start.timestamp() if trial.datetime_start else 0.0
-        return time.time() - begun > (10.0 if dead else LEASE)  # killed between making it and writing its name
+        return time.time() - begun > (UNNAMED if dead else LEASE)
+
+    def _unsettled(self, trials: Sequence[Any]) -> bool:
+        """Whether a dead process may have made a candidate and not lived to write its name on it."""
+        unnamed = any(trial.state.name == "RUNNING" and "worker" not in trial.user_attrs for trial in trials)
+        return unnamed and bool(self._dead())
 
 
 class _Flock:

@@ -6,6 +6,7 @@ import glob
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
-from sysid import tpe
+from sysid import studies, tpe
 from sysid.studies import BATCH, SharedStudy, open_storage
 
 NAMES = ("a", "b")
@@ -191,6 +192,30 @@ def test_a_line_that_was_not_written_to_its_end_is_cut_off(tmp_path):
     study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}"))
     study.run(quadratic, 9)
     assert len(study.table()[0]) == 9
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("repetition", [False, True])
+def test_a_candidate_whose_process_died_before_naming_it_is_given_up_before_the_end(tmp_path, monkeypatch, repetition):
+    monkeypatch.setattr(studies, "UNNAMED", 0.5)
+    storage = open_storage(f"journal:{tmp_path / 'study.log'}")
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, study="shared")
+    study.run(quadratic, 1)
+    known = study._study
+    known.set_user_attr("worker: 1", {"host": socket.gethostname(), "pid": dead.pid, "began": 0.0, "seen": 0.0})
+    if repetition:
+        known.enqueue_trial({"a": 0.1, "b": 0.2})
+        number = storage.get_trial(known._pop_waiting_trial_id()).number
+    else:
+        number = storage.get_trial(storage.create_new_trial(known._study_id)).number
+    study.run(quadratic, 1)
+    assert known.trials[number].state.name == "FAIL"
+    study.run(quadratic, 9)
+    again = [trial for trial in known.trials if trial.user_attrs.get("retry_of") == number]
+    assert [trial.params for trial in again] == ([{"a": 0.1, "b": 0.2}] if repetition else [])
+    assert all(trial.state.name == "COMPLETE" for trial in known.trials if trial.number != number)
 
 
 @pytest.mark.quick
