@@ -49,6 +49,7 @@ HEADINGS = {
     "force": "Force: wrenches on the chassis and torques on the wheels",
     "world": "World: true geometry, ground, gravity, load",
     "sensing": "Sensing: what is reported",
+    "outside": "Outside: what a pose measured from outside makes of the motion",
 }
 CLOSING = """## Which look alike
 From odometry and outside pose of ordinary drives these are hard or impossible to tell apart; a fit frees one of each
@@ -60,6 +61,7 @@ row, or needs what the last column says.
 | `slope`, `wind` | both a force fixed in the room | a known load on board: only the slope's pull grows |
 | `track_width`, `turn_efficiency` | the same on a skid drive | nothing |
 | `command_delay`, `sensor_delay`, `clock_offset`, `state_rate` | shifts in time | outside pose sees the first alone |
+| `command_delay`, `pose_delay` | shifts in time | odometry sees the first alone |
 | `odometry_scale`, `command_scale`, `wheel_radius_difference` (common) | scales of distance | outside pose |
 | `air_drag`, `quadratic_drag` | one law | wind |
 | `rolling_resistance_speed`, `rolling_resistance` | hidden behind the speed control | coasting |
@@ -140,7 +142,7 @@ def signatures() -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
     """
     spec, params = preset("whill_cr_physical")
     model = build_model(spec)
-    names = [name for where in PLACES for name in EFFECTS if name not in BASE and place_of(make_effect(name)) == where]
+    names = [name for where in COLOURS for name in EFFECTS if name not in BASE and place_of(make_effect(name)) == where]
     have = {effect.name for effect in params.effects}
     params = replace(params, effects=(*params.effects, *(make_effect(name) for name in names if name not in have)))
 

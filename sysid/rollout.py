@@ -247,6 +247,9 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
     path = jnp.concatenate([first[None], later])
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
+    outside = [effect for effect in getattr(params, "effects", ()) if hasattr(effect, "outside")]
+    for effect in outside:
+        path = path.at[:, POSE].set(effect.outside((), path[:, POSE], plant.dt * command.shape[1])[1])
     # The measured yaw may count full turns from another origin than the simulated one.
     return path.at[:, 2].add(jax.lax.stop_gradient(_turns(start[2] - first[2])))
 

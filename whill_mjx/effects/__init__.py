@@ -31,6 +31,7 @@ from whill_mjx.effects.odometry_scale import OdometryScale
 from whill_mjx.effects.omni_roller_friction import OmniRollerFriction
 from whill_mjx.effects.payload_shift import PayloadShift
 from whill_mjx.effects.pid_drive import ForwardSlip, PidDrive, RollingContact
+from whill_mjx.effects.pose_delay import PoseDelay
 from whill_mjx.effects.quadratic_drag import QuadraticDrag
 from whill_mjx.effects.ramp import Ramp
 from whill_mjx.effects.rolling_resistance import RollingResistance
@@ -81,6 +82,7 @@ EFFECTS: dict[str, type[Effect]] = {
         OmniRollerFriction,
         PayloadShift,
         PidDrive,
+        PoseDelay,
         QuadraticDrag,
         Ramp,
         RollingContact,

@@ -7,6 +7,7 @@ An effect is a frozen pytree whose leaves are its own parameters. It acts at one
     force(memory, motion)                   -> memory, Wrench      friction, slip, drag; what reacts comes last
     world(memory, World)                    -> memory, World       slope, ground, true geometry
     sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
+    outside(memory, path (R, 3), dt)        -> memory, path        latency of a pose measured from outside; replays only
 
 Effects of one place act in the order of the tuple; forces add up. At its neutral values an effect vanishes exactly.
 `init()` gives the memory it starts with.
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 
 from whill_mjx.types import Motion, Wrench
 
-PLACES = ("command", "actuation", "force", "world", "sensing")
+PLACES = ("command", "actuation", "force", "world", "sensing", "outside")
 
 
 class Effect:
