@@ -28,16 +28,20 @@ import numpy as np
 
 from sysid import command_line
 from sysid.log import Log, Trial
-from sysid.loop.catalogue import Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.loop.alone import judged, stands_alone
+from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.drives import CHUNK, Drives, make_drives
 from sysid.loop.evidence import PARTS, Evidence, gather
+from sysid.loop.late_pose import PARAMETER, told_late
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
 from sysid.loop.unexplained import best_gain
 from sysid.loop.wander import Wander, estimate
+from sysid.models import with_effects
 from sysid.result import Progress
 from sysid.rollout import PathReplay, Plant, vehicle_plant
+from sysid.space import FIXED, make_space
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
@@ -60,6 +64,13 @@ class LoopConfig:
     """Fewer iterations, nulls and candidates."""
     physics_dt: float = 0.005
     """Physics step [s]."""
+    with_effects: tuple[str, ...] = ()
+    """Effects of the catalogue that the base model has as well, fitted like its own."""
+    held: tuple[str, ...] = ()
+    """Base parameters that keep their value; an effect that is one of them is then looked for, not fitted before."""
+    pose_delay: bool = False
+    """Look for a late outside pose too: where its stamps are those of receipt. Logs whose loader says so
+    (`fields["pose_stamps"]`) are always asked."""
     poses: bool = True
     """After the verdict, refit the vehicle to whole poses."""
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -132,7 +143,7 @@ class Result:
 
 def close_loop(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
-    progress: Progress | None = None, reference: Reference | Prepared | None = None,
+    progress: Progress | None = None, reference: Reference | Prepared | None = None, start: Any = None,
 ) -> Result:
     """Verdict on the training trials of a log; its held-out trials are not looked at.
 
@@ -140,22 +151,27 @@ def close_loop(
         log: the drives in question.
         references: drives of the same vehicle on other days.
         vehicle: `VehicleParams` fitted before, kept as the reference.
+        start: `VehicleParams` where the fit of the base model starts, instead of the preset.
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
     _check(log, references)
+    if log.fields.get("pose_stamps") == "receipt":
+        config = replace(config, pose_delay=True)
     began = time.perf_counter()
     if reference is None:
         known = bool(references) or vehicle is not None
-        start = preset_params(log.spec, config.preset) if vehicle is None else vehicle
+        start = preset_params(log.spec, config.preset) if start is None else start
+        start = with_effects(start, config.with_effects) if vehicle is None else vehicle
+        free = _free(start, config)
         iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
         reference = make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations,
-                                   progress=progress, fitted=vehicle is not None)
+                                   free, progress, vehicle is not None)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
     base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, paths=ready.paths)
+    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
     evidence, slopes = gather(drives, reference, found, full, progress)
@@ -164,27 +180,45 @@ def close_loop(
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual)
+        return best_gain(log.training, log.spec, residual, reference.width)
 
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
+    alone = stands_alone(log.training, reference.known)
+    if alone:
+        outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted,
                "search": time.perf_counter() - gathered}
-    return Result(log, tuple(references), config, ready, outcome, evidence, seconds)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds)
+    if alone and config.pose_delay and PARAMETER not in reference.space.names:
+        result = told_late(result, config.thresholds.alpha)
+    return result
 
 
 def prepare(
     reference: Reference, spec: VehicleSpec, config: LoopConfig | None = None, progress: Progress | None = None
 ) -> Prepared:
     """A vehicle with the catalogue, ready for `close_loop` on one log after the other."""
-    plant = _plant(spec, config or LoopConfig())
+    config = config or LoopConfig()
+    plant = _plant(spec, config)
     found = hypotheses(spec, reference.params)
+    if config.pose_delay:
+        fitted = PARAMETER in reference.space.names
+        found += (Hypothesis("pose_delay", (Axis(PARAMETER, 0.05, signed=fitted, limit=20.0),),
+                             kind="parameter_shift" if fitted else "effect"),)
     full = with_catalogue(reference.params, found)
     base = base_values(full)
     paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), CHUNK)
-    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), paths=paths)
+    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
+                         paths)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
     wander = estimate(drives, reference, found, full, spec, progress)
     return Prepared(reference, plant, found, full, tuple(base), paths, wander)
+
+
+def _free(vehicle: Any, config: LoopConfig) -> list[str]:
+    """Parameters of the base model that are fitted: limits that are not there stay away."""
+    names = [name for name in describe(vehicle) if name not in FIXED and name not in config.held]
+    return [name for name, value in zip(names, get_values(vehicle, names), strict=True) if np.isfinite(float(value))]
 
 
 def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
@@ -218,8 +252,6 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     refit may move base parameters and the accepted effects' own, and nothing else.
     """
     from sysid.loop.poses import fit_poses
-    from sysid.space import make_space
-
     have = describe(vehicle)
     names = list(result.reference.space.names)
     if result.search.verdict == "named":
@@ -239,7 +271,7 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
 def drives_of(result: Result, trials: tuple[Trial, ...]) -> Drives:
     """Trials replayed by the vehicle with the catalogue, as it was compiled for the search."""
     ready = result.prepared
-    return make_drives(ready.plant, ready.full, ready.names, trials, paths=ready.paths)
+    return make_drives(ready.plant, ready.full, ready.names, trials, ready.reference.width, ready.paths)
 
 
 def all_values(result: Result, vehicle: Any) -> np.ndarray:

@@ -81,6 +81,8 @@ class Start:
     """Standard error of x and y [m]."""
     yaw_sigma: float = 0.0
     """Standard error of yaw [rad]."""
+    measured: bool = False
+    """Whether the pose is the outside measurement at t = 0 itself."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,8 @@ class Trial:
     held_out: bool = False
     group: str = ""
     """Terrain or robot; part of a selection."""
+    breaks: tuple[tuple[float, float], ...] = ()
+    """Times between which the outside pose moved by an unknown amount [s]."""
 
     @property
     def duration(self) -> float:

@@ -71,6 +71,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
 
     Returns:
         One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window.
+        `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
     """
     folder = Path(folder)
     specs = {drive_spec(run) for run in runs}
@@ -91,7 +92,8 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
             run_trials, note = _drive_continuous(found[0], run, 6.0 if chained else 2.0)
         trials += run_trials
         notes.append(note)
-    return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes), {"gyro": gyro})
+    return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes),
+               {"gyro": gyro, "pose_stamps": "receipt"})
 
 
 def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
@@ -148,17 +150,21 @@ def _drive_windows(path: Path, run: str, chained: bool) -> tuple[list[Trial], st
         step, window = divmod(row, DRIVE_STEP_ROWS)
         name = f"{run}/{step:03d}.{window}"
         pose = (x[row], y[row], yaw[row])
+        breaks: list[tuple[float, float]] = []
         for k in range(row + 1, row + length):
-            pose, gap = _chain(pose, (x[k], y[k], yaw[k]))
+            pose, gap, between = _chain(pose, (x[k], y[k], yaw[k]))
             missed.append(gap)
+            if gap > 0:
+                breaks.append((between[0] * DRIVE_DT, between[1] * DRIVE_DT))
         command = Command(t, command_v[rows].ravel(), command_omega[rows].ravel())
         odometry = OdometryStream(t, None, None, None, wheel_v[rows].ravel(), wheel_omega[rows].ravel())
-        start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]))
+        start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]), measured=True)
         truth = only_changes(t, *pose)
         if len(truth.t) == 0 or DRIVE_DT * np.abs(wheel_v[rows]).sum() + spec.track / 2 * DRIVE_DT * np.abs(
                 wheel_omega[rows]).sum() < MOVING:
             continue
-        trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run)))
+        trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
+                            breaks=tuple(breaks)))
         rates[name] = float(gyro[rows].mean())
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
     if chained:
@@ -170,8 +176,9 @@ def _drive_windows(path: Path, run: str, chained: bool) -> tuple[list[Trial], st
 
 def _chain(
     first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float]:
-    """Both windows in the frame of the first, and the motion that the joint misses [m] (0 where it misses none).
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, tuple[int, int]]:
+    """Both windows in the frame of the first, the motion that the joint misses [m] (0 where it misses none), and the
+    samples between which it does.
 
     The second window's frame is that of its own first sample. An ICP update between the last sample of the first
     window and the first sample of the second is lost; then the time since the last change is over 1.5 update periods.
@@ -185,12 +192,12 @@ def _chain(
     changes = np.flatnonzero(np.diff(joined[0]) != 0) + 1
     before, after = changes[changes < n], changes[changes > n]
     if len(before) < 2 or len(after) < 2:
-        return joined, 0.0
+        return joined, 0.0, (n, n)
     period = float(np.median(np.diff(changes)))
     if after[0] - before[-1] <= 1.5 * period:
-        return joined, 0.0
+        return joined, 0.0, (n, n)
     speed = np.hypot(joined[0][after[-1]] - joined[0][after[0]], joined[1][after[-1]] - joined[1][after[0]])
-    return joined, float(speed / max(after[-1] - after[0], 1) * period)
+    return joined, float(speed / max(after[-1] - after[0], 1) * period), (int(before[-1]), int(after[0]))
 
 
 def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
@@ -227,7 +234,7 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
             continue
         command = Command(now, command_v[inside], command_omega[inside])
         odometry = OdometryStream(now, None, None, None, wheel_v[inside], wheel_omega[inside])
-        start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]))
+        start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
         trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run)))
     return trials, f"{run}: {len(trials)} windows of {window:g} s during calibration phases"
 
@@ -255,7 +262,8 @@ def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial],
         trials.append(Trial(
             f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
             thin(pose, MRCLAM_SPACING),
-            Start(float(truth[first, 1]), float(truth[first, 2]), float(yaw[first]), float(v[0]), float(omega[0])),
+            Start(float(truth[first, 1]), float(truth[first, 2]), float(yaw[first]), float(v[0]), float(omega[0]),
+                  measured=True),
             group=f"robot{robot}"))
     return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are the commands in force"
 

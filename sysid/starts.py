@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid import gradient
-from sysid.loop.features import Features, make_features
+from sysid.loop.features import Features, bin_width, make_features
 from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
 from sysid.objective import HUGE, Objective, Replays
 from sysid.result import FitResult, Progress
@@ -117,7 +117,7 @@ def fit(
 
 def make_features_objective(objective: Objective) -> FeatureObjective:
     """Errors in features of what an objective of poses compares, in the noise that replicates show."""
-    features = make_features(objective.trials)
+    features = make_features(objective.trials, bin_width(objective.trials))
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)
     return FeatureObjective(objective.replay, objective.space, features, target, features.mask,

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from sysid.log import Trial
-from sysid.loop.features import BIN, Features, make_features
+from sysid.loop.features import Features, bin_width, make_features
 from sysid.loop.noise import roughness
 from sysid.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Simulated, make_batch
 from whill_mjx.parameters import get_values, set_values
@@ -137,9 +137,10 @@ def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[
 
 
 def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],
-                width: float = BIN, paths: PathReplay | None = None) -> Drives:
+                width: float | None = None, paths: PathReplay | None = None) -> Drives:
     """Drives of trials, replayed with the named parameters of `params` free.
 
+    `width`: of the bins [s]; by default what the outside poses allow (`bin_width`).
     `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
     """
     batch, measured = make_batch(trials, plant.dt)
@@ -154,7 +155,7 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     shared = all(float(get_values(params, [name])[0]) == neutral[name] for name in held)
     room = tuple((names.index(name), neutral[name]) for name in neutral if name in names)
     courses = _courses(batch, room, shared)
-    features = make_features(trials, width)
+    features = make_features(trials, bin_width(trials) if width is None else width)
     paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))

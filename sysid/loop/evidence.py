@@ -15,7 +15,8 @@ import numpy as np
 from sysid.log import Trial
 from sysid.loop.catalogue import LEVELS, Hypothesis, base_values
 from sysid.loop.drives import Drives
-from sysid.loop.reference import Reference, alike, difference_sizes
+from sysid.loop.noise import repeated
+from sysid.loop.reference import Leftover, Reference, alike, difference_sizes
 from sysid.result import Progress
 from whill_mjx.types import VehicleParams
 
@@ -99,6 +100,16 @@ def signature_columns(
     return np.stack(parts, axis=-1), columns
 
 
+def column_layout(hypotheses: Sequence[Hypothesis], offset: int) -> tuple[Columns, ...]:
+    """Which columns `gather` makes, behind those of `offset` base parameters."""
+    found = []
+    for number, one in enumerate(hypotheses):
+        for level in (1.0,) if one.signed else LEVELS:
+            found.append(Columns(number, level, tuple(range(offset, offset + len(one.axes)))))
+            offset += len(one.axes)
+    return tuple(found)
+
+
 def with_values(values: np.ndarray, names: Sequence[str], changes: dict[str, float]) -> np.ndarray:
     """Values (P,) with some of them replaced."""
     out = values.copy()
@@ -160,7 +171,7 @@ def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
     names: dict[str, list[int]] = {}
     for i, trial in enumerate(drives.trials):
         names.setdefault(trial.manoeuvre, []).append(i)
-    if len(names) > 40:
+    if len(names) > 40 or len(names) < len(drives.trials) and not repeated(drives.trials):
         parts = np.array_split(np.arange(len(drives.trials)), 8)
         return tuple(tuple(int(i) for i in part) for part in parts)
     return tuple(tuple(each) for each in names.values())
@@ -172,17 +183,13 @@ def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
     if len(like) < 3:
         same = [one for one in reference.leftovers if one.trial.manoeuvre == trial.manoeuvre]
         like = same if len(same) >= 3 else list(reference.leftovers)
-    bins, channels = mask.shape
-    rows = []
-    for one in like:
-        series = (one.series - (reference.expected_on_others(one))) * one.mask
-        inside = np.flatnonzero(one.mask.prod(-1) > 0)
-        last = inside[-1] + 1 if len(inside) else len(series)
-        fitted = np.resize(series[:last], (bins, channels))  # a longer drive repeats a shorter one's noise
-        rows.append(_whiten_one(reference, fitted, (mask > 0).astype(float)))
-    return np.stack(rows)
+    return np.stack([white_leftover(reference, one, mask) for one in like])
 
 
-def _whiten_one(reference: Reference, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    return reference.whitener.apply(series[None], mask[None]).reshape(-1)
-
+def white_leftover(reference: Reference, one: Leftover, mask: np.ndarray) -> np.ndarray:
+    """(n,) white noise of a reference drive, put into the bins of another drive of weights `mask` (K, C)."""
+    series = (one.series - reference.expected_on_others(one)) * one.mask
+    inside = np.flatnonzero(one.mask.prod(-1) > 0)
+    last = inside[-1] + 1 if len(inside) else len(series)
+    fitted = np.resize(series[:last], mask.shape)  # a longer drive repeats a shorter one's noise
+    return reference.whitener.apply(fitted[None], (mask > 0).astype(float)[None]).reshape(-1)

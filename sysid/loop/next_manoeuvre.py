@@ -142,7 +142,8 @@ def refitter_of(result: Result) -> Refitter:
     """A refitter like that of the search, through the replay that it compiled."""
     base = base_values(result.full)
     values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.plant, result.full, result.names, result.log.training, paths=result.prepared.paths)
+    drives = make_drives(result.plant, result.full, result.names, result.log.training, result.reference.width,
+                         result.prepared.paths)
     drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 

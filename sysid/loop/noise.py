@@ -6,6 +6,7 @@ in nothing. A vector autoregression fitted to what replicates do not share white
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,11 @@ def same_commands(a: Trial, b: Trial) -> bool:
         return False
     return all(np.allclose(getattr(a.command, name), getattr(b.command, name), atol=1e-6)
                for name in ("t", "v", "omega"))
+
+
+def repeated(trials: Sequence[Trial]) -> bool:
+    """Whether any trials are replicates."""
+    return any(len(group) > 1 for group in replicate_groups(tuple(trials)))
 
 
 def deviations(series: np.ndarray, groups: list[list[int]]) -> np.ndarray:

@@ -51,6 +51,8 @@ class Reference:
     whitener: Whitener
     factors: np.ndarray  # (4, C) noise of rough bins beside smooth ones
     leftovers: tuple[Leftover, ...]
+    width: float
+    """Of the bins [s]."""
     known: bool
     """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
     remark: str
@@ -158,7 +160,8 @@ def make_reference(
         whitener = fit_whitener(np.stack([one.series - expected_without(leftovers, one) for one in leftovers]),
                                 drives.mask)
     params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
-    return Reference(params, space, u, spread, days, whitener, factors, leftovers, known, remark)
+    return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
+                     known, remark)
 
 
 def expected_without(leftovers: Sequence[Leftover], one: Leftover) -> np.ndarray:

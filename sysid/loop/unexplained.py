@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.log import Trial
-from sysid.loop.features import BIN, CHANNELS
+from sysid.loop.features import CHANNELS
 from sysid.metrics import command_in_force
 
 if TYPE_CHECKING:
@@ -35,18 +35,18 @@ def where_it_lives(result: Result) -> list[dict[str, Any]]:
     """Quantities by the share of the systematic residual that they predict on other drives, best first."""
     residual, excess = result.search.final.residual, result.search.excess[1]
     beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
-    gains = held_back_gains(result.log.training, result.log.spec, residual)
+    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
     out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
     return sorted(out, key=lambda one: -one["share"])
 
 
-def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray) -> dict[str, float]:
+def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float) -> dict[str, float]:
     """By how much smooth functions of each quantity, fitted to two thirds of the trials, lower the sum of squares of
-    the white residual (B, n) of the others."""
+    the white residual (B, n) of the others, in bins of a width [s]."""
     channels = len(CHANNELS)
     bins = residual.shape[1] // channels
     residual = residual.reshape(len(trials), bins, channels)
-    found = [quantities(trial, bins, BIN, spec) for trial in trials]
+    found = [quantities(trial, bins, width, spec) for trial in trials]
     fold = np.arange(len(trials)) % 3
     out = {}
     for name in found[0]:
@@ -66,9 +66,9 @@ def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray) ->
     return out
 
 
-def best_gain(trials: Sequence[Trial], spec: Any, residual: np.ndarray) -> float:
+def best_gain(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float) -> float:
     """What the best of the quantities gains; 0 where none does."""
-    return max(0.0, *held_back_gains(trials, spec, residual).values())
+    return max(0.0, *held_back_gains(trials, spec, residual, width).values())
 
 
 def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np.ndarray]:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.drives import Drives
-from sysid.loop.evidence import Columns, Evidence, gather
+from sysid.loop.evidence import Columns, Evidence, column_layout, gather
 from sysid.loop.noise import scatter
 from sysid.loop.reference import Reference
 from sysid.loop.solver import Solver
@@ -55,6 +56,11 @@ class Wander:
         mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
         return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
 
+    def of(self, kept: Sequence[bool]) -> Wander:
+        """Of some of the evidence's columns only."""
+        return replace(self, covariance=tuple(compress(self.covariance, kept)),
+                       shapes=tuple(compress(self.shapes, kept)))
+
     def p_excess(self, excess: float) -> float:
         """Probability of so much excess on a day with nothing in it."""
         from scipy import stats
@@ -89,11 +95,11 @@ def estimate(
         drives: all training trials of all reference days, in the order of `reference.leftovers`.
         full: the vehicle with the catalogue; `drives` free all its parameters.
     """
-    evidence, _ = gather(drives, reference, hypotheses, full, progress, pools=False)
     day = np.array([one.day for one in reference.leftovers])
     count = int(day.max()) + 1
     if not reference.known or count < 2:
-        return no_wander(evidence.columns, ASSUMED if reference.known else 0.0)
+        return no_wander(column_layout(hypotheses, reference.space.size), ASSUMED if reference.known else 0.0)
+    evidence, _ = gather(drives, reference, hypotheses, full, progress, pools=False)
     white = reference.whitener
     series = np.stack([one.series - reference.expected_on_others(one) for one in reference.leftovers])
     left = white.apply(series, drives.mask).reshape(len(day), -1)
@@ -102,7 +108,8 @@ def estimate(
     evidence = replace(evidence, residual=residual, moments=np.einsum("bni,bn->bi", evidence.design, residual))
     measured = (drives.mask > 0).reshape(len(day), -1)
     excess = [np.square(left[day == number]).sum() / measured[day == number].sum() - 1 for number in range(count)]
-    usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number])
+    usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number],
+                       reference.width)
              / float((day == number).sum()) for number in range(count)]
     apart = [scatter(left[day == number], drives.courses.of_trial[day == number]) for number in range(count)]
     apart = [one for one in apart if np.isfinite(one)]

@@ -1,0 +1,61 @@
+"""What may be said of drives that stand alone: no reference days, and no manoeuvre driven twice.
+
+The noise is then only what the base model leaves of the drives themselves, so nothing tells whether that is too much.
+Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
+be a lucky correlate of something else. It is named where blocks of drives speak for it: they agree on its size, and
+the gain of each is foretold by the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sysid.log import Trial
+from sysid.loop.agreement import disagreement, foretold
+from sysid.loop.noise import repeated
+from sysid.loop.search import Search, Thresholds
+
+UNTOLD = "neither replicates nor reference drives tell the noise, so whether anything else is missing cannot be told"
+
+
+def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
+    """Whether neither a reference nor replicates tell the noise of some trials."""
+    return not known and not repeated(trials)
+
+
+def judged(found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds) -> Search:
+    """The search with a verdict that needs no noise level.
+
+    Args:
+        groups: blocks of trials.
+        precision: (P, P) of the base parameters, in unit coordinates.
+    """
+    if found.verdict == "named":
+        against = doubts(found, groups, precision, thresholds)
+        if against:
+            found.verdict, found.reason = "unexplained", f"{'; '.join(against)}; {UNTOLD}"
+        else:
+            found.reason = f"stands out of what the base model leaves, and blocks of drives agree on it; {UNTOLD}"
+    else:
+        found.reason = f"{found.reason}; {UNTOLD}"
+    return found
+
+
+def doubts(
+    found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds
+) -> list[str]:
+    """What speaks against each named effect, in words."""
+    fit, start, out = found.final, 0, []
+    for one in fit.hypotheses:
+        part = slice(start, start + len(one.axes))
+        start = part.stop
+        differ = disagreement(fit, part, groups, precision)
+        told = foretold(fit, part, groups, precision)
+        lost = float(-told[told < 0].sum())
+        if differ > thresholds.differ:
+            out.append(f"{one.effect} stands out, but blocks of drives differ by {differ:.0%} on its size")
+        elif told.sum() <= 0 or lost > thresholds.loss * (told.sum() + lost):
+            out.append(f"{one.effect} stands out, but is wrong about blocks of drives that were held back")
+    return out
