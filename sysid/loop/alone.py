@@ -3,7 +3,7 @@
 The noise is then only what the base model leaves of the drives themselves, so nothing tells whether that is too much.
 Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
 be a lucky correlate of something else. It is named where blocks of drives speak for it: they agree on its size, and
-the gain of each is foretold by the others.
+the gain of each is foretold by the others. Of effects that are not told apart the simplest is.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ def judged(found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray
         precision: (P, P) of the base parameters, in unit coordinates.
     """
     if found.verdict == "named":
+        simplest(found)
         against = doubts(found, groups, precision, thresholds)
         if against:
             found.verdict, found.reason = "unexplained", f"{'; '.join(against)}; {UNTOLD}"
@@ -41,6 +42,20 @@ def judged(found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray
     else:
         found.reason = f"{found.reason}; {UNTOLD}"
     return found
+
+
+def simplest(found: Search) -> None:
+    """Of effects that the drives do not tell apart, name the one with the fewest parameters: by how much better another
+    one fits means nothing where the noise is not known."""
+    if len(found.accepted) != 1:
+        return
+    best, members = found.accepted[0], found.classes[0]
+    near = [one for one in found.rounds[0] if one.hypothesis.effect in members]
+    chosen = min([best, *near], key=lambda one: (len(one.hypothesis.axes), -one.gain))
+    if len(chosen.hypothesis.axes) < len(best.hypothesis.axes):
+        mine = chosen.hypothesis.effect
+        found.accepted, found.final, found.share = [chosen], chosen.refit, chosen.share
+        found.classes = [[mine, *(name for name in members if name != mine)]]
 
 
 def doubts(

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.loop.alone import UNTOLD, judged, stands_alone
+from sysid.loop.alone import UNTOLD, judged, simplest, stands_alone
 from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import manoeuvre_groups
 from sysid.loop.features import BIN, bin_width, make_features
 from sysid.loop.refit import Refit
-from sysid.loop.search import Thresholds
+from sysid.loop.search import Candidate, Thresholds
 from sysid.rollout import make_batch, path_of
 from whill_mjx.effects import make_effect
 
@@ -68,7 +68,7 @@ def search_with(residual, column, q=1.0):
     """A search that named one effect with this column (B, n)."""
     one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
     fit = Refit((one,), np.zeros(0), np.array([q]), 0.0, residual, column[..., None], np.zeros(0))
-    return SimpleNamespace(verdict="named", reason="", final=fit)
+    return SimpleNamespace(verdict="named", reason="", final=fit, accepted=[], classes=[])
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -81,6 +81,20 @@ def test_an_effect_is_named_only_where_blocks_of_drives_agree_on_it(shared):
     found = judged(search_with(residual, column), groups, np.zeros((0, 0)), Thresholds())
     assert found.verdict == ("named" if shared else "unexplained")
     assert UNTOLD in found.reason
+
+
+def test_of_effects_that_are_not_told_apart_the_simplest_is_named():
+    def candidate(effect, axes, gain):
+        one = Hypothesis(effect, tuple(Axis(f"{effect}.{i}", 1.0) for i in range(axes)))
+        return Candidate(one, gain, 1e-4, 1.0, f"refit of {effect}")
+
+    ramp, delay, other = (candidate(*each) for each in (
+        ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0)))
+    found = SimpleNamespace(accepted=[ramp], classes=[["acceleration_limit", "command_delay"]],
+                            rounds=[[ramp, delay, other]], final=ramp.refit, share=1.0)
+    simplest(found)
+    assert found.final == "refit of command_delay" and found.accepted == [delay]
+    assert found.classes == [["command_delay", "acceleration_limit"]]
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():

@@ -1,0 +1,280 @@
+"""The closed loop on two published measured sets: what it adds to a fitted vehicle, and what it falsely names.
+
+    python -m benchmarks.measured_loop --shared ../shared --parts ladder mrclam
+
+`ladder` (drive_norlab, skid-steered robot): the base model with a turn efficiency is fitted to steps of 6 s on asphalt,
+gravel and sand; then the loop names an effect, the vehicle with it is fitted, and the loop goes on from there until it
+names none. Each rung is scored on steps that were never fitted. `change`: the vehicle of the asphalt run is the
+reference, gravel and sand are asked what changed. `mrclam` (five nearly ideal robots): verdicts with the base model's
+delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
+
+Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.fit import show, thin
+from benchmarks.harness import figure, record
+from sysid.close_loop import LoopConfig, Result, close_loop, refit_poses
+from sysid.log import Log, Trial
+from sysid.loop.report import effects, replay
+from sysid.loop.unnamed import find_unnamed, replay_unnamed
+from sysid.measured import load_drive, load_mrclam, split
+from sysid.metrics import Prediction, ideal_replay, score
+from sysid.models import with_effects
+from whill_mjx.parameters import set_values
+from whill_mjx.presets import preset_params
+from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+
+CLAIM = "A fitted vehicle predicts real robots better than an ideal one"
+RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
+TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
+HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.667-1", "sand": "warthog_sand_2"}
+ROBOTS = (1, 2, 3, 4, 5)
+BLOCK = 5  # steps that follow one another and are drawn together
+DRAWS = 4000
+TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
+SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
+DEAD = {"command_dead_zone"}
+LONGEST, LARGEST = 0.3, 0.1
+"""Delay [s] and share of the speed beyond which a verdict on a nearly ideal robot is false."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What to measure."""
+
+    shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
+    """Folder that holds data/measured."""
+    parts: tuple[Literal["ladder", "change", "mrclam"], ...] = ("ladder", "change", "mrclam")
+    out: Path = Path("runs/measured_loop")
+    """Folder that keeps each loop."""
+    windows: int = 48
+    """Training steps of drive_norlab, spread evenly over each terrain; all held-out ones are scored."""
+    robot_windows: int = 16
+    """Windows of 15 s of each robot of mrclam."""
+    rounds: int = 3
+    """Loops at most, one after the other."""
+    physics_dt: float = 0.01
+    """Physics step [s]."""
+
+
+def drive_log(settings: Benchmark, terrains: tuple[str, ...]) -> Log:
+    """Steps of 6 s, training ones thinned."""
+    log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", RUNS, chained=True)
+    log = split(log, tuple(TRAIN[name] for name in terrains), tuple(HELD_OUT[name] for name in terrains))
+    return thin(log, settings.windows)
+
+
+def errors(trials: tuple[Trial, ...], seen: list[Prediction]) -> dict[str, list[float]]:
+    """Trial -> RMSE of the outside position [m] and yaw [rad]."""
+    found = {}
+    for trial, one in zip(trials, seen, strict=True):
+        mine = score(trial, one)["ground_truth"]
+        assert mine.trajectory is not None and mine.yaw is not None
+        found[trial.name] = [mine.trajectory, mine.yaw]
+    return found
+
+
+def kept(settings: Benchmark, name: str) -> dict[str, Any] | None:
+    """What an earlier run left of a loop."""
+    path = settings.out / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def keep(settings: Benchmark, name: str, found: dict[str, Any]) -> dict[str, Any]:
+    """Write what a loop found, whole or not at all."""
+    settings.out.mkdir(parents=True, exist_ok=True)
+    temporary = settings.out / f"{name}.tmp"
+    temporary.write_text(json.dumps(found, indent=1) + "\n")
+    os.replace(temporary, settings.out / f"{name}.json")
+    return found
+
+
+def verdict_of(result: Result) -> dict[str, Any]:
+    """Verdict, reason, and effects with class and values."""
+    found = result.search
+    named = effects(result) if found.verdict == "named" else []
+    return {"verdict": found.verdict, "reason": found.reason, "p_value": found.p_value, "effects": [
+        {"name": one["name"], "class": one["class"],
+         "parameters": {name: [value["value"], *value["interval"]] for name, value in one["parameters"].items()}}
+        for one in named], "seconds": result.seconds}
+
+
+def one_loop(
+    settings: Benchmark, name: str, log: Log, config: LoopConfig, scored: bool = True, **given: Any
+) -> dict[str, Any]:
+    """One loop, or what was kept of it; if `scored` with the held-out errors of the fitted base and of what follows."""
+    done = kept(settings, name)
+    if done is not None:
+        return done
+    result = close_loop(log, config=config, progress=lambda _, text: print(f"  {name}: {text}", flush=True), **given)
+    found = verdict_of(result)
+    if not scored:
+        return keep(settings, name, found)
+    held = log.held_out
+    before = refit_poses(result, result.before)  # as often as what comes after, so that this is no reason to be better
+    after = refit_poses(result, result.after) if found["verdict"] == "named" else before
+    found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
+    found["before"], found["after"] = (errors(held, replay(result, one, held)) for one in (before, after))
+    wrench = find_unnamed(result)
+    if wrench is not None and wrench.kept:
+        found["unnamed"] = wrench.table.quantity
+        found["after"] = errors(held, replay_unnamed(result, wrench, held))
+    save_vehicle(settings.out / f"{name}.toml", log.spec, after)
+    return keep(settings, name, found)
+
+
+def climb(settings: Benchmark, name: str, log: Log) -> list[dict[str, Any]]:
+    """Loops one after the other, each from the vehicle of the one before, until one names nothing."""
+    start = with_effects(preset_params(log.spec, "physical"), ("turn_efficiency",))
+    loops: list[dict[str, Any]] = []
+    for number in range(settings.rounds):
+        stem = f"{name}_{number + 1}"
+        loops.append(one_loop(settings, stem, log, LoopConfig(physics_dt=settings.physics_dt), start=start))
+        if loops[-1]["verdict"] != "named":
+            break
+        start = load_vehicle(settings.out / f"{stem}.toml")[1]
+    return loops
+
+
+def interval(trials: list[str], before: dict[str, list[float]], after: dict[str, list[float]], column: int
+             ) -> tuple[float, float, float]:
+    """Share of the mean RMSE removed, and its 95 % interval from blocks of steps that are drawn anew, in pairs."""
+    pairs = np.array([[before[name][column], after[name][column]] for name in trials])
+    runs = [name.split("/")[0] for name in trials]
+    blocks: list[list[int]] = []
+    for i, run in enumerate(runs):
+        if blocks and runs[blocks[-1][0]] == run and len(blocks[-1]) < BLOCK:
+            blocks[-1].append(i)
+        else:
+            blocks.append([i])
+    rng = np.random.default_rng(0)
+    sums = np.array([pairs[block].sum(0) for block in blocks])
+    drawn = sums[rng.integers(0, len(blocks), (DRAWS, len(blocks)))].sum(1)
+    low, high = np.quantile(1 - drawn[:, 1] / drawn[:, 0], [0.025, 0.975])
+    total = pairs.sum(0)
+    return float(1 - total[1] / total[0]), float(low), float(high)
+
+
+def of_terrain(trials: list[str], terrain: str) -> list[str]:
+    return [name for name in trials if terrain in ("all", *[one for one in TRAIN if one in name])]
+
+
+def ladder(settings: Benchmark) -> None:
+    """Ideal, fitted base, and every vehicle that the loop made of it."""
+    loops = climb(settings, "ladder", drive_log(settings, tuple(TRAIN)))
+    rungs = {"ideal": loops[0]["ideal"], "base": loops[0]["before"]}
+    rungs |= {"_".join(["with", str(i + 1), *[one["name"] for one in loop["effects"]]]): loop["after"]
+              for i, loop in enumerate(loops) if loop["verdict"] == "named" or "unnamed" in loop}
+    figures, trials = {}, list(loops[0]["before"])
+    last = list(rungs)[-1]
+    for terrain in ("all", *TRAIN):
+        mine = of_terrain(trials, terrain)
+        for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
+            for name, rows in rungs.items():
+                value = float(np.mean([rows[trial][column] for trial in mine]))
+                figures[f"ladder_{terrain}_{metric}_{name}"] = figure([value], unit)
+            gain, low, high = interval(mine, rungs["base"], rungs[last], column)
+            stem = f"ladder_gain_{terrain}_{metric}"
+            figures |= {stem: figure([gain], "share"), f"{stem}_low": figure([low], "share"),
+                        f"{stem}_high": figure([high], "share")}
+    figures["drive_gain_over_fitted_base"] = figures["ladder_gain_all_position"]
+    show(figures)
+    tell(loops)
+    record("measured", CLAIM, figures)
+
+
+def change(settings: Benchmark) -> None:
+    """What changed from asphalt to gravel and to sand."""
+    loops = climb(settings, "asphalt", drive_log(settings, ("asphalt",)))
+    named = [i for i, loop in enumerate(loops) if loop["verdict"] == "named"]
+    vehicle = load_vehicle(settings.out / f"asphalt_{named[-1] + 1 if named else 1}.toml")[1]
+    figures = {}
+    for terrain in ("gravel", "sand"):
+        log = drive_log(settings, (terrain,))
+        loop = one_loop(settings, f"asphalt_to_{terrain}", log, LoopConfig(physics_dt=settings.physics_dt),
+                        vehicle=vehicle)
+        trials = list(loop["before"])
+        for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
+            stem = f"changed_{terrain}_{metric}"
+            for which in ("ideal", "before", "after"):
+                value = float(np.mean([row[column] for row in loop[which].values()]))
+                figures[f"{stem}_{which}"] = figure([value], unit)
+            gain, low, high = interval(trials, loop["before"], loop["after"], column)
+            figures |= {f"{stem}_gain": figure([gain], "share"), f"{stem}_gain_low": figure([low], "share"),
+                        f"{stem}_gain_high": figure([high], "share")}
+        tell([loop])
+    show(figures)
+    record("measured", CLAIM, figures)
+
+
+def is_false(loop: dict[str, Any], fastest: float) -> bool:
+    """Whether a verdict on a nearly ideal robot, whose fastest command is so many m/s, names what it cannot have."""
+    for one in loop["effects"]:
+        sizes = {name.partition(".")[2]: abs(value[0]) for name, value in one["parameters"].items()}
+        if one["name"] in TIMES:
+            wrong = max(sizes.values()) > LONGEST
+        elif one["name"] in SCALES:
+            wrong = max(min(size, abs(size - 1)) for size in sizes.values()) > LARGEST
+        elif one["name"] in DEAD:
+            wrong = sizes["linear"] > LARGEST * fastest
+        else:
+            wrong = True
+        if wrong:
+            return True
+    return False
+
+
+def mrclam(settings: Benchmark) -> None:
+    """Verdicts on five nearly ideal robots: the question is what the model family, without its delay, lacks."""
+    false, delays = [], []
+    for robot in ROBOTS:
+        log = load_mrclam(settings.shared / "data" / "measured" / "mrclam", (robot,))
+        log = split(log, (f"robot{robot}:0-0.667",), (f"robot{robot}:0.667-1",))
+        fastest = max(float(np.abs(trial.command.v).max()) for trial in log.trials)
+        start = set_values(preset_params(log.spec, "physical"), ["command_delay.delay"], jnp.zeros(1))
+        config = LoopConfig(physics_dt=settings.physics_dt, held=("command_delay.delay",))
+        loop = one_loop(settings, f"mrclam_{robot}", thin(log, settings.robot_windows), config, False,
+                        start=start)
+        tell([loop])
+        false.append(float(is_false(loop, fastest)))
+        delays.append(float(any(TIMES & {one["name"], *one["class"]} for one in loop["effects"])))
+    figures = {"mrclam_false": figure([sum(false)], f"of {len(ROBOTS)} robots"),
+               "mrclam_delay_found": figure([sum(delays)], f"of {len(ROBOTS)} robots")}
+    show(figures)
+    record("measured", CLAIM, figures)
+
+
+def tell(loops: list[dict[str, Any]]) -> None:
+    """Verdicts in words."""
+    for loop in loops:
+        print(f"{loop['verdict']} (p {loop['p_value']:.2g}): {loop['reason']}", flush=True)
+        for one in loop["effects"]:
+            print(f"  {one['name']} {one['parameters']}, class {', '.join(one['class'])}", flush=True)
+
+
+def main(settings: Benchmark) -> None:
+    """Measure the parts whose data is at hand."""
+    parts = {"ladder": (ladder, "drive_norlab"), "change": (change, "drive_norlab"), "mrclam": (mrclam, "mrclam")}
+    for name in settings.parts:
+        part, folder = parts[name]
+        if not (settings.shared / "data" / "measured" / folder).is_dir():
+            print(f"{name}: {settings.shared / 'data' / 'measured' / folder} is not there, left out")
+            continue
+        part(settings)
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Benchmark, description=__doc__))

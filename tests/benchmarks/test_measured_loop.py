@@ -1,0 +1,74 @@
+"""How the loops on measured sets are judged and scored."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.measured_loop import Benchmark, climb, drive_log, interval, is_false, keep, of_terrain
+
+pytestmark = pytest.mark.quick
+SHARED = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / ".." / "shared"))
+
+
+def verdict(name, **parameters):
+    return {"verdict": "named", "effects": [
+        {"name": name, "class": [name], "parameters": {f"{name}.{key}": [value, 0.0, 1.0]
+                                                       for key, value in parameters.items()}}]}
+
+
+@pytest.mark.parametrize(("loop", "false"), [
+    ({"verdict": "none", "effects": []}, False),
+    (verdict("command_delay", delay=0.12), False),
+    (verdict("command_delay", delay=0.42), True),
+    (verdict("command_scale", linear=0.97, angular=1.08), False),
+    (verdict("wheel_radius_difference", difference=-0.01, common=0.15), True),
+    (verdict("command_dead_zone", linear=0.02, angular=0.0), True),
+    (verdict("slope", along_x=0.001, along_y=0.0), True),
+])
+def test_a_verdict_on_a_nearly_ideal_robot_is_false_where_it_cannot_have_the_effect(loop, false):
+    assert is_false(loop, fastest=0.1) is false
+
+
+def test_the_share_removed_is_that_of_the_means_and_its_interval_is_paired():
+    names = [f"run/{i:03d}.0" for i in range(60)]
+    sizes = 1 + 9 * np.random.default_rng(1).random(60)
+    before = {name: [size, size] for name, size in zip(names, sizes, strict=True)}
+    after = {name: [0.8 * size, size] for name, size in zip(names, sizes, strict=True)}
+    np.testing.assert_allclose(interval(names, before, after, 0), 0.2)
+    np.testing.assert_allclose(interval(names, before, after, 1), 0.0, atol=1e-12)
+
+
+def test_trials_are_of_the_terrain_in_their_name():
+    names = ["warthog_sand_2/000.0", "warthog_gravel/001.0"]
+    assert of_terrain(names, "sand") == names[:1] and of_terrain(names, "all") == names
+
+
+def test_a_loop_that_was_kept_is_not_run_again(tmp_path):
+    """An interrupted run goes on where it was: without a log there is nothing that a loop could be run on."""
+    settings = Benchmark(out=tmp_path)
+    keep(settings, "ladder_1", {"verdict": "none", "effects": []})
+
+    class Nothing:
+        spec = drive_spec()
+
+    assert [one["verdict"] for one in climb(settings, "ladder", Nothing())] == ["none"]
+
+
+def drive_spec():
+    from whill_mjx.specs import WARTHOG
+
+    return WARTHOG
+
+
+def test_no_step_is_both_fitted_and_held_out_and_poses_are_known_to_be_late():
+    if not (SHARED / "data" / "measured" / "drive_norlab").is_dir():
+        pytest.skip(f"measured set drive_norlab is not in {SHARED}; set WHILL_SHARED to the folder that holds data")
+    log = drive_log(Benchmark(shared=SHARED, windows=12), ("asphalt", "gravel", "sand"))
+    names = {trial.name for trial in log.training}, {trial.name for trial in log.held_out}
+    assert len(names[0]) == 12 and not names[0] & names[1]
+    assert {trial.group for trial in log.held_out} == {"asphalt", "gravel", "sand"}
+    assert log.fields["pose_stamps"] == "receipt" and any(trial.breaks for trial in log.training)
