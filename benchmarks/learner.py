@@ -2,6 +2,7 @@
 
     python -m benchmarks.learner                  # size12m on an accelerator, the cpu preset on a CPU
     python -m benchmarks.learner --preset size25m --batch-size 32
+    python -m benchmarks.learner --preset size1m --dtype float32 --unroll 1 --per-block 2     # on a CPU
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ def random_replay(config: DreamerConfig, key: jax.Array) -> Replay:
     )
 
 
-def time_updates(config: DreamerConfig, blocks: int, per_block: int) -> tuple[list[float], float]:
-    """Seconds per update of each block, and seconds to compile."""
+def time_updates(config: DreamerConfig, blocks: int, per_block: int) -> tuple[list[float], list[float], float]:
+    """Seconds per update of each block, seconds of all the host's cores in it, and seconds to compile."""
 
     def run(agent: AgentState, memory: Replay, key: jax.Array) -> tuple[AgentState, Replay]:
         def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[AgentState, Replay]:
@@ -68,13 +69,14 @@ def time_updates(config: DreamerConfig, blocks: int, per_block: int) -> tuple[li
     start = time.perf_counter()
     compiled = jax.jit(run, donate_argnums=(0, 1)).lower(agent, memory, key).compile()
     compile_s = time.perf_counter() - start
-    seconds = []
+    seconds, processor_seconds = [], []
     for block in range(blocks + 1):
-        start = time.perf_counter()
+        start, processor_start = time.perf_counter(), time.process_time()
         agent, memory = compiled(agent, memory, jax.random.fold_in(key, block))
         jax.block_until_ready(agent)
         seconds.append((time.perf_counter() - start) / per_block)
-    return seconds[1:], compile_s
+        processor_seconds.append((time.process_time() - processor_start) / per_block)
+    return seconds[1:], processor_seconds[1:], compile_s
 
 
 def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
@@ -131,6 +133,7 @@ def main() -> None:
     parser.add_argument("--preset", help="size; size12m on an accelerator and cpu on a CPU unless given")
     parser.add_argument("--batch-size", type=int)
     parser.add_argument("--unroll", type=int)
+    parser.add_argument("--dtype", choices=("bfloat16", "float32"), help="type of the products")
     parser.add_argument("--blocks", type=int, default=5)
     parser.add_argument("--per-block", type=int, default=10)
     parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
@@ -138,15 +141,19 @@ def main() -> None:
     args = parser.parse_args()
     on_cpu = jax.devices()[0].platform == "cpu"
     name = args.preset or ("cpu" if on_cpu else "size12m")
-    given = {"batch_size": args.batch_size, "scan_unroll": args.unroll, "replay_capacity": STREAMS * ROWS}
+    given = {"batch_size": args.batch_size, "scan_unroll": args.unroll, "compute_dtype": args.dtype,
+             "replay_capacity": STREAMS * ROWS}
     config = preset(name, **{field: value for field, value in given.items() if value is not None})
-    seconds, compile_s = time_updates(config, args.blocks, args.per_block)
+    seconds, processor_seconds, compile_s = time_updates(config, args.blocks, args.per_block)
     rates = [1.0 / s for s in seconds]
     replayed = [config.replayed_per_update * rate for rate in rates]
     label = name.removeprefix("size") + (f"_batch{args.batch_size}" if args.batch_size else "")
-    figures = {f"compile_s_{label}": harness.figure([compile_s], "s")}
-    if name == "cpu":
-        figures["cpu_replayed_steps_per_s"] = harness.figure(replayed, "1/s")
+    figures = {f"compile_s_{f'cpu_{label}' if on_cpu and name != 'cpu' else label}": harness.figure([compile_s], "s")}
+    if on_cpu:
+        cores = [config.replayed_per_update / s for s in processor_seconds]
+        suffix = "" if name == "cpu" else f"_{label}"
+        figures[f"cpu_replayed_steps_per_s{suffix}"] = harness.figure(replayed, "1/s")
+        figures[f"cpu_replayed_steps_per_core_s{suffix}"] = harness.figure(cores, "1/s")
     else:
         figures[f"updates_per_s_{label}"] = harness.figure(rates, "1/s")
         figures[f"replayed_steps_per_s_{label}"] = harness.figure(replayed, "1/s")

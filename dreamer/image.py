@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from dreamer import nets
 from dreamer.config import DreamerConfig
+from dreamer.convolution import by_chunks
 from dreamer.types import Params
 
 Shape = tuple[int, int, int]
@@ -58,14 +61,21 @@ def init_encoder(config: DreamerConfig, obs_shape: Shape, key: jax.Array) -> Par
 def encode(config: DreamerConfig, params: Params, image: jax.Array) -> jax.Array:
     """Tokens (..., E) of images (..., H, W, C) uint8."""
     batch = image.shape[:-3]
-    x = to_blocks(config, image.reshape(-1, *image.shape[-3:])).astype(config.dtype)
+    frames = image.reshape(-1, *image.shape[-3:])
     if config.encoder == "patch":
+        x = to_blocks(config, frames).astype(config.dtype)
         x = nets.layer(centred(params["patch"]), x)
         return nets.layer(params["mix"], x.reshape(x.shape[0], -1)).reshape(*batch, -1)
+    return by_chunks(partial(_encode_conv, config, params), frames).reshape(*batch, -1)
+
+
+def _encode_conv(config: DreamerConfig, params: Params, frames: jax.Array) -> jax.Array:
+    """Feature maps (M, h, w, C') of frames (M, H, W, C) uint8."""
+    x = to_blocks(config, frames).astype(config.dtype)
     x = nets.conv_pool(params["conv0"], x / 255 - 0.5)
     for i in range(1, len(config.mults)):
         x = nets.conv_pool(params[f"conv{i}"], nets.space_to_depth(x))
-    return x.reshape(*batch, -1)
+    return x
 
 
 def centred(params: Params) -> Params:
@@ -134,9 +144,15 @@ def reconstruction_loss(
     The target is brought into the decoder's block form, which is cheaper than unfolding the decoder's output.
     """
     obs_shape = (image.shape[1], image.shape[2], image.shape[3])
-    target = to_blocks(config, image).astype(jnp.float32) / 255
-    error = decode_blocks(config, params, deter, stoch, obs_shape) - target
-    return jnp.sum(jnp.square(error), range(1, error.ndim))
+
+    def squared_error(deter: jax.Array, stoch: jax.Array, image: jax.Array) -> jax.Array:
+        target = to_blocks(config, image).astype(jnp.float32) / 255
+        error = decode_blocks(config, params, deter, stoch, obs_shape) - target
+        return jnp.sum(jnp.square(error), range(1, error.ndim))
+
+    if config.encoder == "patch":
+        return squared_error(deter, stoch, image)
+    return by_chunks(squared_error, deter, stoch, image)
 
 
 def decode(config: DreamerConfig, params: Params, deter: jax.Array, stoch: jax.Array, obs_shape: Shape) -> jax.Array:

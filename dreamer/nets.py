@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from dreamer.convolution import block_max, conv
 from dreamer.types import Params
 
 NORM_EPS = 1e-4
@@ -56,8 +57,20 @@ def linear(params: Params, x: jax.Array) -> jax.Array:
 
 def block_linear(params: Params, x: jax.Array) -> jax.Array:
     """(..., G, inputs / G) -> (..., G, outputs / G), each block with its own weight."""
-    weight = params["w"].astype(x.dtype)
-    return jnp.einsum("...gi,gio->...go", x, weight) + params["b"].astype(x.dtype)
+    return block_product(x, params["w"].astype(x.dtype)) + params["b"].astype(x.dtype)
+
+
+def block_product(x: jax.Array, weight: jax.Array) -> jax.Array:
+    """(..., G, I) and (G, I, O) -> (..., G, O).
+
+    On a CPU the blocks lead in the product, and its result is put in order before anything else reads it: left to
+    itself, XLA reads it column by column in all that follows.
+    """
+    if jax.default_backend() != "cpu":
+        return jnp.einsum("...gi,gio->...go", x, weight)
+    rows = jnp.swapaxes(x.reshape(-1, *x.shape[-2:]), 0, 1)
+    product = jnp.swapaxes(jnp.matmul(rows, weight), 0, 1)
+    return jax.lax.optimization_barrier(product).reshape(*x.shape[:-1], weight.shape[-1])
 
 
 def norm_act(x: jax.Array, scale: jax.Array) -> jax.Array:
@@ -91,13 +104,6 @@ def depth_to_space(x: jax.Array) -> jax.Array:
     *batch, height, width, channels = x.shape
     x = x.reshape(*batch, height, width, 2, 2, channels // 4)
     return jnp.swapaxes(x, -4, -3).reshape(*batch, 2 * height, 2 * width, channels // 4)
-
-
-def conv(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """Stride-1 convolution with zero padding: (M, H, W, I) and (K, K, I, O) -> (M, H, W, O)."""
-    return jax.lax.conv_general_dilated(
-        x, weight.astype(x.dtype), (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
 
 
 def block_conv_weight(weight: jax.Array) -> jax.Array:
@@ -144,13 +150,13 @@ def upsample_conv_weight(weight: jax.Array) -> jax.Array:
 def conv_pool(params: Params, blocks: jax.Array) -> jax.Array:
     """5x5 convolution, 2x2 max-pool, norm, SiLU of an image in block form: (M, H, W, 4 I) -> (M, H, W, O)."""
     outputs = params["w"].shape[-1]
-    x = conv(blocks, block_conv_weight(params["w"]))
-    x = x.reshape(*x.shape[:-1], 4, outputs).max(-2)
+    x = conv(blocks, block_conv_weight(params["w"]).astype(blocks.dtype))
+    x = block_max(x.reshape(*x.shape[:-1], 4, outputs))
     return norm_act(x + params["b"].astype(x.dtype), params["scale"])
 
 
 def upsample_conv(params: Params, x: jax.Array) -> jax.Array:
     """Nearest-neighbour doubling and 5x5 convolution: (M, H, W, I) -> (M, H, W, 4, O), the result in block form."""
     outputs = params["w"].shape[-1]
-    y = conv(x, upsample_conv_weight(params["w"]))
+    y = conv(x, upsample_conv_weight(params["w"]).astype(x.dtype))
     return y.reshape(*y.shape[:-1], 4, outputs) + params["b"].astype(y.dtype)

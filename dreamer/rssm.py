@@ -209,9 +209,9 @@ def _observe_body(
     from_deter = nets.norm_act(deter_product + terms["in_deter_bias"], terms["in_deter_scale"])
     from_stoch = nets.norm_act(stoch @ weights["in_stoch"] + terms["in_stoch"], terms["in_stoch_scale"])
     operand = _core_operand(config, deter, jnp.concatenate([from_deter, from_stoch], -1))
-    wide = jnp.einsum("bgi,gio->bgo", operand, weights["core"]) + terms["core"]
+    wide = nets.block_product(operand, weights["core"]) + terms["core"]
     wide = _blocks(config, nets.norm_act(wide.reshape(deter.shape), terms["core_scale"]))
-    gates = jnp.einsum("bgi,gio->bgo", wide, weights["gates"]) + terms["gates"]
+    gates = nets.block_product(wide, weights["gates"]) + terms["gates"]
     deter = gru(config, deter, gates)
     products = deter @ weights["deter"] + terms["deter"]
     hidden = nets.norm_act(products[:, h:], terms["post_scale"])
