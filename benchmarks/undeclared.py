@@ -53,6 +53,8 @@ class Benchmark:
     """Logs of each effect and multiple."""
     pairs: int = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
+    left_out: bool = False
+    """The logs of 4 times that size against a catalogue that lacks the effect; after those logs are driven."""
     full: int = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -71,7 +73,7 @@ def main(settings: Benchmark) -> None:
     """Run what was asked for."""
     if settings.shared:
         shared(settings)
-    if settings.nulls or settings.base or settings.scales or settings.pairs:
+    if settings.nulls or settings.base or settings.scales or settings.pairs or settings.left_out:
         plant(settings)
     if settings.speed:
         contact.speed(settings.work / "plant")
@@ -125,7 +127,7 @@ def plant(settings: Benchmark) -> None:
                 continue
             if not ready:
                 ready.append(prepare(reference_of(days, config), days[0].spec, config))
-            full = job.stage != "base" and bool(job.effects) and number % settings.full == 0
+            full = job.stage in ("scaled", "pair") and bool(job.effects) and number % settings.full == 0
             one = contact.judge(job, ready[0], work, config, full)
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
@@ -135,6 +137,8 @@ def plant(settings: Benchmark) -> None:
         judge(listed)
     if settings.scales:
         judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part))
+    if settings.left_out:
+        judge(contact.left_out_jobs(work, part))
     if settings.pairs:
         judge(contact.pair_jobs(work, settings.pairs, part))
     contact.figures(work)
@@ -163,7 +167,7 @@ def look_alikes(settings: Benchmark) -> None:
         members = classes(imitation(evidence, found), found)
         content["sensors"][sensors] = {"classes": members,
                                        "mean_size": float(np.mean([len(each) for each in members.values()]))}
-    write_json(Path("sysid/data/classes.json"), content)
+    write_json(contact.CLASSES, content)
 
 
 def write_json(path: Path, content: Any) -> None:

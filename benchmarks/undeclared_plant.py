@@ -13,13 +13,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import figure, record
+from benchmarks.harness import RESULTS, figure, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
@@ -28,6 +28,8 @@ from sysid.loop.report import effects as named_effects
 from sysid.loop.report import make_report, write_run
 from sysid.report import write_report
 
+RECORDED = RESULTS / "undeclared.json"
+CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
 DAYS = 6
 POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
@@ -60,7 +62,11 @@ class Job:
     scale: float = 0.0
     """Multiple of the 80 %-power size; 0 at base size and where there is nothing."""
     stage: str = "null"
-    """null, base, scaled or pair."""
+    """null, base, scaled, pair or left_out."""
+    log: str = ""
+    """Label of the log, where another job drives it."""
+    without: tuple[str, ...] = ()
+    """Effects that the catalogue does not have."""
 
 
 def reference_days(work: Path) -> list[Log]:
@@ -108,6 +114,12 @@ def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str) -> l
                 30001 + 50 * i + 10 * j + seed, scale, "scaled")
             for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part)
             for j, scale in enumerate(scales) for seed in range(seeds)]
+
+
+def left_out_jobs(work: Path, part: str) -> list[Job]:
+    """The logs with one effect of the catalogue at four times that size, for a catalogue without that effect."""
+    return [replace(job, label=f"{job.label}_left_out", log=job.label, stage="left_out", without=tuple(job.effects))
+            for job in scaled_jobs(work, (4.0,), 1, part) if all(EFFECTS[name].known for name in job.effects)]
 
 
 def pair_jobs(work: Path, pairs: int, part: str) -> list[Job]:
@@ -160,8 +172,14 @@ def next_size(base: float, points: Sequence[Point]) -> float | None:
 
 
 def power_sizes(work: Path) -> dict[str, float]:
-    """Size of each effect that would be noticed with 80 % power; without those for which no such size was found."""
-    found = {name: size_between(EFFECTS[name].base, seen_at(work, name)) for name in EFFECTS}
+    """Size of each effect that would be noticed with 80 % power; without those for which no such size was found.
+
+    Where no effect was driven to find its size, the sizes are the recorded ones.
+    """
+    driven = {name: seen_at(work, name) for name in EFFECTS}
+    found = {name: size_between(EFFECTS[name].base, points) for name, points in driven.items()}
+    if not any(driven.values()) and RECORDED.exists():
+        found = {name: one["value"] for name, one in json.loads(RECORDED.read_text())["sizes"].items()}
     return {name: size for name, size in found.items() if size is not None}
 
 
@@ -183,10 +201,11 @@ def judge(job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool)
     verdict = work / "verdicts" / f"{job.label}.json"
     if verdict.exists():
         return json.loads(verdict.read_text())
-    folder = work / "logs" / job.label
+    folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
         make_log(folder, effects=job.effects, seed=job.seed)
     began = time.perf_counter()
+    config = replace(config, without=job.without)
     result = close_loop(load_log(folder), (), config, reference=ready)
     content = {"stage": job.stage, "scale": job.scale, **brief(result), "seconds": time.perf_counter() - began}
     if full and result.search.verdict == "named":
@@ -239,7 +258,8 @@ def figures(work: Path) -> None:
                   if one["stage"] == "scaled" and one["scale"] == scale]
         found.update(of_singles(inside, f"_{scale:g}x"))
     found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
-    found.update(of_parameters(cases))
+    found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"]))
+    found.update(of_parameters([(truth, one) for truth, one in cases if one["stage"] != "left_out"]))
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
     if ratios:
         found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
@@ -317,6 +337,19 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
     clean = [all(set(effect["class"]) & set(truth) for effect in one["effects"]) for truth, one in pairs]
     return {"pair_both": figure([float(np.mean(both))], f"share of {len(pairs)} logs"),
             "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
+
+
+def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
+    """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class."""
+    if not inside:
+        return {}
+    [*_, alike] = json.loads(CLASSES.read_text())["sensors"].values()
+    wrong = [one["verdict"] == "named" and not any(
+        set(alike["classes"][name]) & set(effect["class"]) for effect in one["effects"]) for name, one in inside]
+    about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
+    return {"left_out_wrong": figure([float(np.mean(wrong))], about),
+            "left_out_unexplained": figure([float(np.mean([one["verdict"] == "unexplained" for _, one in inside]))],
+                                           about)}
 
 
 def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:

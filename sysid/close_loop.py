@@ -20,6 +20,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,8 +32,10 @@ from sysid.log import Log, Trial
 from sysid.loop.alone import judged, stands_alone
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.drives import CHUNK, Drives, make_drives
-from sysid.loop.evidence import PARTS, Evidence, gather
+from sysid.loop.evidence import PARTS, Evidence, column_layout, gather
 from sysid.loop.late_pose import PARAMETER, told_late
+from sysid.loop.null_refits import NullRefits, checked
+from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
 from sysid.loop.search import Search, Thresholds, search
@@ -60,6 +63,8 @@ class LoopConfig:
     """Simulated nulls that the decision is calibrated on."""
     seed: int = 0
     """Of the simulated nulls."""
+    refit_nulls: int = 0
+    """Simulated days with nothing missing that are refitted as the drives are; from 100 they decide too."""
     quick: bool = False
     """Fewer iterations, nulls and candidates."""
     physics_dt: float = 0.005
@@ -73,6 +78,8 @@ class LoopConfig:
     (`fields["pose_stamps"]`) are always asked."""
     poses: bool = True
     """After the verdict, refit the vehicle to whole poses."""
+    without: tuple[str, ...] = ()
+    """Effects of the catalogue that are not looked for."""
     thresholds: Thresholds = field(default_factory=Thresholds)
     """When something counts as found."""
 
@@ -90,6 +97,16 @@ class Prepared:
     paths: PathReplay
     wander: Wander
 
+    def without(self, effects: Sequence[str]) -> Prepared:
+        """The same without some effects of the catalogue; nothing is compiled or simulated again."""
+        known = {one.effect for one in self.hypotheses}
+        if unknown := sorted(set(effects) - known):
+            raise ValueError(f"without: there is no effect {unknown[0]!r} (known: {', '.join(sorted(known))}).")
+        kept = [one.effect not in effects for one in self.hypotheses]
+        columns = column_layout(self.hypotheses, self.reference.space.size)
+        return replace(self, hypotheses=tuple(compress(self.hypotheses, kept)),
+                       wander=self.wander.of([kept[one.hypothesis] for one in columns]))
+
 
 @dataclass(frozen=True)
 class Result:
@@ -102,6 +119,7 @@ class Result:
     search: Search
     evidence: Evidence
     seconds: dict[str, float]
+    null_refits: NullRefits | None = None
 
     @property
     def reference(self) -> Reference:
@@ -168,6 +186,7 @@ def close_loop(
         reference = make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations,
                                    free, progress, vehicle is not None)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
+    ready = ready.without(config.without)
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
     base = base_values(full)
@@ -183,12 +202,17 @@ def close_loop(
         return best_gain(log.training, log.spec, residual, reference.width)
 
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
+    searched, nulls = time.perf_counter(), None
+    if config.refit_nulls:
+        nulls = run_null_refits(evidence, found, refitter, ready.wander, outcome.scan, config.thresholds,
+                                config.refit_nulls, config.seed, progress)
+        outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     alone = stands_alone(log.training, reference.known)
     if alone:
         outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds)
-    seconds = {"reference": fitted - began, "signatures": gathered - fitted,
-               "search": time.perf_counter() - gathered}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds)
+    seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
+               "null_refits": time.perf_counter() - searched}
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls)
     if alone and config.pose_delay and PARAMETER not in reference.space.names:
         result = told_late(result, config.thresholds.alpha)
     return result
@@ -300,7 +324,7 @@ def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     base = 0 if fitted else iterations + max(iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 2 + 3 * (config.thresholds.rounds + 1)
+    return base + 6 * days + 2 * PARTS + 2 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,8 +343,12 @@ class Arguments:
     """Fewer iterations, nulls and candidates."""
     seed: int = 0
     """Seed of the simulated nulls."""
+    refit_nulls: int = 0
+    """Simulated days with nothing missing that are refitted as the drives are (a few seconds each)."""
     iterations: int = 15
     """Iterations of the base fit."""
+    without: tuple[str, ...] = ()
+    """Effects of the catalogue that are not looked for, because the vehicle cannot have them."""
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -337,7 +365,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
             raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
                              "them.")
         _, vehicle, _ = load_vehicle(arguments.vehicle)
-    config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations)
+    config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
+                        without=arguments.without, refit_nulls=arguments.refit_nulls)
     return run(log, references, arguments.out, config, vehicle)
 
 

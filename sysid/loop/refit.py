@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
@@ -77,6 +78,16 @@ class Refitter:
         away = REACH * np.sqrt(np.diag(reference.spread))
         self.low, self.high = np.maximum(reference.u - away, 0.0), np.minimum(reference.u + away, 1.0)
         self.base_index = [self.names.index(name) for name in reference.space.names]
+
+    def aimed(self, target: np.ndarray) -> Refitter:
+        """The same for other drives with these commands, of white features `target` (B, n)."""
+        other = copy.copy(self)
+        other.target = target
+        return other
+
+    def white_of(self, u: np.ndarray) -> np.ndarray:
+        """(B, n) white features of the base model with parameters u (P,)."""
+        return self._white(self.drives.simulate(self._set((), u, np.zeros(0))[None]))[0]
 
     def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = 12) -> Refit:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""

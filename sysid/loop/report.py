@@ -10,7 +10,8 @@
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
     missing           p-value of "nothing is missing"; squared residual in excess of the noise, as a share of it, before
-                      and after; share of it explained
+                      and after; share of it explained; of simulated days that were refitted (`--refit-nulls`, else
+                      null) count, calibrated p-value, false alarms and the upper 95 % bound of their rate
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
     detectable        per effect the smallest size that these drives would show with 80 % power
     lives_in          where the unexplained residual lives
@@ -70,6 +71,7 @@ def make_report(result: Result) -> dict[str, Any]:
     about = [one.name for one in result.references]
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
              if result.reference.known else "what the model family lacks")
+    nulls = result.null_refits
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
         "question": asked, "remark": result.reference.remark,
@@ -80,7 +82,10 @@ def make_report(result: Result) -> dict[str, Any]:
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
         "missing": {"p_value": found.p_value, "excess_before": found.excess[0],
-                    "excess_after": found.excess[1], "explained": found.share},
+                    "excess_after": found.excess[1], "explained": found.share,
+                    "null_refits": None if nulls is None else {
+                        "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
+                        "upper": nulls.upper}},
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]

@@ -149,25 +149,8 @@ def search(
             break
         scans = [far, (first.gain, first.worth, first.q)] if number == 0 else [
             _rescan(evidence, hypotheses, current, refitter, wander)]
-        taken = {one.effect for one in current.hypotheses}
-        chosen = _starts(hypotheses, scans, first, taken, thresholds)
-        at = Start.at(current)
-        fits = refitter.fit_all([Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
-                                 for h, q in chosen], FIRST_LOOK)
-        report(f"refits, round {number + 1}")
-        least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
-        best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
-        for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
-            fits[i] = fit
-        report(f"polish, round {number + 1}")
-        rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
-        chosen += [(h, _best_start(scans, h)) for h in rivals]
-        fits += refitter.fit_all([Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
-                                  for h, q in chosen[len(fits) :]], POLISH)
-        report(f"rivals, round {number + 1}")
-        candidates = [_candidate(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
-                      for (h, _), fit in zip(chosen, fits, strict=True)]
-        candidates.sort(key=lambda one: -one.gain)
+        candidates = refitted(refitter, current, evidence, hypotheses, wander, first, scans, thresholds, similar,
+                              explained, lambda text: report(f"{text}, round {len(found.rounds) + 1}"))
         found.rounds.append(candidates)
         likely = [one for one in candidates if one.p < thresholds.alpha]
         if not likely:
@@ -284,6 +267,36 @@ def _decide(
 
 Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
 """Gain (H,), worth (H,) and coordinates of every hypothesis."""
+
+
+def refitted(
+    refitter: Refitter, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
+    first: Scan, scans: Sequence[Looked], thresholds: Thresholds, similar: np.ndarray,
+    explained: Callable[[Refit], float], report: Callable[[str], None],
+) -> list[Candidate]:
+    """One round: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and so is
+    what might imitate the best; in order of gain."""
+    taken = {one.effect for one in current.hypotheses}
+    chosen = _starts(hypotheses, scans, first, taken, thresholds)
+    at = Start.at(current)
+
+    def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
+        return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
+
+    fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
+    report("refits")
+    least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
+    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
+    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
+        fits[i] = fit
+    report("polish")
+    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
+    chosen += [(h, _best_start(scans, h)) for h in rivals]
+    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
+    report("rivals")
+    candidates = [_candidate(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
+                  for (h, _), fit in zip(chosen, fits, strict=True)]
+    return sorted(candidates, key=lambda one: -one.gain)
 
 
 def _rescan(

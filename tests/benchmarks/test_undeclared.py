@@ -58,3 +58,42 @@ def test_every_log_belongs_to_one_process():
     both = [[job.label for job in contact.null_jobs(7, part)] for part in ("1/2", "2/2")]
     assert sorted(both[0] + both[1]) == [job.label for job in contact.null_jobs(7, "1/1")]
     assert not set(both[0]) & set(both[1])
+
+
+@pytest.mark.quick
+def test_where_no_size_was_searched_for_the_recorded_ones_are_driven(tmp_path):
+    recorded = json.loads(contact.RECORDED.read_text())["sizes"]
+    assert contact.power_sizes(tmp_path) == {name: one["value"] for name, one in recorded.items()}
+
+
+@pytest.mark.quick
+def test_a_left_out_effect_is_judged_on_the_log_that_has_it(tmp_path):
+    jobs = contact.left_out_jobs(tmp_path, "1/1")
+    driven = {job.label: job for job in contact.scaled_jobs(tmp_path, (4.0,), 1, "1/1")}
+    assert len(jobs) == sum(contact.EFFECTS[name].known for name in contact.power_sizes(tmp_path))
+    for job in jobs:
+        assert job.without == tuple(job.effects) and job.stage == "left_out"
+        assert (driven[job.log].effects, driven[job.log].seed) == (job.effects, job.seed)
+        assert job.label not in driven
+
+
+@pytest.mark.quick
+def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong():
+    def verdict(*members):
+        return {"verdict": "named" if members else "unexplained",
+                "effects": [{"class": list(members)}] if members else []}
+
+    found = contact.of_left_out([("slope", verdict("wind")), ("slope", verdict()),
+                                 ("slope", verdict("dry_friction")), ("wind", verdict("slope", "x"))])
+    assert found["left_out_wrong"]["value"] == 0.25
+    assert found["left_out_unexplained"]["value"] == 0.25
+
+
+@pytest.mark.quick
+def test_committed_classes_are_small_and_of_the_catalogue():
+    sensors = json.loads(contact.CLASSES.read_text())["sensors"]
+    sizes = [one["mean_size"] for one in sensors.values()]
+    assert sizes == sorted(sizes, reverse=True)  # more sensors tell more apart
+    for one in sensors.values():
+        for name, members in one["classes"].items():
+            assert members[0] == name and len(members) <= 4 and set(members) <= set(one["classes"])

@@ -15,6 +15,7 @@ from sysid.loop.drives import make_drives
 from sysid.loop.evidence import Columns
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
+from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.refit import Refit
 from sysid.loop.report import make_report, replay, write_run
 from sysid.loop.search import Candidate, Thresholds, _own
@@ -78,6 +79,28 @@ def test_names_the_slope_and_its_size(sloping):
 def test_finds_nothing_where_nothing_is(drives, sloping):
     result = close_loop(drives["plain"], (), CONFIG, reference=sloping.reference)
     assert result.search.verdict == "none"
+
+
+def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, sloping):
+    config = replace(CONFIG, without=("slope", "wind"))
+    result = close_loop(drives["sloping"], (), config, reference=sloping.prepared)
+    assert result.search.verdict != "none"
+    assert not {"slope", "wind"} & {one.hypothesis.effect for one in result.search.accepted}
+    with pytest.raises(ValueError, match="there is no effect 'slop' .known: "):
+        sloping.prepared.without(("slop",))
+
+
+def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sloping):
+    result = close_loop(drives["sloping"], (), replace(CONFIG, refit_nulls=4), reference=sloping.prepared)
+    assert result.search.verdict == "named"
+    nulls = result.null_refits
+    assert nulls.alarms == 0 and np.all(nulls.p > 1e-3)  # with nothing in them they look nothing like the slope
+    assert nulls.p_of(result.search.p_value) == 1 / 5
+    assert make_report(result)["missing"]["null_refits"]["count"] == 4
+    often = NullRefits(np.zeros(200), 150)  # had such drives always shown as much
+    weak = replace(result.search, excess=(0.0, 0.0))
+    assert checked(weak, often, result.prepared.wander, CONFIG.thresholds).verdict == "none"
+    assert not weak.accepted
 
 
 def test_report_and_vehicle_file(sloping, tmp_path):

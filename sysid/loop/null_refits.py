@@ -1,0 +1,112 @@
+"""Days with nothing missing, put through the same fits as the drives in question.
+
+The nulls of `sysid.loop.scan` are linear: they move along the columns of the base parameters. Those here are drives of
+the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
+day is added, and base fit, scan and refits see it as they see measured drives. They tell how often this very set of
+drives would raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.loop.catalogue import Hypothesis
+from sysid.loop.classes import imitation
+from sysid.loop.evidence import Evidence, at_fit, white_leftover
+from sysid.loop.reference import Reference, alike
+from sysid.loop.refit import Refitter
+from sysid.loop.scan import Scan, best, family, tail
+from sysid.loop.search import Search, Thresholds, refitted
+from sysid.loop.solver import Solver
+from sysid.loop.wander import Wander
+from sysid.result import Progress
+
+SPREAD_FREEDOM = 8.0  # of the Student's t that parameters are drawn from: a few days tell the spread
+
+
+@dataclass(frozen=True)
+class NullRefits:
+    """What was found in N simulated days with nothing missing."""
+
+    p: np.ndarray  # (N,) what `Search.p_value` would be
+    alarms: int
+    """How many of them would not have been called `none`."""
+
+    def p_of(self, p: float) -> float:
+        """Share of days with nothing in them whose p-value is as small, the drives in question counted in."""
+        return float((np.sum(self.p <= p) + 1) / (len(self.p) + 1))
+
+    @property
+    def upper(self) -> float:
+        """Upper end of the one-sided 95 % interval of the false-alarm rate."""
+        from scipy import stats
+
+        return float(stats.beta.ppf(0.95, self.alarms + 1, max(len(self.p) - self.alarms, 1)))
+
+
+def run(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
+    thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
+) -> NullRefits:
+    """Simulate and judge `count` days.
+
+    Args:
+        evidence: of the drives in question around the reference, as `gather` made it.
+        scan: of the drives in question: its linear nulls are what the first look at each day is held against.
+    """
+    reference, measured = refitter.reference, float((refitter.drives.mask > 0).sum())
+    rng = np.random.default_rng((seed, 1))
+    similar = imitation(evidence, hypotheses)
+    p, alarms = np.ones(count), 0
+    for n in range(count):
+        one = refitter.aimed(refitter.white_of(_vehicle(reference, rng)) + _noise(refitter, rng))
+        base = one.fit((), np.zeros(0))
+        around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
+        looked = best(Solver(around), hypotheses, wander)
+        p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
+        if p[n] < thresholds.alpha:
+            candidates = refitted(one, base, around, hypotheses, wander, scan, [looked], thresholds, similar,
+                                  lambda _: 0.0, lambda _: None)
+            p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
+        excess = float(np.square(base.residual).sum()) / measured - 1
+        alarms += bool(p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha)
+        if progress is not None:
+            progress(1, f"null refits, {alarms} of {n + 1} alarms")
+    return NullRefits(p, alarms)
+
+
+def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresholds) -> Search:
+    """The verdict, taken back where simulated days with nothing in them often look the same."""
+    if (found.verdict != "none" and len(nulls.p) >= 1 / thresholds.alpha
+            and nulls.p_of(found.p_value) >= thresholds.alpha and wander.p_excess(found.excess[0]) >= thresholds.alpha):
+        found.verdict, found.accepted, found.classes, found.final = "none", [], [], found.base
+        found.share, found.excess = 0.0, (found.excess[0], found.excess[0])
+        found.reason = f"stands out no more than in {nulls.p_of(found.p_value):.1%} of simulated days without anything"
+    return found
+
+
+def _vehicle(reference: Reference, rng: np.random.Generator) -> np.ndarray:
+    """Base parameters (P,), in unit coordinates, of a vehicle from the day-to-day spread."""
+    size = len(reference.u)
+    scale = np.sqrt(SPREAD_FREEDOM / rng.chisquare(SPREAD_FREEDOM))
+    factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(size))
+    return np.clip(reference.u + scale * factor @ rng.standard_normal(size), 0.0, 1.0)
+
+
+def _noise(refitter: Refitter, rng: np.random.Generator) -> np.ndarray:
+    """(B, n) white: what the model left of the drives of one reference day, with either sign."""
+    reference, drives = refitter.reference, refitter.drives
+    day = int(rng.choice(sorted({one.day for one in reference.leftovers})))
+    mine = [one for one in reference.leftovers if one.day == day]
+    rows, taken = [], dict.fromkeys(range(len(mine)), 0)
+    for trial, mask in zip(drives.trials, drives.mask, strict=True):
+        like = ([i for i, one in enumerate(mine) if alike(one.trial, trial)]
+                or [i for i, one in enumerate(mine) if one.trial.manoeuvre == trial.manoeuvre] or list(taken))
+        least = min(taken[i] for i in like)
+        chosen = int(rng.choice([i for i in like if taken[i] == least]))  # each drive once before one comes again
+        taken[chosen] += 1
+        rows.append(white_leftover(reference, mine[chosen], mask))
+    return float(rng.choice((-1.0, 1.0))) * np.stack(rows)
