@@ -3,8 +3,8 @@
     python -m benchmarks.learner_peer --compile     # pip install sheeprl; prints one line of JSON
 
 It is timed as it is used: mixed bf16, cuDNN's own choice of algorithms, TF32 elsewhere, and with `--compile` its losses
-through `torch.compile` with CUDA graphs, which takes minutes. The batch is on the device already; its replay, which lives
-on the host, is not timed. A process of its own, so that PyTorch and JAX do not share a device's memory.
+through `torch.compile` with CUDA graphs, which takes minutes. The batch is on the device already; its replay, which
+lives on the host, is not timed. A process of its own, so that PyTorch and JAX do not share a device's memory.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def noise(cfg: Any, batch: int, device: Any) -> dict[str, Any]:
     world = cfg.algo.world_model
     return {
         "rgb": torch.randint(0, 256, (*steps, *SHAPE), dtype=torch.uint8, device=device),
-        "actions": torch.rand(*steps, ACTION_DIM, device=device) * 2 - 1, "rewards": torch.randn(*steps, 1, device=device),
+        "actions": torch.rand(*steps, ACTION_DIM, device=device) * 2 - 1,
+        "rewards": torch.randn(*steps, 1, device=device),
         "terminated": flag, "truncated": flag.clone(), "is_first": first,
         "deter": torch.randn(*steps, recurrent, device=device).to(torch.float16),
         "stoch": torch.randint(0, world.discrete_size, (*steps, world.stochastic_size), dtype=torch.uint8,
