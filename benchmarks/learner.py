@@ -3,12 +3,16 @@
     python -m benchmarks.learner                  # size12m on an accelerator, the cpu preset on a CPU
     python -m benchmarks.learner --preset size25m --batch-size 32
     python -m benchmarks.learner --preset size1m --dtype float32 --unroll 1 --per-block 2     # on a CPU
+    python -m benchmarks.learner --peer           # and SheepRL's learner in the same run (pip install sheeprl)
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -119,6 +123,32 @@ def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
     return {name: _bind(jax.jit(function), arguments) for name, (function, arguments) in calls.items()}
 
 
+def peer(size: str, batch: int | None, blocks: int, per_block: int) -> dict[str, Any]:
+    """Updates/s of SheepRL's learner, plain and through `torch.compile`; of the faster one as the peer's."""
+    found = {}
+    for name, more in (("eager", []), ("compiled", ["--compile"])):
+        command = [sys.executable, "-m", "benchmarks.learner_peer", "--size", size, "--blocks", str(blocks),
+                   "--per-block", str(per_block), "--batch-size", str(batch or 16), *more]
+        answer = subprocess.run(command, capture_output=True, text=True)
+        if answer.returncode:
+            print(f"peer, {name}: left out, {answer.stderr.strip().splitlines()[-1]}", flush=True)
+            continue
+        one = json.loads(answer.stdout.splitlines()[-1])
+        found[name] = harness.figure(one["updates_per_s"], "1/s", one["device"])
+    label = f"{size.lower()}" + (f"_batch{batch}" if batch else "")
+    figures = {f"peer_updates_per_s_{label}_{name}": one for name, one in found.items()}
+    if found:
+        figures[f"peer_updates_per_s_{label}"] = max(found.values(), key=lambda one: one["value"])
+    return figures
+
+
+def replay_bytes(config: DreamerConfig) -> float:
+    """Bytes of the replay for each of its steps."""
+    memory = jax.eval_shape(lambda: replay.init(config, STREAMS, OBS_SHAPE, ACTION_DIM))
+    stored = [leaf for leaf in jax.tree.leaves(memory) if leaf.ndim >= 2 and leaf.shape[:2] == memory.reward.shape]
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in stored) / memory.reward.size
+
+
 def _arrays(rollout: behavior.Imagined) -> tuple[jax.Array, jax.Array]:
     return rollout.features, rollout.actions
 
@@ -137,6 +167,7 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=5)
     parser.add_argument("--per-block", type=int, default=10)
     parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
+    parser.add_argument("--peer", action="store_true", help="also time the learner of SheepRL at this size")
     parser.add_argument("--dry", action="store_true", help="print only")
     args = parser.parse_args()
     on_cpu = jax.devices()[0].platform == "cpu"
@@ -160,6 +191,9 @@ def main() -> None:
     for part, call in (parts(config) if args.parts else {}).items():
         times = [1e3 * s for s in harness.time_calls(call, repeats=args.per_block, warm_up=2)]
         figures[f"{part}_ms_{label}"] = harness.figure(times, "ms")
+    figures[f"replay_bytes_per_step_{label}"] = harness.figure([replay_bytes(config)], "B")
+    if args.peer:
+        figures |= peer(name.removeprefix("size").upper(), args.batch_size, args.blocks, args.per_block)
     for key, value in figures.items():
         print(f"{key}: {value['value']:.4g} {value['unit']}", flush=True)
     if not args.dry:
