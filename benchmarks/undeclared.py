@@ -59,6 +59,8 @@ class Benchmark:
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
     """How long the whole command takes, from start to report, on a log of 27 trials with six reference days."""
+    refit_nulls: int = 0
+    """Simulated days that are refitted meanwhile."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     collect: bool = False
@@ -76,7 +78,7 @@ def main(settings: Benchmark) -> None:
     if settings.nulls or settings.base or settings.scales or settings.pairs or settings.left_out:
         plant(settings)
     if settings.speed:
-        contact.speed(settings.work / "plant")
+        contact.speed(settings.work / "plant", settings.refit_nulls)
     if settings.classes:
         look_alikes(settings)
     if settings.collect:

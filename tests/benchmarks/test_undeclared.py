@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import pytest
 
@@ -58,6 +59,27 @@ def test_every_log_belongs_to_one_process():
     both = [[job.label for job in contact.null_jobs(7, part)] for part in ("1/2", "2/2")]
     assert sorted(both[0] + both[1]) == [job.label for job in contact.null_jobs(7, "1/1")]
     assert not set(both[0]) & set(both[1])
+
+
+@pytest.mark.quick
+def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, monkeypatch):
+    recorded = json.loads(contact.RECORDED.read_text())
+    path = tmp_path / "undeclared.json"
+    path.write_text(json.dumps(recorded))
+    monkeypatch.setattr(contact, "RECORDED", path)
+    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+    verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
+               "seconds": 1.0}
+    for folder, content in (("verdicts", verdict), ("truth", {})):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "null_000.json").write_text(json.dumps(content))
+    contact.figures(tmp_path)
+    after = json.loads(path.read_text())
+    others = [row for row in recorded["confusion"] if row["stage"] != "null"]
+    assert [row for row in after["confusion"] if row["stage"] != "null"] == others
+    assert after["sizes"] == recorded["sizes"]
+    assert after["figures"]["class_accuracy_4x"] == recorded["figures"]["class_accuracy_4x"]
+    assert after["figures"]["false_alarms"]["unit"] == "of 1 logs with nothing in them"
 
 
 @pytest.mark.quick
