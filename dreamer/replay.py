@@ -200,13 +200,23 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
 def write_back(config: DreamerConfig, replay: Replay, window: Window, latent: Latent) -> Replay:
     """Replace the stored states of a window's trained steps by latent (T, B, ...).
 
-    Where two windows overlap, one of their states is kept.
+    Where sequences overlap, those of the last one are kept, as if they were written one after the other. Which of two
+    writes to one place a GPU keeps is open: a state could be mixed of both.
     """
-    place = (window.row[1:], window.stream)
-    deter = replay.deter.at[place].set(latent.deter.astype(replay.deter.dtype), mode="promise_in_bounds")
-    index = to_index(config, latent.stoch)
-    stoch = replay.stoch.at[place].set(index, mode="promise_in_bounds")
+    outside = replay.reward.shape[0]  # a row that does not exist: what goes there is dropped
+    place = (jnp.where(overwritten(window, outside), outside, window.row[1:]), window.stream)
+    deter = replay.deter.at[place].set(latent.deter.astype(replay.deter.dtype), mode="drop")
+    stoch = replay.stoch.at[place].set(to_index(config, latent.stoch), mode="drop")
     return dataclasses.replace(replay, deter=deter, stoch=stoch)
+
+
+def overwritten(window: Window, rows: int) -> jax.Array:
+    """(T, B) bool: a later sequence of the batch trains this step too, in a ring of so many rows."""
+    trained = window.row[1:]
+    since = (trained[:, :, None] - trained[0]) % rows  # (T, B, B): steps after the start of each sequence
+    order = jnp.arange(trained.shape[1])
+    later = (window.stream[:, None] == window.stream) & (order[:, None] < order)
+    return jnp.any((since < trained.shape[0]) & later, -1)
 
 
 def to_index(config: DreamerConfig, stoch: jax.Array) -> jax.Array:
