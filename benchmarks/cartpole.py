@@ -4,9 +4,10 @@
     python -m benchmarks.cartpole --task balance --sight joints --preset tiny --steps 20000     # minutes on a CPU
     python -m benchmarks.cartpole --task grid --preset tiny --steps 20000
 
-Steps are those of the suite (0.01 s), of which a decision takes two (grid: one). All seeds run in one program. The same
-command goes on where it was stopped, by the clock or by a kill; the curve of every seed goes into
-results/dreamer_control.json.
+Steps are those of the suite (0.01 s), of which a decision takes two (grid: one); the train ratio counts decisions, so
+that published curves with 256 for each step or 512 for each decision of two both mean --ratio 512, a quarter of an
+update per step. All seeds run in one program. The same command goes on where it was stopped, by the clock or by a kill;
+the curve of every seed goes into results/dreamer_control.json.
 """
 
 from __future__ import annotations
@@ -147,7 +148,8 @@ def progress(task: Task, began: float) -> Any:
     """Prints a line for every logged one."""
 
     def say(line: dict[str, float]) -> None:
-        names = ("updates_per_s", "updates_per_env_step", "episode/return", "kl", "policy_std", "policy_certainty")
+        line = {**line, "updates_per_step": line["updates_per_env_step"] / task.repeat}  # the learner counts decisions
+        names = ("updates_per_s", "updates_per_step", "episode/return", "kl", "policy_std", "policy_certainty")
         text = ", ".join(f"{name} {line[name]:.3g}" for name in names if name in line)
         print(f"{int(line['env_steps']) * task.repeat} steps, {time.monotonic() - began:.0f} s: {text}", flush=True)
 
@@ -184,7 +186,8 @@ def summary(
         f"{name}_return": {
             **figure([curves[seed][last] for seed in every], "-"), "steps": last, "seeds": every,
             "curve": [[at, [round(curves[seed][at], 3) for seed in every]] for at in shared],
-            "episodes": options.episodes, "updates": updates[last], "train_ratio": config.train_ratio,
+            "episodes": options.episodes, "updates": updates[last],
+            "updates_per_step": updates[last] / last, "train_ratio": config.train_ratio,
             "instances": options.instances,
         },
         f"{name}_random_return": figure([random_return(task.test, task.max_decisions)], "-"),
