@@ -70,7 +70,8 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
             the log states how often and by how much.
 
     Returns:
-        One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window.
+        One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
+        `fields["yaw_rate"]` all of it: times [s] and rates [rad/s].
         `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
     """
     folder = Path(folder)
@@ -79,7 +80,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
         raise ValueError(f"{folder}: runs {runs} are of {len(specs)} different robots; fit one robot at a time.")
     trials: list[Trial] = []
     notes = []
-    gyro: dict[str, float] = {}
+    gyro: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for run in runs:
         found = sorted(folder.glob(f"{run}.*"))
         if not found:
@@ -93,7 +94,8 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
         trials += run_trials
         notes.append(note)
     return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes),
-               {"gyro": gyro, "pose_stamps": "receipt"})
+               {"gyro": {name: float(rate.mean()) for name, (_, rate) in gyro.items()}, "yaw_rate": gyro,
+                "pose_stamps": "receipt"})
 
 
 def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
@@ -120,7 +122,8 @@ def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) ->
     return spec.wheel_radius * (left + right) / 2, spec.wheel_radius * (right - left) / spec.track
 
 
-def _drive_windows(path: Path, run: str, chained: bool) -> tuple[list[Trial], str, dict[str, float]]:
+def _drive_windows(path: Path, run: str, chained: bool
+                   ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     with np.load(path, allow_pickle=False) as file:
         missing = {"data", "columns"} - set(file.files)
         if missing:
@@ -165,7 +168,7 @@ def _drive_windows(path: Path, run: str, chained: bool) -> tuple[list[Trial], st
             continue
         trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
                             breaks=tuple(breaks)))
-        rates[name] = float(gyro[rows].mean())
+        rates[name] = t, gyro[rows].ravel()
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
     if chained:
         late = np.array([gap for gap in missed if gap > 0] or [0.0])

@@ -52,6 +52,8 @@ def test_chained_windows_continue_each_other_and_state_the_error_of_the_joints(t
     log = load_drive(tmp_path, ("warthog_sand_1",), chained=True)
     truth = log.trials[0].ground_truth
     assert len(log.trials) == 1 and truth.t[-1] == pytest.approx(4 + 35 * 0.05)
+    when, rate = log.fields["yaw_rate"]["warthog_sand_1/000.0"]
+    assert len(when) == len(rate) == 120 and when[-1] == pytest.approx(5.95)
     assert (np.diff(truth.x) > 0).all()
     # Each window loses the update between its last change (sample 35) and the next window's first sample.
     assert "100% of the joints miss an ICP update" in log.notes[0]
