@@ -72,7 +72,8 @@ class LoopConfig:
     with_effects: tuple[str, ...] = ()
     """Effects of the catalogue that the base model has as well, fitted like its own."""
     held: tuple[str, ...] = ()
-    """Base parameters that keep their value; an effect that is one of them is then looked for, not fitted before."""
+    """Base parameters that keep their value; an effect that is one of them is then looked for, not fitted before;
+    `pose_delay.delay` is what it is."""
     pose_delay: bool = False
     """Look for a late outside pose too: where its stamps are those of receipt. Logs whose loader says so
     (`fields["pose_stamps"]`) are always asked."""
@@ -213,7 +214,7 @@ def close_loop(
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls)
-    if alone and config.pose_delay and PARAMETER not in reference.space.names:
+    if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
 
@@ -225,7 +226,7 @@ def prepare(
     config = config or LoopConfig()
     plant = _plant(spec, config)
     found = hypotheses(spec, reference.params)
-    if config.pose_delay:
+    if config.pose_delay and PARAMETER not in config.held:
         fitted = PARAMETER in reference.space.names
         found += (Hypothesis("pose_delay", (Axis(PARAMETER, 0.05, signed=fitted, limit=20.0),),
                              kind="parameter_shift" if fitted else "effect"),)
@@ -281,7 +282,7 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     if result.search.verdict == "named":
         moved = [axis.parameter for one in result.search.final.hypotheses for axis in one.axes]
         names += [name for name in dict.fromkeys(moved) if name in have and name not in names
-                  and np.isfinite(float(get_values(vehicle, [name])[0]))]
+                  and np.isfinite(float(get_values(vehicle, [name])[0])) and name not in result.config.held]
     space = make_space(vehicle, result.log.spec, names)
     spread = np.zeros((space.size, space.size))
     known = result.reference.space.size

@@ -57,7 +57,8 @@ class PoseReplay:
 
 
 def fit_poses(
-    drives: Drives, trials: Sequence[Trial], space: Space, held: np.ndarray, spread: np.ndarray, iterations: int
+    drives: Drives, trials: Sequence[Trial], space: Space, held: np.ndarray, spread: np.ndarray, iterations: int,
+    others: np.ndarray | None = None,
 ) -> np.ndarray | None:
     """Unit coordinates (P,) of the least error in whole poses and speeds; None where the start is best.
 
@@ -65,13 +66,18 @@ def fit_poses(
         space: the free parameters, from where to start.
         held: (all,) values of all parameters of the drives.
         spread: (P, P) covariance over which derivatives are taken, in unit coordinates.
+        others: (S, P) further starts, in unit coordinates.
     """
     start = space.to_unit(space.initial)
-    steps = difference_sizes(spread) * space.slope(start)
     noise = estimate_noise(tuple(trials))
-    replay: Any = PoseReplay(drives, held, tuple(space.names), steps)
-    objective = Objective(replay, space, tuple(trials), drives.measured, noise)
+
+    def objective(at: np.ndarray) -> Objective:
+        replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
+        return Objective(replay, space, tuple(trials), drives.measured, noise)
+
     if noise.source == "defaults":
-        objective = objective.with_noise(objective.residual_noise(start))
-    fit = gradient.fit(objective, space, iterations=iterations)
-    return fit.u if fit.cost < fit.initial_cost else None
+        noise = objective(start).residual_noise(start)
+    starts = [start] if others is None else [start, *others]
+    fits = [gradient.fit(objective(one), space, starts=one[None], iterations=iterations) for one in starts]
+    best = min(fits, key=lambda fit: fit.cost)
+    return best.u if best.cost < fits[0].initial_cost else None

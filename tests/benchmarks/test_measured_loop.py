@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.measured_loop import Benchmark, climb, drive_log, interval, is_false, keep, of_terrain
+from benchmarks.measured_loop import Benchmark, climb, config_of, drive_log, interval, is_false, keep, of_terrain
+from sysid.models import with_effects
+from whill_mjx.presets import preset_params
 
 pytestmark = pytest.mark.quick
 SHARED = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / ".." / "shared"))
@@ -58,6 +60,12 @@ def test_a_loop_that_was_kept_is_not_run_again(tmp_path):
     assert [one["verdict"] for one in climb(settings, "ladder", Nothing())] == ["none"]
 
 
+def test_a_delay_of_the_pose_that_was_named_is_held():
+    plain = preset_params(drive_spec(), "physical")
+    assert config_of(Benchmark(), plain).held == ()
+    assert config_of(Benchmark(), with_effects(plain, ("pose_delay",))).held == ("pose_delay.delay",)
+
+
 def drive_spec():
     from whill_mjx.specs import WARTHOG
 
@@ -71,4 +79,5 @@ def test_no_step_is_both_fitted_and_held_out_and_poses_are_known_to_be_late():
     names = {trial.name for trial in log.training}, {trial.name for trial in log.held_out}
     assert len(names[0]) == 12 and not names[0] & names[1]
     assert {trial.group for trial in log.held_out} == {"asphalt", "gravel", "sand"}
+    assert set(log.fields["yaw_rate"]) >= names[0]
     assert log.fields["pose_stamps"] == "receipt" and any(trial.breaks for trial in log.training)

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from sysid.close_loop import LoopConfig
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.loop import late_pose
+from sysid.loop.catalogue import Axis, Hypothesis
+from sysid.loop.evidence import Columns
 from sysid.loop.pose_lag import pose_lag, sign_flips
+from sysid.loop.refit import Refit
+from sysid.loop.search import Search
+from sysid.space import Space
 
 pytestmark = pytest.mark.quick
 BLOCKS = [list(range(4 * b, 4 * b + 4)) for b in range(8)]
@@ -94,3 +104,43 @@ def test_signs_of_blocks_are_drawn_one_sided():
     assert sign_flips(-np.ones(8)) == 1.0
     assert sign_flips(np.ones(20)) < 1e-3
     assert 0.3 < sign_flips(np.array([1.0, -1.0] * 10)) <= 0.7
+
+
+@dataclass(frozen=True)
+class Told:
+    """What `told_late` reads of a closed loop, with a base model of one parameter."""
+
+    search: Search
+    evidence: SimpleNamespace
+    log: SimpleNamespace
+    config: LoopConfig = field(default_factory=LoopConfig)
+    names: tuple = ("body.mass", "pose_delay.delay")
+    hypotheses: tuple = (Hypothesis("pose_delay", (Axis("pose_delay.delay", 0.05),)),)
+    plant: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(dt=0.01))
+    seconds: dict = field(default_factory=dict)
+
+    @property
+    def reference(self):
+        one = np.ones(1)
+        return SimpleNamespace(space=Space(("body.mass",), 0 * one, 2 * one, one, np.zeros(1, bool)))
+
+
+def closed(delay):
+    trials, rates = drives(delay=delay)
+    base = Refit((), np.ones(1), np.zeros(0), 0.0, np.zeros((32, 5)), np.zeros((32, 5, 1)), np.zeros(2))
+    evidence = SimpleNamespace(groups=BLOCKS, columns=[Columns(0, 1.0, (1,))], design=np.ones((32, 5, 2)))
+    search = Search("none", base, base, None)
+    return Told(search, evidence, SimpleNamespace(training=tuple(trials), fields={"yaw_rate": rates}))
+
+
+def test_a_late_pose_is_named_with_its_delay_and_later_fits_hold_it(monkeypatch):
+    monkeypatch.setattr(late_pose, "fitted", lambda result, delay: np.array([1.5 if delay else 0.5, delay]))
+    monkeypatch.setattr(late_pose, "residuals", lambda result, values: np.zeros((2, 32, 5)))
+    found = late_pose.told_late(closed(0.4), 0.01)
+    assert found.search.verdict == "named" and found.search.classes == [["pose_delay"]]
+    assert found.search.final.values[1] == pytest.approx(0.4, abs=0.1)
+    assert (found.search.base.u, found.search.final.u) == (0.25, 0.75)
+    assert found.config.held == ("pose_delay.delay",)
+    assert "s late" in found.search.reason
+    on_time = closed(0.0)
+    assert late_pose.told_late(on_time, 0.01) is on_time
