@@ -354,15 +354,23 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
             "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
 
 
+def warned(one: dict[str, Any]) -> bool:
+    """Whether a name comes with the warning that more is left than days differ by (`sysid.loop.report.warnings`)."""
+    return one["verdict"] == "named" and one["excess"][1] > one["excess_limit"]
+
+
 def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
-    """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class."""
+    """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class, without
+    a warning."""
     if not inside:
         return {}
     [*_, alike] = json.loads(CLASSES.read_text())["sensors"].values()
-    wrong = [one["verdict"] == "named" and not any(
+    outside = [one["verdict"] == "named" and not any(
         set(alike["classes"][name]) & set(effect["class"]) for effect in one["effects"]) for name, one in inside]
+    wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
     about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
     return {"left_out_wrong": figure([float(np.mean(wrong))], about),
+            "left_out_outside_class": figure([float(np.mean(outside))], about),
             "left_out_unexplained": figure([float(np.mean([one["verdict"] == "unexplained" for _, one in inside]))],
                                            about)}
 

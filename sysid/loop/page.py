@@ -43,6 +43,7 @@ def verdict(report: dict[str, Any]) -> str:
              paragraph(f"The squared residual exceeds the noise by {missing['excess_before']:.0%} before and by "
                        f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
                        f"{missing['p_value']:.2g}.")]
+    parts += [paragraph(f"Warning: {one}.") for one in report["warnings"]]
     if nulls := missing["null_refits"]:
         parts.append(paragraph(f"Of {nulls['count']} simulated days with nothing missing, fitted in the same way, "
                                f"{nulls['false_alarms']} raise a false alarm (at most {nulls['upper']:.1%} of all, "

@@ -2,6 +2,7 @@
 
     schema, kind      1, "sysid-close-loop"
     verdict, reason   "named", "none" or "unexplained", and why in one sentence
+    warnings          what speaks against taking a name as certain, in sentences
     question          what was asked: against a reference, or of the model family
     effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
                       p_value, equation, evidence
@@ -74,7 +75,7 @@ def make_report(result: Result) -> dict[str, Any]:
     nulls = result.null_refits
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
-        "question": asked, "remark": result.reference.remark,
+        "warnings": warnings(result), "question": asked, "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
                     "held_out": [t.name for t in result.log.held_out]},
@@ -141,6 +142,16 @@ def change(rows: list[dict[str, Any]]) -> dict[str, Any]:
                     "relative": float(difference.mean() / max(pairs[:, 0].mean(), 1e-12)),
                     "worse": int((difference > 0).sum()), "trials": len(pairs)}
     return out
+
+
+def warnings(result: Result) -> list[str]:
+    """What speaks against taking the names as certain."""
+    found, alpha = result.search, result.config.thresholds.alpha
+    if found.verdict != "named" or found.excess[1] <= result.prepared.wander.excess_limit(alpha):
+        return []
+    names = " and ".join(one.hypothesis.effect for one in found.accepted)
+    return [f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has another "
+            "form here than in the catalogue, or is imitated by an effect that the catalogue does not have"]
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
@@ -280,6 +291,7 @@ def base_table(result: Result) -> list[dict[str, Any]]:
 def summary(report: dict[str, Any]) -> str:
     """What a person reads first."""
     lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+    lines += [f"  warning: {one}" for one in report["warnings"]]
     for one in report["effects"]:
         values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
                            for name, p in one["parameters"].items())

@@ -100,15 +100,17 @@ def test_a_left_out_effect_is_judged_on_the_log_that_has_it(tmp_path):
 
 
 @pytest.mark.quick
-def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong():
-    def verdict(*members):
-        return {"verdict": "named" if members else "unexplained",
+def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong_unless_it_is_warned_of():
+    def verdict(*members, left=0.0):
+        return {"verdict": "named" if members else "unexplained", "excess": [9.0, left], "excess_limit": 0.1,
                 "effects": [{"class": list(members)}] if members else []}
 
-    found = contact.of_left_out([("slope", verdict("wind")), ("slope", verdict()),
-                                 ("slope", verdict("dry_friction")), ("wind", verdict("slope", "x"))])
-    assert found["left_out_wrong"]["value"] == 0.25
-    assert found["left_out_unexplained"]["value"] == 0.25
+    found = contact.of_left_out([("slope", verdict("wind", left=0.5)), ("slope", verdict()),
+                                 ("slope", verdict("dry_friction")), ("slope", verdict("yaw_scrub", left=0.5)),
+                                 ("wind", verdict("slope", "x"))])
+    assert found["left_out_wrong"]["value"] == 0.2
+    assert found["left_out_outside_class"]["value"] == 0.4
+    assert found["left_out_unexplained"]["value"] == 0.2
 
 
 @pytest.mark.quick

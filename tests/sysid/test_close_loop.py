@@ -17,7 +17,7 @@ from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.refit import Refit
-from sysid.loop.report import make_report, replay, write_run
+from sysid.loop.report import make_report, replay, warnings, write_run
 from sysid.loop.search import Candidate, Thresholds, _own
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
@@ -101,6 +101,15 @@ def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sl
     weak = replace(result.search, excess=(0.0, 0.0))
     assert checked(weak, often, result.prepared.wander, CONFIG.thresholds).verdict == "none"
     assert not weak.accepted
+
+
+def test_a_name_that_leaves_more_than_days_differ_by_comes_with_a_warning(sloping):
+    limit = sloping.prepared.wander.excess_limit(CONFIG.thresholds.alpha)
+    for left, text in ((0.9 * limit, None), (1.1 * limit, "another form here")):
+        search = replace(sloping.search, excess=(sloping.search.excess[0], left))
+        said = warnings(replace(sloping, search=search))
+        assert not said if text is None else len(said) == 1 and text in said[0]
+    assert not warnings(replace(sloping, search=replace(sloping.search, verdict="none", excess=(1.0, 1.0))))
 
 
 def test_report_and_vehicle_file(sloping, tmp_path):
