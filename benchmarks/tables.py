@@ -57,6 +57,8 @@ HEADLINES = (  # file, figure, factor, what it says
      "of 1,000: balancing a cart-pole from pixels, 100,000 steps (median of 3 seeds)"),
     ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),
     ("course", "cpu_minutes", 1.0, "minutes of training for that (the fit and the installation come on top)"),
+    ("measured", "drive_gain_over_fitted_base", 100.0,
+     "% less held-out position error than the fitted base, by what the loop added (skid-steered robot)"),
     ("measured", "drive_gain_over_ideal_asphalt", 100.0, "% less held-out position error than ideal replay, asphalt"),
     ("measured", "drive_gain_over_ideal_sand", 100.0, "% the same on sand (Warthog robot both)"),
     ("measured", "gain_mrclam_physical", 100.0, "% the same for two Create robots that were not fitted"),

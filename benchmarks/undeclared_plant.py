@@ -279,7 +279,9 @@ def figures(work: Path) -> None:
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
     if ratios:
         found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
-    found["seconds_per_log"] = figure([one["seconds"] for _, one in cases], "s on one core, reference fit apart")
+    seconds = [one["seconds"] for _, one in cases if one["stage"] in ("scaled", "pair")]
+    if seconds:
+        found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
     found.update(of_speed(work))
     sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
              for name, size in power_sizes(work).items()}
