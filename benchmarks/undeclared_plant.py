@@ -274,7 +274,8 @@ def figures(work: Path) -> None:
                   if one["stage"] == "scaled" and one["scale"] == scale]
         found.update(of_singles(inside, f"_{scale:g}x"))
     found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
-    found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"]))
+    found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"],
+                             own_classes(work)))
     found.update(of_parameters([(truth, one) for truth, one in cases if one["stage"] != "left_out"]))
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
     if ratios:
@@ -361,14 +362,25 @@ def warned(one: dict[str, Any]) -> bool:
     return one["verdict"] == "named" and one["excess"][1] > one["excess_limit"]
 
 
-def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
+def own_classes(work: Path) -> dict[str, set[str]]:
+    """Effect -> what its log at four times the size is named as where the catalogue has it, judged here or recorded."""
+    rows = json.loads(RECORDED.read_text()).get("confusion", []) if RECORDED.exists() else []
+    rows += [{"truth": truth, **one, "classes": [e["class"] for e in one["effects"]]}
+             for truth, one in read_cases(work)]
+    return {name: {member for members in row["classes"] for member in members} for row in rows
+            for name in row["truth"] if row["stage"] == "scaled" and row["scale"] == 4.0}
+
+
+def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, set[str]]) -> dict[str, Any]:
     """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class, without
-    a warning."""
+    a warning. Its class is that of the file, and that with which the same log is named by the whole catalogue (`own`).
+    """
     if not inside:
         return {}
     [*_, alike] = json.loads(CLASSES.read_text())["sensors"].values()
     outside = [one["verdict"] == "named" and not any(
-        set(alike["classes"][name]) & set(effect["class"]) for effect in one["effects"]) for name, one in inside]
+        ({*alike["classes"][name]} | own.get(name, set())) & set(effect["class"]) for effect in one["effects"])
+        for name, one in inside]
     wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
     about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
     return {"left_out_wrong": figure([float(np.mean(wrong))], about),

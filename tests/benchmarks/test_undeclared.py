@@ -107,10 +107,17 @@ def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong_unless_it_is_war
 
     found = contact.of_left_out([("slope", verdict("wind", left=0.5)), ("slope", verdict()),
                                  ("slope", verdict("dry_friction")), ("slope", verdict("yaw_scrub", left=0.5)),
-                                 ("wind", verdict("slope", "x"))])
-    assert found["left_out_wrong"]["value"] == 0.2
-    assert found["left_out_outside_class"]["value"] == 0.4
-    assert found["left_out_unexplained"]["value"] == 0.2
+                                 ("wind", verdict("slope", "x")), ("backlash", verdict("jerk_limit"))],
+                                {"backlash": {"backlash", "jerk_limit"}})
+    assert found["left_out_wrong"]["value"] == pytest.approx(1 / 6)  # dry friction for a slope
+    assert found["left_out_outside_class"]["value"] == pytest.approx(2 / 6)
+    assert found["left_out_unexplained"]["value"] == pytest.approx(1 / 6)
+
+
+@pytest.mark.quick
+def test_the_class_of_a_log_is_that_of_its_verdict_at_four_times_the_size(tmp_path):
+    own = contact.own_classes(tmp_path)  # from the recorded verdicts
+    assert own["slope"] == {"slope", "wind"} and "backlash" in own
 
 
 @pytest.mark.quick
