@@ -9,6 +9,7 @@ import pytest
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
 from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
 from sysid.loop.drives import make_drives
+from sysid.loop.features import BIN
 from sysid.loop.next_manoeuvre import (
     FILE,
     LEAST,
@@ -52,7 +53,8 @@ def subject():
     space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
     whitener = Whitener(np.array([0.005, 0.01, 0.01, 0.01, 0.01]), np.zeros((1, 5, 5)), np.eye(5))
     reference = SimpleNamespace(params=params, space=space, u=space.to_unit(space.initial), spread=1e-4 * np.eye(2),
-                                whitener=whitener, factors=np.ones((4, 5)), target_of=lambda drives: drives.target)
+                                whitener=whitener, factors=np.ones((4, 5)), target_of=lambda drives: drives.target,
+                                width=BIN)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
     log = SimpleNamespace(spec=spec, training=(straight_trial(),), name="drives")
     drives = make_drives(plant, full, names, log.training)

@@ -8,6 +8,7 @@ import pytest
 
 from sysid.candidates import make_command
 from sysid.log import OdometryStream, PoseStream, Start, Trial
+from sysid.loop.features import BIN
 from sysid.loop.noise import Whitener
 from sysid.loop.page import wrench as wrench_section
 from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
@@ -41,6 +42,7 @@ def bench():
     space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
     scale = np.array([0.004, 0.008, 0.01, 0.01, 0.01])
     reference = SimpleNamespace(
+        width=BIN,
         params=params, space=space, u=space.to_unit(space.initial), factors=np.ones((4, 5)),
         whitener=Whitener(scale, np.zeros((1, 5, 5)), np.eye(5)), target_of=lambda drives: drives.target)
     trials = tuple(trial_of(name, heading) for heading, name in enumerate(DRIVES))
