@@ -27,6 +27,7 @@ from sysid.log import Log, load_log
 from sysid.loop.report import effects as named_effects
 from sysid.loop.report import make_report, write_run
 from sysid.report import write_report
+from sysid.statistics import upper_rate
 
 RECORDED = RESULTS / "undeclared.json"
 CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
@@ -316,7 +317,7 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
     false = sum(one["verdict"] != "none" for one in nulls)
     return {
         "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
-        "false_alarm_upper": figure([float(stats.beta.ppf(0.95, false + 1, len(nulls) - false))], "share"),
+        "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share"),
         "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)], "-")}
 
 

@@ -56,3 +56,10 @@ def mean_sd(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """Mean and sample standard deviation; nan for the latter where there is one value only."""
     array = np.asarray(values, float)
     return float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else float("nan")
+
+
+def upper_rate(events: int, count: int) -> float:
+    """Upper end of the one-sided 95 % interval of a rate (Clopper and Pearson 1934)."""
+    from scipy import stats
+
+    return float(stats.beta.ppf(0.95, events + 1, count - events)) if events < count else 1.0

@@ -16,15 +16,14 @@ import numpy as np
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit, white_leftover
-from sysid.loop.reference import Reference, alike
+from sysid.loop.reference import alike
 from sysid.loop.refit import Refitter
-from sysid.loop.scan import Scan, best, family, tail
+from sysid.loop.scan import Scan, best, drawn_away, family, tail
 from sysid.loop.search import Search, Thresholds, refitted
 from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress
-
-SPREAD_FREEDOM = 8.0  # of the Student's t that parameters are drawn from: a few days tell the spread
+from sysid.statistics import upper_rate
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,7 @@ class NullRefits:
     @property
     def upper(self) -> float:
         """Upper end of the one-sided 95 % interval of the false-alarm rate."""
-        from scipy import stats
-
-        return float(stats.beta.ppf(0.95, self.alarms + 1, max(len(self.p) - self.alarms, 1)))
+        return upper_rate(self.alarms, len(self.p))
 
 
 def run(
@@ -59,10 +56,12 @@ def run(
     """
     reference, measured = refitter.reference, float((refitter.drives.mask > 0).sum())
     rng = np.random.default_rng((seed, 1))
+    factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
     similar = imitation(evidence, hypotheses)
     p, alarms = np.ones(count), 0
     for n in range(count):
-        one = refitter.aimed(refitter.white_of(_vehicle(reference, rng)) + _noise(refitter, rng))
+        u = np.clip(reference.u + drawn_away(factor, rng), 0.0, 1.0)
+        one = refitter.aimed(refitter.white_of(u) + _noise(refitter, rng))
         base = one.fit((), np.zeros(0))
         around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
         looked = best(Solver(around), hypotheses, wander)
@@ -86,14 +85,6 @@ def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresh
         found.share, found.excess = 0.0, (found.excess[0], found.excess[0])
         found.reason = f"stands out no more than in {nulls.p_of(found.p_value):.1%} of simulated days without anything"
     return found
-
-
-def _vehicle(reference: Reference, rng: np.random.Generator) -> np.ndarray:
-    """Base parameters (P,), in unit coordinates, of a vehicle from the day-to-day spread."""
-    size = len(reference.u)
-    scale = np.sqrt(SPREAD_FREEDOM / rng.chisquare(SPREAD_FREEDOM))
-    factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(size))
-    return np.clip(reference.u + scale * factor @ rng.standard_normal(size), 0.0, 1.0)
 
 
 def _noise(refitter: Refitter, rng: np.random.Generator) -> np.ndarray:

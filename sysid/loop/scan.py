@@ -21,6 +21,7 @@ from sysid.loop.wander import Wander
 
 REACH = 1.6
 """How far beyond a level its columns are trusted, as a factor on the level."""
+SPREAD_FREEDOM = 8  # degrees of freedom that the day-to-day spread rests on
 
 
 @dataclass(frozen=True)
@@ -147,9 +148,7 @@ def null_moments(
     products = evidence.products.sum(0)[:, :size]
     moments = np.zeros((draws, evidence.products.shape[1]))
     for n in range(draws):
-        # Student's t: the spread itself is known from a few days only.
-        scale = np.sqrt(8 / rng.chisquare(8))
-        moments[n] = products @ (scale * factor @ rng.standard_normal(size))
+        moments[n] = products @ drawn_away(factor, rng)
         for group in evidence.groups:
             sign = rng.choice((-1.0, 1.0))
             order = rng.permutation(len(evidence.pool_moments[group[0]]))
@@ -157,6 +156,13 @@ def null_moments(
                 pick = int(order[place % len(order)]) % len(evidence.pool_moments[trial])
                 moments[n] += sign * evidence.pool_moments[trial][pick]
     return moments
+
+
+def drawn_away(factor: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(P,) how far a day's base parameters are from the reference; `factor` (P, P) is the Cholesky factor of their
+    spread. Student's t: the spread itself is known from a few days only."""
+    scale = np.sqrt(SPREAD_FREEDOM / rng.chisquare(SPREAD_FREEDOM))
+    return scale * factor @ rng.standard_normal(len(factor))
 
 
 def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:

@@ -16,7 +16,7 @@ from sysid.fit import Fit
 from sysid.paper import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, main, markdown, select
 from sysid.result import FitResult
 from sysid.rollout import make_batch, predictions, simulate
-from sysid.statistics import EXACT_UP_TO, holm, mean_sd, sign_flip_p, smallest_p
+from sysid.statistics import EXACT_UP_TO, holm, mean_sd, sign_flip_p, smallest_p, upper_rate
 from whill_mjx.manoeuvres import PAPER_MANOEUVRES
 from whill_mjx.parameters import describe, set_values
 from whill_mjx.presets import preset_params
@@ -190,3 +190,10 @@ def test_a_missing_log_ends_with_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["paper", str(tmp_path / "nowhere")])
     with pytest.raises(SystemExit, match="error: .*nowhere: no such folder"):
         paper_module.cli()
+
+
+@pytest.mark.quick
+def test_upper_end_of_a_rate():
+    assert upper_rate(0, 60) == pytest.approx(1 - 0.05 ** (1 / 60))  # none seen: (1 - p)^n = 0.05
+    assert upper_rate(4, 200) < 0.05 < upper_rate(5, 200)
+    assert upper_rate(3, 3) == 1.0
