@@ -1,6 +1,7 @@
-"""The obstacle course: trainings with every seed shown, and the planner that is their ceiling.
+"""The paper's two trainings with every seed shown, and the planner that is the course's ceiling.
 
     python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
+    python -m benchmarks.course run --task corridor --seed 0 --out runs/corridor/0
     python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
     python -m benchmarks.course together --change mirror=false --out runs/ablation/unmirrored
@@ -15,7 +16,7 @@ import dataclasses
 import json
 import statistics
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -24,21 +25,34 @@ from benchmarks.harness import RESULTS, device_name, figure, record
 from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
+from whill_mjx import evaluate as evaluation_command
 from whill_mjx.train import TrainOptions, main, mean_figures
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
+CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
+BLIND: tuple[Literal["blank", "freeze", "replay"], ...] = ("blank", "freeze", "replay")
 
 
 def run(options: argparse.Namespace) -> None:
-    """One training of the main command; notes the device beside its results."""
+    """One training of the main command with its proofs of sight; notes device and settings beside its results."""
     result = main(
         TrainOptions(
-            out=options.out, vehicle=options.vehicle, preset=options.preset, layout=options.layout, seed=options.seed,
-            steps=options.steps,
+            out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
+            seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
+            episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip
-    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed}
+    told = evaluation_command.main(
+        evaluation_command.EvaluateOptions(
+            str(options.out / "policy"), out=options.out / "sight", episodes=options.episodes, layout=options.layout,
+            blind=BLIND, videos=0,
+        )
+    )  # fmt: skip
+    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed,
+            "sight": {kind: told["drivers"][f"policy {kind}"]["success"] for kind in BLIND}}
+    if options.beside:
+        note["together"] = 1 + options.beside
     (options.out / "course.json").write_text(json.dumps({**note, **result}, indent=1) + "\n")
 
 
@@ -101,13 +115,20 @@ def collect(options: argparse.Namespace) -> None:
     """Merge finished runs into course.json and draw their curves."""
     runs = sorted((load_run(path) for path in options.runs), key=lambda one: one["seed"])
     figures: dict[str, Any] = {}
+    corridor = [one for one in runs if is_corridor(one)]
     for preset in ("cpu", "paper"):
         for layout in ("fixed", "randomised"):
-            chosen = [one for one in runs if one["preset"] == preset and one["layout"] == layout]
+            chosen = [one for one in runs if (one["preset"], one["layout"]) == (preset, layout) and one not in corridor]
             if chosen:
                 figures |= cpu_figures(chosen) if preset == "cpu" else paper_figures(chosen, layout)
                 draw(chosen, RESULTS / f"course_{preset}_{layout}.png")
-    record("course", CLAIM, figures)
+    if figures:
+        record("course", CLAIM, figures)
+    if corridor:
+        found = corridor_figures(corridor)
+        record("corridor", CORRIDOR_CLAIM, found)
+        draw(corridor, RESULTS / "corridor.png")
+        figures |= {f"corridor: {name}": entry for name, entry in found.items()}
     for name, entry in figures.items():
         print(f"{name:40s} {entry['value']:.4g} {entry['unit']:8s} {entry['repeats']}")
 
@@ -164,6 +185,36 @@ def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def is_corridor(run: dict[str, Any]) -> bool:
+    """Whether a run was in the corridor."""
+    return "box_x" in run["task"]
+
+
+def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Success and collisions of each seed over unseen randomised episodes, its proofs of sight and wall-clock."""
+    device = runs[0]["device"]
+    alone = [training_s(one) for one in runs if "together" not in one]
+    episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": runs[0]["env_steps"],
+                "updates": runs[0]["updates"]}  # fmt: skip
+    return {
+        "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},
+        "collisions": {**figure([one["policy"]["collision"] for one in runs], "share", device), **episodes},
+        **sight_figures(runs),
+        **({"wallclock_s": figure(alone, "s", device)} if alone else {}),
+    }
+
+
+def sight_figures(runs: list[dict[str, Any]], suffix: str = "") -> dict[str, Any]:
+    """Success of each seed without sight: the best of the three kinds, and each kind."""
+    seeing = [one for one in runs if "sight" in one]
+    if not seeing:
+        return {}
+    device = seeing[0]["device"]
+    kinds = {f"blinded_{kind}_success{suffix}": figure([one["sight"][kind] for one in seeing], "share", device)
+             for kind in BLIND}
+    return {f"blinded_success{suffix}": figure([max(one["sight"].values()) for one in seeing], "share", device), **kinds}
+
+
 def training_s(run: dict[str, Any]) -> float:
     """Seconds of training, compilation and evaluations inside the run included."""
     return run["metrics"][-1]["wall_s"]
@@ -190,6 +241,7 @@ def paper_figures(runs: list[dict[str, Any]], layout: str) -> dict[str, Any]:
         f"return_at_18000_median{suffix}": figure(returns, "-", device),
         f"return_at_18000_worst{suffix}": {**figure(returns, "-", device), "value": min(returns)},
         f"success_at_22000{suffix}": figure([one["policy"]["success"] for one in runs], "share", device),
+        **sight_figures(runs, suffix),
         **({f"wallclock_s{suffix}": figure(alone, "s", device)} if alone else {}),
     }
 
@@ -262,9 +314,15 @@ def parse() -> argparse.Namespace:
     one.add_argument("--out", type=Path, required=True)
     one.add_argument("--seed", type=int, default=0)
     one.add_argument("--preset", default="auto")
+    one.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
     one.add_argument("--layout", default="randomised")
     one.add_argument("--vehicle", type=Path)
     one.add_argument("--steps", type=int)
+    one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
+    one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
+    one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
+    one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
+    one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
     one.set_defaults(call=run)
     side = commands.add_parser("together")
     side.add_argument("--out", type=Path, required=True)
