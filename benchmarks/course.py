@@ -212,7 +212,8 @@ def sight_figures(runs: list[dict[str, Any]], suffix: str = "") -> dict[str, Any
     device = seeing[0]["device"]
     kinds = {f"blinded_{kind}_success{suffix}": figure([one["sight"][kind] for one in seeing], "share", device)
              for kind in BLIND}
-    return {f"blinded_success{suffix}": figure([max(one["sight"].values()) for one in seeing], "share", device), **kinds}
+    best = [max(one["sight"].values()) for one in seeing]
+    return {f"blinded_success{suffix}": figure(best, "share", device), **kinds}
 
 
 def training_s(run: dict[str, Any]) -> float:

@@ -49,8 +49,9 @@ def find_preset(name: str, task: str) -> Preset:
     """Preset by name ("paper", "wallclock", "cpu" or "smoke") for a task; ValueError names the known ones.
 
     "paper" is the reference paper's setting: 16 instances, 22,000 control steps on the obstacle course and 200,000 in
-    the corridor (which have about as many updates). Its updates are few, so it learns faster at first and explores more than DreamerV3's defaults; it also
-    learns from the mirrored world, an average of its parameters drives, and on the course it looks 10 s ahead, not 33.
+    the corridor (which have about as many updates). Its updates are few, so it learns faster at first and explores more
+    than DreamerV3's defaults; it also learns from the mirrored world, an average of its parameters drives, and on the
+    course it looks 10 s ahead, not 33.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step, and
     an end when nearly all held-out episodes succeed. "cpu" is an easier course for 2 cores: forward speeds only, one
     gate, a decision every 0.5 s, a small network on 8x8 patches. "smoke" only shows that everything runs.
