@@ -51,6 +51,8 @@ class Benchmark:
     """The same at multiples of that size."""
     seeds: int = 1
     """Logs of each effect and multiple."""
+    noise: float = 1.0
+    """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
     pairs: int = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
@@ -82,7 +84,7 @@ def main(settings: Benchmark) -> None:
     if settings.classes:
         look_alikes(settings)
     if settings.collect:
-        contact.figures(settings.work / "plant")
+        contact.figures(settings.work / "plant", settings.noise)
 
 
 def shared(settings: Benchmark) -> None:
@@ -119,8 +121,8 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 
 def plant(settings: Benchmark) -> None:
     """Logs of the contact plant."""
-    work, config, part = settings.work / "plant", LoopConfig(), settings.part
-    days = contact.reference_days(work)
+    work, config, part, noise = settings.work / "plant", LoopConfig(), settings.part, settings.noise
+    days = contact.reference_days(work, noise)
     ready: list[Prepared] = []
 
     def judge(listed: Sequence[contact.Job]) -> None:
@@ -130,7 +132,7 @@ def plant(settings: Benchmark) -> None:
             if not ready:
                 ready.append(prepare(reference_of(days, config), days[0].spec, config))
             full = job.stage in ("scaled", "pair") and bool(job.effects) and number % settings.full == 0
-            one = contact.judge(job, ready[0], work, config, full)
+            one = contact.judge(job, ready[0], work, config, full, noise)
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
@@ -138,12 +140,12 @@ def plant(settings: Benchmark) -> None:
     while settings.base and (listed := contact.probe_jobs(work, part)):
         judge(listed)
     if settings.scales:
-        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part))
+        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, noise))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:
-        judge(contact.pair_jobs(work, settings.pairs, part))
-    contact.figures(work)
+        judge(contact.pair_jobs(work, settings.pairs, part, noise))
+    contact.figures(work, noise)
 
 
 def look_alikes(settings: Benchmark) -> None:

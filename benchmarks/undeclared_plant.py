@@ -70,14 +70,14 @@ class Job:
     """Effects that the catalogue does not have."""
 
 
-def reference_days(work: Path) -> list[Log]:
+def reference_days(work: Path, noise: float = 1.0) -> list[Log]:
     """Days of the contact plant with nothing in them: one with three replicates, the others with one."""
     days = []
     for number in range(DAYS):
         path = work / "reference" / f"day_{number + 1}"
         if not path.exists():
             try:
-                make_log(path, seed=11001 + number, replicates=3 if number == 0 else 1)
+                make_log(path, seed=11001 + number, noise=noise, replicates=3 if number == 0 else 1)
             except OSError:
                 if not path.exists():  # else another part was quicker
                     raise
@@ -108,9 +108,9 @@ def probe_jobs(work: Path, part: str) -> list[Job]:
     return out
 
 
-def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str) -> list[Job]:
+def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str, noise: float = 1.0) -> list[Job]:
     """Logs with one effect each, at multiples of that size, as far as the chair still drives with it."""
-    sizes = power_sizes(work)
+    sizes = power_sizes(work, noise)
     return [Job(f"{name}_x{scale:g}_{seed}", {name: capped(name, scale * sizes[name])},
                 30001 + 50 * i + 10 * j + seed, scale, "scaled")
             for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part)
@@ -123,9 +123,9 @@ def left_out_jobs(work: Path, part: str) -> list[Job]:
             for job in scaled_jobs(work, (4.0,), 1, part) if all(EFFECTS[name].known for name in job.effects)]
 
 
-def pair_jobs(work: Path, pairs: int, part: str) -> list[Job]:
+def pair_jobs(work: Path, pairs: int, part: str, noise: float = 1.0) -> list[Job]:
     """Logs with two effects each, at four times that size; the sizes of all effects must be there."""
-    sizes = power_sizes(work)
+    sizes = power_sizes(work, noise)
     known = [name for name in sorted(EFFECTS) if EFFECTS[name].known and name in sizes]
     random, out = np.random.default_rng(7), []
     for n in range(pairs if len(known) > 1 else 0):
@@ -172,15 +172,15 @@ def next_size(base: float, points: Sequence[Point]) -> float | None:
     return size if abs(np.log(size / base)) < np.log(REACH) else None
 
 
-def power_sizes(work: Path) -> dict[str, float]:
+def power_sizes(work: Path, noise: float = 1.0) -> dict[str, float]:
     """Size of each effect that would be noticed with 80 % power; without those for which no such size was found.
 
-    Where no effect was driven to find its size, the sizes are the recorded ones.
+    Where no effect was driven to find its size, the sizes are the recorded ones, times the noise.
     """
     driven = {name: seen_at(work, name) for name in EFFECTS}
     found = {name: size_between(EFFECTS[name].base, points) for name, points in driven.items()}
     if not any(driven.values()) and RECORDED.exists():
-        found = {name: one["value"] for name, one in json.loads(RECORDED.read_text())["sizes"].items()}
+        found = {name: noise * one["value"] for name, one in json.loads(RECORDED.read_text())["sizes"].items()}
     return {name: size for name, size in found.items() if size is not None}
 
 
@@ -197,14 +197,16 @@ def size_between(base: float, points: Sequence[Point]) -> float | None:
     return size * found**-0.5 if FAR[0] < found < FAR[1] else None
 
 
-def judge(job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool) -> dict[str, Any]:
+def judge(
+    job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool, noise: float = 1.0
+) -> dict[str, Any]:
     """Drive a log, close the loop on it, and keep the verdict; `full` also opens its held-out trials."""
     verdict = work / "verdicts" / f"{job.label}.json"
     if verdict.exists():
         return json.loads(verdict.read_text())
     folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
-        make_log(folder, effects=job.effects, seed=job.seed)
+        make_log(folder, effects=job.effects, seed=job.seed, noise=noise)
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = close_loop(load_log(folder), (), config, reference=ready)
@@ -266,7 +268,7 @@ def brief(result: Result) -> dict[str, Any]:
                            for each in found.rounds]}
 
 
-def figures(work: Path) -> None:
+def figures(work: Path, noise: float = 1.0) -> None:
     """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
     cases = list(read_cases(work))
     found = {**of_nulls([one for truth, one in cases if not truth])}
@@ -285,14 +287,18 @@ def figures(work: Path) -> None:
     if seconds:
         found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
     found.update(of_speed(work))
+    if noise != 1.0:
+        found = {f"{name}_noise_{noise:g}": one for name, one in found.items()}
+    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
     sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
-             for name, size in power_sizes(work).items()}
-    rows = json.loads(RECORDED.read_text()).get("confusion", []) if RECORDED.exists() else []
+             for name, size in power_sizes(work).items()} if noise == 1.0 else recorded.get("sizes", {})
     path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
     content = {**json.loads(path.read_text()), "sizes": sizes}
     stages = {one["stage"] for _, one in cases}  # logs of other kinds may have been judged in another folder
-    content["confusion"] = [row for row in rows if row["stage"] not in stages] + [
-        {"truth": truth, "stage": one["stage"], "scale": one["scale"], "verdict": one["verdict"],
+    kept = [row for row in recorded.get("confusion", [])
+            if row["stage"] not in stages or row.get("noise", 1.0) != noise]
+    content["confusion"] = kept + [
+        {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": noise, "verdict": one["verdict"],
          "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
          "explained": one["share"]} for truth, one in cases]
     write_report(path, content)
@@ -369,7 +375,8 @@ def own_classes(work: Path) -> dict[str, set[str]]:
     rows += [{"truth": truth, **one, "classes": [e["class"] for e in one["effects"]]}
              for truth, one in read_cases(work)]
     return {name: {member for members in row["classes"] for member in members} for row in rows
-            for name in row["truth"] if row["stage"] == "scaled" and row["scale"] == 4.0}
+            for name in row["truth"]
+            if (row["stage"], row["scale"], row.get("noise", 1.0)) == ("scaled", 4.0, 1.0)}
 
 
 def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, set[str]]) -> dict[str, Any]:

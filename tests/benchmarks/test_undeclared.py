@@ -83,6 +83,27 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, monkeypatch)
 
 
 @pytest.mark.quick
+def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, monkeypatch):
+    recorded = json.loads(contact.RECORDED.read_text())
+    path = tmp_path / "undeclared.json"
+    path.write_text(json.dumps(recorded))
+    monkeypatch.setattr(contact, "RECORDED", path)
+    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+    verdict = {"stage": "scaled", "scale": 4.0, "verdict": "named", "share": 0.9, "p_value": 0.01, "seconds": 1.0,
+               "effects": [{"name": "slope", "class": ["slope", "wind"], "parameters": {}}]}
+    for folder, content in (("verdicts", verdict), ("truth", {"wind": 0.1})):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "wind_x4_0.json").write_text(json.dumps(content))
+    contact.figures(tmp_path, 2.0)
+    after = json.loads(path.read_text())
+    assert after["figures"]["class_accuracy_4x_noise_2"]["value"] == 1.0
+    assert after["figures"]["class_accuracy_4x"] == recorded["figures"]["class_accuracy_4x"]
+    assert [row for row in after["confusion"] if row.get("noise", 1.0) == 1.0] == recorded["confusion"]
+    assert len(after["confusion"]) == len(recorded["confusion"]) + 1
+    assert contact.power_sizes(tmp_path / "empty", 2.0)["wind"] == 2 * recorded["sizes"]["wind"]["value"]
+
+
+@pytest.mark.quick
 def test_where_no_size_was_searched_for_the_recorded_ones_are_driven(tmp_path):
     recorded = json.loads(contact.RECORDED.read_text())["sizes"]
     assert contact.power_sizes(tmp_path) == {name: one["value"] for name, one in recorded.items()}
