@@ -145,7 +145,7 @@ def env_program(options: Options, count: int, manual: bool = False) -> Program:
     placement = jax.tree.map(lambda leaf: leaf.sharding, state)
     compiled = jax.jit(block, donate_argnums=0, out_shardings=placement).lower(state).compile()
     compile_s = time.perf_counter() - start
-    show_exchange(f"environment, {count} devices{', by hand' if manual else ''}, {compile_s:.1f} s", compiled.as_text())
+    show_exchange(f"environment, {count} devices{', by hand' if manual else ''}, {compile_s:.1f} s", compiled)
     return Program(compiled, state, total * options.steps, compile_s)
 
 
@@ -176,7 +176,7 @@ def learner_program(options: Options, count: int) -> Program:
     start = time.perf_counter()
     iterate = compile_iteration(env, config, state, mesh, updates_alone)
     compile_s = time.perf_counter() - start
-    show_exchange(f"learner, {count} devices, {compile_s:.1f} s", iterate.as_text())
+    show_exchange(f"learner, {count} devices, {compile_s:.1f} s", iterate)
     work = config.replayed_per_update * options.updates
     return Program(lambda one: iterate(one)[0], state, work, compile_s)
 
@@ -232,10 +232,11 @@ def exchange(program: str) -> dict[str, tuple[int, int]]:
     return dict(found)
 
 
-def show_exchange(what: str, program: str | None) -> None:
-    """Print what the devices send each other."""
-    found = [f"{number} {name} ({size / 2**20:.3g} MiB)" for name, (number, size) in exchange(program or "").items()]
-    print(f"compiled {what}: {', '.join(found) or 'nothing exchanged'}", flush=True)
+def show_exchange(what: str, program: Any) -> None:
+    """Print what each device computes, which should not grow with their number, and what they send each other."""
+    found = [f"{count} {name} ({size / 2**20:.3g} MiB)" for name, (count, size) in exchange(program.as_text()).items()]
+    flops = program.cost_analysis()["flops"]  # loops count once here, too
+    print(f"compiled {what}: {flops:.4g} flops per device; {', '.join(found) or 'nothing exchanged'}", flush=True)
 
 
 def rates(programs: dict[Name, Program], blocks: int) -> dict[Name, list[float]]:
