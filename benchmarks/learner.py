@@ -4,83 +4,31 @@
     python -m benchmarks.learner --preset size25m --batch-size 32
     python -m benchmarks.learner --preset size1m --dtype float32 --unroll 1 --per-block 2     # on a CPU
     python -m benchmarks.learner --peer           # and SheepRL's learner in the same run (pip install sheeprl)
+    python -m benchmarks.learner --batches 16 32 64 128 256 --seeds-under-vmap 1 2 4 8 --profile --tries
+        # scaling, where an update's time goes, other ways to compile it (benchmarks.learner_study)
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import subprocess
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks import harness
+from benchmarks import harness, learner_study
+from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE, ROWS, STREAMS, random_replay, time_updates
 from dreamer import agent as agents
-from dreamer import behavior, distributions, image, optim, replay, rssm
-from dreamer.agent import AgentState
+from dreamer import behavior, distributions, image, optim, replay, rssm, world_model
 from dreamer.config import DreamerConfig, preset
-from dreamer.replay import Replay
 from dreamer.rssm import Latent
 
-OBS_SHAPE = (64, 64, 3)
-ACTION_DIM = 2
-STREAMS = 16
-ROWS = 1024
+Figures = dict[str, dict[str, Any]]
 CLAIM = "One DreamerV3 update, all of it on the device, as the training loop runs it."
-
-
-def random_replay(config: DreamerConfig, key: jax.Array) -> Replay:
-    """A full memory of noise, with an episode start every 100 rows."""
-    memory = replay.init(config, STREAMS, OBS_SHAPE, ACTION_DIM)
-    keys = jax.random.split(key, 4)
-    rows = memory.reward.shape[0]
-    starts = jnp.broadcast_to((jnp.arange(rows) % 100 == 0)[:, None], (rows, STREAMS))
-    return dataclasses.replace(
-        memory,
-        obs=jax.random.bits(keys[0], memory.obs.shape, jnp.uint8),
-        reward=jax.random.normal(keys[1], memory.reward.shape),
-        is_first=starts,
-        is_last=jnp.roll(starts, -1, 0),
-        action=jax.random.normal(keys[2], memory.action.shape),
-        stoch=jax.random.randint(keys[3], memory.stoch.shape, 0, config.classes).astype(jnp.uint8),
-        written=jnp.asarray(rows, jnp.int32),
-        online_next=jnp.asarray(rows * STREAMS, jnp.int32),  # no fresh sequences: all draws are uniform
-    )
-
-
-def time_updates(config: DreamerConfig, blocks: int, per_block: int) -> tuple[list[float], list[float], float]:
-    """Seconds per update of each block, seconds of all the host's cores in it, and seconds to compile."""
-
-    def run(agent: AgentState, memory: Replay, key: jax.Array) -> tuple[AgentState, Replay]:
-        def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[AgentState, Replay]:
-            agent, memory = carry
-            sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-            memory, batch, window = replay.sample(config, memory, sample_key)
-            agent, latent, _ = agents.update(config, agent, batch, update_key)
-            return agent, replay.write_back(config, memory, window, latent)
-
-        return jax.lax.fori_loop(0, per_block, one, (agent, memory))
-
-    key = jax.random.PRNGKey(0)
-    agent = jax.jit(lambda k: agents.init_agent(config, OBS_SHAPE, ACTION_DIM, k))(key)
-    memory = jax.jit(lambda k: random_replay(config, k))(key)
-    start = time.perf_counter()
-    compiled = jax.jit(run, donate_argnums=(0, 1)).lower(agent, memory, key).compile()
-    compile_s = time.perf_counter() - start
-    seconds, processor_seconds = [], []
-    for block in range(blocks + 1):
-        start, processor_start = time.perf_counter(), time.process_time()
-        agent, memory = compiled(agent, memory, jax.random.fold_in(key, block))
-        jax.block_until_ready(agent)
-        seconds.append((time.perf_counter() - start) / per_block)
-        processor_seconds.append((time.process_time() - processor_start) / per_block)
-    return seconds[1:], processor_seconds[1:], compile_s
 
 
 def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
@@ -102,6 +50,16 @@ def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
         features = states.features().astype(jnp.float32)
         return jnp.mean(jnp.square(features)) + jnp.mean(distributions.categorical_kl(post, prior))
 
+    def encode(params: Any) -> jax.Array:
+        return jnp.mean(jnp.square(image.encode(config, params["enc"], batch.obs).astype(jnp.float32)))
+
+    def heads(params: Any, features: jax.Array) -> jax.Array:
+        reward = world_model.head(params["reward"], features)
+        alive = world_model.head(params["continue"], features)[..., 0]
+        target = world_model.continue_target(config, batch.is_terminal)
+        loss = distributions.cross_entropy(reward, distributions.twohot(batch.reward, config.bins))
+        return jnp.mean(loss) + jnp.mean(distributions.bernoulli_loss(alive, target))
+
     def images(params: Any, latent: Latent) -> jax.Array:
         encoded = image.encode(config, params["enc"], batch.obs).astype(jnp.float32)
         frames = batch.obs.reshape(-1, *OBS_SHAPE)
@@ -112,7 +70,10 @@ def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
         losses, *_ = behavior.imagination_loss(config, params, agent.slow_value, agent.return_norm, latent, key)
         return sum((jnp.mean(value) for value in losses.values()), jnp.zeros(()))
 
+    features = jnp.zeros((*steps, config.deter + config.stoch_size), config.dtype)
     calls: dict[str, tuple[Callable[..., Any], tuple]] = {
+        "encode": (jax.grad(encode), (agent.params,)),
+        "heads": (jax.grad(heads, argnums=(0, 1)), (agent.params, features)),
         "observe": (jax.grad(observe, argnums=(0, 1)), (agent.params, tokens)),
         "images": (jax.grad(images, argnums=(0, 1)), (agent.params, latent)),
         "behavior": (jax.grad(behave), (agent.params, start)),
@@ -157,8 +118,8 @@ def _bind(function: Callable[..., Any], arguments: tuple) -> Callable[[], Any]:
     return lambda: function(*arguments)
 
 
-def main() -> None:
-    """Measure and write benchmarks/results/learner.json."""
+def arguments() -> argparse.ArgumentParser:
+    """The options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", help="size; size12m on an accelerator and cpu on a CPU unless given")
     parser.add_argument("--batch-size", type=int)
@@ -168,17 +129,18 @@ def main() -> None:
     parser.add_argument("--per-block", type=int, default=10)
     parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
     parser.add_argument("--peer", action="store_true", help="also time the learner of SheepRL at this size")
+    learner_study.add_arguments(parser)
     parser.add_argument("--dry", action="store_true", help="print only")
-    args = parser.parse_args()
+    return parser
+
+
+def base(name: str, config: DreamerConfig, args: argparse.Namespace) -> Figures:
+    """Figures of the update as it is configured."""
     on_cpu = jax.devices()[0].platform == "cpu"
-    name = args.preset or ("cpu" if on_cpu else "size12m")
-    given = {"batch_size": args.batch_size, "scan_unroll": args.unroll, "compute_dtype": args.dtype,
-             "replay_capacity": STREAMS * ROWS}
-    config = preset(name, **{field: value for field, value in given.items() if value is not None})
     seconds, processor_seconds, compile_s = time_updates(config, args.blocks, args.per_block)
     rates = [1.0 / s for s in seconds]
     replayed = [config.replayed_per_update * rate for rate in rates]
-    label = name.removeprefix("size") + (f"_batch{args.batch_size}" if args.batch_size else "")
+    label = learner_study.label_of(name, args.batch_size)
     figures = {f"compile_s_{f'cpu_{label}' if on_cpu and name != 'cpu' else label}": harness.figure([compile_s], "s")}
     if on_cpu:
         cores = [config.replayed_per_update / s for s in processor_seconds]
@@ -188,16 +150,45 @@ def main() -> None:
     else:
         figures[f"updates_per_s_{label}"] = harness.figure(rates, "1/s")
         figures[f"replayed_steps_per_s_{label}"] = harness.figure(replayed, "1/s")
-    for part, call in (parts(config) if args.parts else {}).items():
-        times = [1e3 * s for s in harness.time_calls(call, repeats=args.per_block, warm_up=2)]
-        figures[f"{part}_ms_{label}"] = harness.figure(times, "ms")
-    figures[f"replay_bytes_per_step_{label}"] = harness.figure([replay_bytes(config)], "B")
+    return figures | {f"replay_bytes_per_step_{label}": harness.figure([replay_bytes(config)], "B")}
+
+
+def time_parts(label: str, config: DreamerConfig, repeats: int) -> Iterator[Figures]:
+    """Figures of `parts`, one after the other."""
+    for part, call in parts(config).items():
+        times = [1e3 * s for s in harness.time_calls(call, repeats=repeats, warm_up=2)]
+        yield {f"{part}_ms_{label}": harness.figure(times, "ms")}
+
+
+def main() -> None:
+    """Measure, and write benchmarks/results/learner.json after every part."""
+    args = arguments().parse_args()
+    on_cpu = jax.devices()[0].platform == "cpu"
+    name = args.preset or ("cpu" if on_cpu else "size12m")
+    given = {"batch_size": args.batch_size, "scan_unroll": args.unroll, "compute_dtype": args.dtype,
+             "replay_capacity": STREAMS * ROWS}
+    config = preset(name, **{field: value for field, value in given.items() if value is not None})
+    label = learner_study.label_of(name, args.batch_size)
+
+    known: Figures = {}
+
+    def keep(figures: Figures) -> None:
+        known.update(figures)
+        for key, value in figures.items():
+            print(f"{key}: {value['value']:.4g} {value['unit']}", flush=True)
+        if figures and not args.dry:
+            harness.record("learner", CLAIM, figures)
+
+    if not args.skip_base:
+        keep(base(name, config, args))
+    if args.parts or args.profile:
+        for figures in time_parts(label, config, args.per_block):
+            keep(figures)
+    learner_study.run(name, config, args, keep)
     if args.peer:
-        figures |= peer(name.removeprefix("size").upper(), args.batch_size, args.blocks, args.per_block)
-    for key, value in figures.items():
-        print(f"{key}: {value['value']:.4g} {value['unit']}", flush=True)
-    if not args.dry:
-        harness.record("learner", CLAIM, figures)
+        keep(peer(name.removeprefix("size").upper(), args.batch_size, args.blocks, args.per_block))
+    if args.json:
+        print(json.dumps(known))
 
 
 if __name__ == "__main__":
