@@ -235,7 +235,7 @@ def exchange(program: str) -> dict[str, tuple[int, int]]:
 def show_exchange(what: str, program: Any) -> None:
     """Print what each device computes, which should not grow with their number, and what they send each other."""
     found = [f"{count} {name} ({size / 2**20:.3g} MiB)" for name, (count, size) in exchange(program.as_text()).items()]
-    flops = program.cost_analysis()["flops"]  # loops count once here, too
+    flops = (program.cost_analysis() or {}).get("flops", float("nan"))  # loops count once here, too
     print(f"compiled {what}: {flops:.4g} flops per device; {', '.join(found) or 'nothing exchanged'}", flush=True)
 
 
