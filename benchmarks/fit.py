@@ -1,6 +1,9 @@
 """How well vehicles are identified: planted truth, the shared plant logs, and two published measured sets.
 
-    python -m benchmarks.fit --shared ../shared --parts planted plant chair contact speed starts drive mrclam
+    python -m benchmarks.fit --shared ../shared --parts planted plant chair contact speed drive mrclam
+
+    python -m benchmarks.fit --parts coverage starts tpe searches --part 3/16 --work runs/fit  # one of 16 processes
+    python -m benchmarks.fit --parts coverage starts tpe searches --collect --work runs/fit    # figures of what is done
 
 Writes benchmarks/results/fit.json and, for drive and mrclam, measured.json. A "gain" is the share of
 the held-out mean position RMSE (or yaw RMSE) of the ideal kinematic replay that the fitted vehicle removes; every
@@ -16,13 +19,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
 
-from benchmarks.harness import figure, record
-from sysid.fit import Fit, FitConfig, fit_log, make_objective, predict
+from benchmarks import fit_coverage, fit_searches
+from benchmarks.fit_jobs import labels_of, read_results, run_jobs, share_compilations, write_result
+from benchmarks.harness import device_name, figure, record
+from sysid.fit import Fit, FitConfig, fit_log, make_objective, make_problem, predict
 from sysid.log import Log, Trial, load_log
 from sysid.measured import load_drive, load_mrclam, split
 from sysid.report import error_rows, summaries
+from sysid.searches import Judge
 
 CLAIM = "How near a fit comes to the noise floor of its data"
 DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
@@ -36,8 +43,29 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/plant and data/measured."""
-    parts: tuple[Literal["planted", "plant", "chair", "contact", "speed", "starts", "tpe", "drive", "mrclam"], ...] = (
+    parts: tuple[Literal["planted", "plant", "chair", "contact", "speed", "many_starts", "starts", "coverage", "tpe",
+                         "searches", "drive", "mrclam"], ...] = (
         "planted", "plant", "chair", "contact", "drive", "mrclam")
+    part: str = "1/1"
+    """I/N: of starts, coverage, tpe and searches, every N-th job, where several processes share them."""
+    work: Path = Path("runs/fit")
+    """Folder for the results of those jobs; what is there is not done again."""
+    collect: bool = False
+    """Do no job, write the figures of those that are done."""
+    logs: int = 200
+    """Synthetic logs of the coverage."""
+    plant_logs: int = 50
+    """Logs of the contact plant of the coverage."""
+    search_log: str = "plant"
+    """Log of starts, tpe and searches: plant (the shared plain chair), planted, or a folder."""
+    search_trials: int = 18
+    """Training trials of it."""
+    search_seeds: int = 10
+    """Runs of each search."""
+    tpe_trials: int = 500
+    """Parameter sets of a search with TPE."""
+    methods: tuple[str, ...] = ("features", "both", "tpe", "cmaes")
+    """Searches that are compared."""
     terrains: tuple[Literal["asphalt", "sand", "pooled"], ...] = ("asphalt", "sand", "pooled")
     """Fits of the DRIVE runs."""
     windows: int = 100
@@ -247,35 +275,109 @@ def compile_seconds(fit: Fit, log: Log) -> float:
     return spent[0] - spent[1]
 
 
-def starts(settings: Benchmark) -> None:
-    """How many of 32 random starts in features end at the same cost."""
-    from sysid import starts as feature_starts
-
-    log = load_log(settings.shared / "data" / "plant" / "plain")
-    fit = fit_log(log, FitConfig(iterations=settings.iterations, starts=32))
-    assert fit.coarse is not None
-    costs = fit.coarse.start_costs
-    figures = {"starts_agreeing_of_32": figure([float(feature_starts.agreeing(costs))], "count"),
-               "starts_within_10_percent_of_32": figure([float((costs < 1.1 * costs.min()).sum())], "count"),
-               "seconds_32_starts": figure([fit.seconds], "s")}
+def many_starts(settings: Benchmark) -> None:
+    """Seconds of 32 starts at once, compilation apart: gpu_seconds on a GPU."""
+    log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
+    figures = fit_searches.many_starts(log, fit_searches.STARTS, settings.iterations, settings.repeats)
     record("fit", CLAIM, figures)
     show(figures)
-    print(np.round(costs, 3))
+
+
+def coverage(settings: Benchmark) -> None:
+    """Coverage of the 90 % intervals on logs with known values."""
+    folder = settings.work / "coverage"
+    labels = [f"{kind}_{n:03d}" for kind, count in (("synthetic", settings.logs), ("plant", settings.plant_logs))
+              for n in range(count)]
+    if not settings.collect:
+        share_compilations(settings.work / "compiled")
+        run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(label, settings.iterations))
+        return
+    for kind, prefix in (("synthetic", ""), ("plant", "plant_")):
+        results = read_results(folder, f"{kind}_*")
+        if results:
+            figures = fit_coverage.summarise(results, prefix)
+            record("fit", CLAIM, figures)
+            show(figures)
+
+
+def starts(settings: Benchmark) -> None:
+    """How many of 32 starts of the default search end at the same optimum."""
+    name = Path(settings.search_log).name
+    folder = settings.work / f"starts_{name}"
+    if settings.collect:
+        results = read_results(folder)
+        if results:
+            figures = fit_searches.summarise_starts(results, "" if name == "plant" else f"{name}_")
+            record("fit", CLAIM, figures)
+            show(figures)
+        return
+    share_compilations(settings.work / "compiled")
+    log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
+    problem = make_problem(log, FitConfig())
+    labels = [f"start_{n:02d}" for n in range(fit_searches.STARTS)]
+    run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_searches.start_job(
+        problem, log.spec.track, int(label[-2:]), settings.iterations))
 
 
 def tpe500(settings: Benchmark) -> None:
-    """Seconds of 500 evaluations of TPE on the plant's plain chair, compilation included."""
-    from sysid import tpe
-    from sysid.objective import estimate_noise
+    """TPE in batches, timed, and its J against that of TPE asked one by one (on the processor: one at a time)."""
+    platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    folder = settings.work / f"tpe_{Path(settings.search_log).name}"
+    if settings.collect:
+        sequential = read_results(folder, "sequential_*")
+        for platform in ("cpu", "gpu"):
+            batched = read_results(folder, f"{platform}_*")
+            if not batched:
+                continue
+            figures = fit_searches.summarise_tpe(batched, sequential, platform)
+            for one in figures.values():
+                one["device"] = batched[0]["device"]
+            record("fit", CLAIM, figures)
+            show(figures)
+        return
+    log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
+    problem = make_problem(log, FitConfig())
+    seeds = range(settings.search_seeds)
+    groups = [list(seeds)[i : i + fit_searches.LOCKSTEP] for i in range(0, len(seeds), fit_searches.LOCKSTEP)]
+    labels = [f"{platform}_{seed:02d}" for seed in seeds]
+    # On an accelerator only what it is to be timed with is run: one by one, the processor is no slower.
+    labels += [f"group_{k}" for k in range(len(groups))] if platform == "cpu" else []
 
-    log = load_log(settings.shared / "data" / "plant" / "plain")
-    fit = fit_log(log, FitConfig(method="lm", iterations=1))
-    objective = make_objective(fit.plant, fit.initial_params, fit.space, log.training, estimate_noise(log.training))
-    began = time.perf_counter()
-    tpe.fit(objective, fit.space, evaluations=500)
-    figures = {"tpe500_cpu_seconds": figure([time.perf_counter() - began], "s")}
-    record("fit", CLAIM, figures)
-    show(figures)
+    def job(label: str) -> dict[str, Any]:
+        if label.startswith(platform):
+            found = fit_searches.tpe_batched(problem, settings.tpe_trials, int(label[-2:]))
+            return {**found, "device": device_name()}
+        group = groups[int(label.removeprefix("group_"))]
+        for seed, one in zip(group, fit_searches.tpe_sequential(problem, settings.tpe_trials, group), strict=True):
+            write_result(folder / f"sequential_{seed:02d}.json", one)
+        return {"seeds": group}
+
+    run_jobs(folder, labels_of(settings.part, labels), job)
+
+
+def searches(settings: Benchmark) -> None:
+    """Error against simulator evaluations and seconds of each search, and their picture."""
+    folder = settings.work / f"searches_{Path(settings.search_log).name}"
+    log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
+    if settings.collect:
+        results = read_results(folder / "jobs")
+        if results:
+            figures = fit_searches.write_curves(folder, log, results)
+            record("fit", CLAIM, figures)
+            show(figures)
+            print(f"wrote {folder / 'searches.png'}")
+        return
+    share_compilations(settings.work / "compiled")
+    problem = make_problem(log, FitConfig())
+    judge = Judge(problem, log)
+    labels = [f"{method}_{seed:02d}" for seed in range(settings.search_seeds) for method in settings.methods]
+
+    def job(label: str) -> dict[str, Any]:
+        method, _, seed = label.partition("_")
+        return fit_searches.curve_job(problem, judge, log.spec.track, method, int(seed), settings.tpe_trials,
+                                      settings.iterations)
+
+    run_jobs(folder / "jobs", labels_of(settings.part, labels), job)
 
 
 def show(figures: dict[str, dict[str, Any]]) -> None:
@@ -290,10 +392,12 @@ def show_parameters(fit: Fit) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"planted": planted, "plant": plant, "chair": chair, "contact": contact, "speed": speed, "starts": starts,
-             "tpe": tpe500, "drive": drive, "mrclam": mrclam}
+    parts = {"planted": planted, "plant": plant, "chair": chair, "contact": contact, "speed": speed,
+             "many_starts": many_starts, "starts": starts, "coverage": coverage, "tpe": tpe500, "searches": searches,
+             "drive": drive, "mrclam": mrclam}
     for name in settings.parts:
-        needs = {**dict.fromkeys(("plant", "speed", "starts", "tpe"), "plant"),
+        searched = ("many_starts", "starts", "tpe", "searches") if settings.search_log == "plant" else ()
+        needs = {**dict.fromkeys(("plant", "speed", *searched), "plant"),
                  "drive": "measured/drive_norlab", "mrclam": "measured/mrclam"}
         folder = settings.shared / "data" / needs.get(name, "")
         if name in needs and not folder.is_dir():

@@ -1,6 +1,6 @@
 """Compares the searches of a fit: error against simulator evaluations and against time.
 
-    python -m sysid.searches DATASET --methods features lm tpe cmaes --seeds 0 1 2 --out RUN
+    python -m sysid.searches DATASET --methods features lm both tpe cmaes --seeds 0 1 2 --out RUN
 
 writes RUN/searches.json, RUN/searches.png and the page RUN/searches.html. All searches minimise the same weighted least
 squares of the training trials (`features` begins with motion in short bins). Every replay that a search asks for is
@@ -36,7 +36,7 @@ from sysid.rollout import Simulated, predictions
 from sysid.studies import BATCH
 
 KIND = "sysid-searches"
-METHODS = ("features", "lm", "tpe", "cmaes")
+METHODS = ("features", "lm", "both", "tpe", "cmaes")
 NEAR = 0.05
 """A search has arrived when its cost is within this share of the best one that any of them found."""
 
@@ -111,6 +111,10 @@ def trace(
     if method in ("tpe", "cmaes"):
         tpe.fit(watched, space, evaluations=evaluations, seed=seed, cost="weighted", method=method, progress=progress)
     else:
+        if method == "both":  # as a fit does it: from the initial values, and from the best of a short global search
+            short = min(evaluations, FitConfig().trials)
+            scan = tpe.fit(watched, space, evaluations=short, seed=seed, cost="weighted", best=1, progress=progress)
+            points = np.concatenate([points[:1], scan.starts])
         if method == "features":
             points = starts.fit(watched, points, track, iterations, progress).u[None]
         # As a fit does it, delays included; squares for all, so that the costs are of one kind.
@@ -176,7 +180,7 @@ class Arguments(FitConfig):
     out: Path = Path("runs/searches")
     """Folder for searches.json, .png and .html."""
     methods: tuple[str, ...] = METHODS
-    """Searches to compare: features, lm, tpe, cmaes."""
+    """Searches to compare: features, lm, both (TPE, then lm), tpe, cmaes."""
     seeds: tuple[int, ...] = (0,)
     """One run of each search for each."""
     trials: int = 256

@@ -1,0 +1,138 @@
+"""Coverage of the fit's 90 % intervals: logs of vehicles with known parameters, each fitted from the preset's values.
+
+Synthetic logs are driven by the model that is fitted, with values drawn around the preset's; logs of the contact plant
+by another physics, of which the values that both have in common are known. Each log has four replicates of a few short
+manoeuvres (10 s, 11 s); the search and the intervals are those of `sysid.fit` without options.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from benchmarks.harness import figure
+from sysid.fit import FitConfig, fit_log
+from sysid.log import Log, load_log
+from sysid.space import Space, make_space
+from sysid.synthetic import write_dataset
+from whill_mjx.parameters import get_values, set_values
+from whill_mjx.presets import preset_params
+from whill_mjx.specs import WHILL_CR, VehicleSpec
+
+MANOEUVRES = ("straight", "turn", "circle", "s_curve")
+PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")
+PLANT_LENGTH = 11.0  # s that are driven of each of them
+REPLICATES = 4
+"""With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
+SPREAD = 0.15  # of the logarithm of a value from log to log
+SHIFT = 0.02  # of the range, where a value may be zero or negative
+TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted
+
+
+def draw_truth(space: Space, random: np.random.Generator) -> np.ndarray:
+    """Values (P,) around the initial ones, off the bounds."""
+    signed = (space.low < 0) | (space.initial == 0)
+    scaled = space.initial * np.exp(SPREAD * random.standard_normal(space.size))
+    moved = space.initial + SHIFT * (space.high - space.low) * random.standard_normal(space.size)
+    return space.to_values(np.clip(space.to_unit(np.where(signed, moved, scaled)), 1e-3, 0.97))
+
+
+def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
+    """A log of the physical model and its values."""
+    start = preset_params(WHILL_CR, "physical")
+    space = make_space(start, WHILL_CR)
+    values = draw_truth(space, np.random.default_rng([seed, 90]))
+    truth = set_values(start, space.names, jnp.asarray(values))
+    path = write_dataset(folder / "log", WHILL_CR, truth, manoeuvres=MANOEUVRES, held_out=(), replicates=REPLICATES,
+                         seed=seed)
+    return load_log(path), dict(zip(space.names, np.asarray(get_values(truth, space.names), float).tolist(),
+                                    strict=True))
+
+
+def plant_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
+    """A log of a day of the contact plant, and the values of the physical model that are known."""
+    from benchmarks.plant.chair import Chair
+    from benchmarks.plant.commands import nine
+    from benchmarks.plant.make import make_log
+
+    tables = {name: table[table[:, 0] < PLANT_LENGTH] for name, table in nine(seed).items() if name in PLANT_MANOEUVRES}
+    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES)
+    log = load_log(folder / "log")
+    log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
+    return log, plant_values(Chair().on_day(np.random.default_rng([seed, 1])), log.spec)
+
+
+def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
+    """The values of the physical model that a chair of the contact plant has.
+
+    Speeds and poses tell forces only per inertia: the model's mass and wheel inertia are nominal, so that its torques
+    are the chair's times the ratio of the inertias that a straight drive moves, and its yaw inertia is the one with
+    which a turn about the driven axle needs the chair's torque times that ratio.
+    """
+    from benchmarks.plant.chair import build
+
+    model = build(chair)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = model.body_mass[1:]
+    middle = (mass[:, None] * data.xipos[1:]).sum(0) / mass.sum() - data.xpos[model.body("chassis").id]
+    apart = data.xipos[1:, :2] - data.xpos[model.body("chassis").id, :2] - middle[:2]
+    upright = np.array([matrix.reshape(3, 3)[2] ** 2 @ inertia
+                        for matrix, inertia in zip(data.ximat[1:], model.body_inertia[1:], strict=True)])
+    yaw = float(upright.sum() + (mass * np.square(apart).sum(1)).sum())
+    wheel = model.body("wheel_left").id
+    spin = float(model.body_inertia[wheel].max() + chair.armature) / np.mean(chair.radius) ** 2  # [kg] of one wheel
+    nominal = spec.wheel_inertia / spec.wheel_radius**2
+    ratio = (spec.mass + 2 * nominal) / (mass.sum() + 2 * spin)
+    turning = yaw + mass.sum() * middle[0] ** 2 + spin * chair.track**2 / 2
+    inertia = ratio * turning - spec.mass * middle[0] ** 2 - nominal * spec.track**2 / 2
+    return {"torque_drive.kp": chair.kp * ratio, "torque_drive.ki": chair.ki * ratio,
+            "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": inertia,
+            "body.com_x": spec.rear_x + float(middle[0]), "body.com_y": float(middle[1]),
+            "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
+
+
+def job(label: str, iterations: int) -> dict[str, Any]:
+    """Fit one log, `synthetic_NNN` or `plant_NNN`, and note each known value with its estimate."""
+    kind, _, number = label.partition("_")
+    with tempfile.TemporaryDirectory() as folder:
+        log, truth = (plant_log if kind == "plant" else synthetic_log)(Path(folder), 50000 + int(number))
+    fit = fit_log(log, FitConfig(iterations=iterations))
+    rows = {one.name: {"truth": truth[one.name], "value": one.value, "low": one.low, "high": one.high,
+                       "identifiable": one.identifiable} for one in fit.uncertainty.estimates if one.name in truth}
+    return {"parameters": rows, "cost": fit.cost, "seconds": fit.seconds}
+
+
+def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, dict[str, Any]]:
+    """Figures of all logs of one kind: coverage and median half-width per parameter, lowest and highest coverage.
+
+    An interval counts where the log tells the parameter: elsewhere it is the parameter's range, which always holds it.
+    """
+    figures, covered = {}, []
+    names = list(dict.fromkeys(name for one in results for name in one["parameters"]))
+    for name in names:
+        rows = [one["parameters"][name] for one in results if name in one["parameters"]]
+        told = [row for row in rows if row["identifiable"]]
+        figures[f"{prefix}identifiable_{name}"] = figure([len(told) / len(rows)], "share")
+        if not told:
+            continue
+        inside = float(np.mean([row["low"] <= row["truth"] <= row["high"] for row in told]))
+        figures[f"{prefix}coverage_90_{name}"] = figure([inside], "share")
+        figures[f"{prefix}half_width_90_{name}"] = figure(
+            [float(np.median([(row["high"] - row["low"]) / 2 for row in told]))], "of the parameter")
+        figures[f"{prefix}bias_{name}"] = figure(
+            [float(np.median([row["value"] - row["truth"] for row in told]))], "of the parameter")
+        if len(told) >= TOLD * len(rows):
+            covered.append(inside)
+    figures[f"{prefix}coverage_90_min"] = figure([min(covered)], "share")
+    figures[f"{prefix}coverage_90_max"] = figure([max(covered)], "share")
+    figures[f"{prefix}coverage_logs"] = figure([float(len(results))], "count")
+    figures[f"{prefix}seconds_coverage_log"] = figure([float(one["seconds"]) for one in results], "s")
+    return figures

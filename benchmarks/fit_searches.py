@@ -1,0 +1,167 @@
+"""Searches of the fit, split into jobs: starts that agree, TPE in batches against one by one, and the curves of all.
+
+Every job finds its log by itself: `planted` is driven by the model with the preset's values, other logs are folders.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.harness import figure
+from sysid import gradient, starts, tpe
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, gradient_search, make_problem
+from sysid.log import Log, load_log
+from sysid.objective import HUGE
+from sysid.searches import Judge, Trace, arrivals, trace, write
+from sysid.studies import BATCH
+
+STARTS = 32
+SAME = 0.01
+"""Starts end at the same optimum where their costs are within this share of the best one's."""
+LOCKSTEP = 4
+"""Searches of one candidate at a time that share a replay: as many sets as it has rows on a processor."""
+CLOSE = 0.05  # by which J of the search in batches may lie above that of the search one by one
+
+
+def short_log(log: Log, count: int) -> Log:
+    """The log with its first `count` training trials; held-out ones are kept."""
+    kept = {trial.name for trial in log.training[:count]}
+    return log.select(lambda trial: trial.held_out or trial.name in kept)
+
+
+def find_log(name: str, shared: Path, trials: int = 18) -> Log:
+    """`planted`, `plant` (the shared plain chair) or a folder; of the latter two at most `trials` are fitted."""
+    if name != "planted":
+        return short_log(load_log(shared / "data" / "plant" / "plain" if name == "plant" else Path(name)), trials)
+    from sysid.synthetic import write_dataset
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    with tempfile.TemporaryDirectory() as folder:
+        return load_log(write_dataset(Path(folder) / "planted", WHILL_CR, preset_params(WHILL_CR, "physical")))
+
+
+def start_job(problem: Problem, track: float, index: int, iterations: int, seed: int = 0) -> dict[str, Any]:
+    """The default search from one of STARTS starts: features, then poses with the delays profiled.
+
+    Start 0 has the initial values; the others are drawn over the whole range of every parameter.
+    """
+    point = gradient.random_starts(problem.space, STARTS, seed)[index : index + 1]
+    began = time.perf_counter()
+    coarse = starts.fit(problem.objective, point, track, FEATURE_ITERATIONS)
+    search, _, _ = gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
+    return {"cost": search.cost, "coarse_cost": coarse.cost, "u": search.u.tolist(), "start": point[0].tolist(),
+            "names": list(problem.space.names), "evaluations": coarse.evaluations + search.evaluations,
+            "seconds": time.perf_counter() - began}
+
+
+def summarise_starts(results: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, dict[str, Any]]:
+    """How many starts end within SAME of the best cost, and within ten times that."""
+    costs = np.array([one["cost"] for one in results])
+    best = costs.min()
+    return {f"{prefix}starts_agreeing_of_32": figure([float((costs <= best * (1 + SAME)).sum())], "count"),
+            f"{prefix}starts_within_10_percent_of_32": figure([float((costs <= best * (1 + 10 * SAME)).sum())],
+                                                              "count"),
+            f"{prefix}starts_counted": figure([float(len(costs))], "count"),
+            f"{prefix}seconds_of_a_start": figure([float(one["seconds"]) for one in results], "s")}
+
+
+def tpe_batched(problem: Problem, evaluations: int, seed: int) -> dict[str, Any]:
+    """J and seconds of TPE in batches; the replay is compiled before the clock starts."""
+    objective, space = problem.objective, problem.space
+    objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH, 1)))
+    began = time.perf_counter()
+    found = tpe.fit(objective, space, evaluations=evaluations, seed=seed, cost="paper")
+    return {"cost": found.cost, "seconds": time.perf_counter() - began}
+
+
+def tpe_sequential(problem: Problem, evaluations: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """J of Optuna's TPE asked one candidate at a time, as the paper's search was; all seeds advance together."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    objective, space = problem.objective, problem.space
+    distributions: Any = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in space.names}
+    studies = [optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed)) for seed in seeds]
+    initial = dict(zip(space.names, space.to_unit(space.initial).tolist(), strict=True))
+    for study in studies:
+        study.enqueue_trial(initial)
+    for _ in range(evaluations):
+        asked = [study.ask(distributions) for study in studies]
+        u = np.array([[trial.params[name] for name in space.names] for trial in asked])
+        for study, trial, cost in zip(studies, asked, objective.paper_cost(u), strict=True):
+            study.tell(trial, float(min(cost, HUGE)))
+    return [{"cost": float(study.best_value)} for study in studies]
+
+
+def summarise_tpe(
+    batched: Sequence[Mapping[str, Any]], sequential: Sequence[Mapping[str, Any]], platform: str
+) -> dict[str, dict[str, Any]]:
+    """Seconds of the searches in batches on a platform (cpu, gpu), and their J over that of the others."""
+    figures = {}
+    if batched:
+        figures[f"tpe500_{platform}_seconds"] = figure([float(one["seconds"]) for one in batched], "s")
+        figures["tpe500_j"] = figure([float(one["cost"]) for one in batched], "m, sum over trials")
+    if sequential:
+        figures["tpe500_j_sequential"] = figure([float(one["cost"]) for one in sequential], "m, sum over trials")
+    if batched and sequential:
+        ratio = figures["tpe500_j"]["value"] / figures["tpe500_j_sequential"]["value"]
+        figures["tpe500_j_over_sequential"] = figure([ratio], "-")
+        figures["tpe500_within_5_percent"] = figure([float(ratio <= 1 + CLOSE)], "1 is yes")
+    return figures
+
+
+def many_starts(log: Log, count: int, iterations: int, repeats: int) -> dict[str, dict[str, Any]]:
+    """Seconds of the default search from `count` starts at once, the compilation apart."""
+    problem = make_problem(log, FitConfig())
+    points = gradient.random_starts(problem.space, count, 0)
+
+    def search() -> float:
+        began = time.perf_counter()
+        coarse = starts.fit(problem.objective, points, log.spec.track, FEATURE_ITERATIONS)
+        gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
+        return time.perf_counter() - began
+
+    first = search()
+    seconds = [search() for _ in range(repeats)]
+    platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    stem = "gpu_seconds" if platform == "gpu" else "cpu_seconds_32_starts"
+    return {stem: figure(seconds, "s"), f"{stem}_compile": figure([first - float(np.median(seconds))], "s")}
+
+
+def curve_job(
+    problem: Problem, judge: Judge, track: float, method: str, seed: int, evaluations: int, iterations: int
+) -> dict[str, Any]:
+    """One search of `sysid.searches` and its best point so far."""
+    one = trace(problem, judge, track, method, seed, evaluations=evaluations, iterations=iterations)
+    return {"trace": {name: value.tolist() if isinstance(value, np.ndarray) else value
+                      for name, value in asdict(one).items()}, "names": list(problem.space.names)}
+
+
+def write_curves(out: Path, log: Log, results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Page, picture and table of all curves; figures: final cost, and effort to come near the best of all."""
+    traces = [_trace(one["trace"]) for one in results]
+    traces.sort(key=lambda one: (one.method, one.seed))
+    write(out, log, traces, results[0]["names"])
+    figures = {}
+    for row in arrivals(traces):
+        stem = f"search_{row['method']}"
+        figures[f"{stem}_arrived"] = figure([row["arrived"] / row["runs"]], "share")
+        figures[f"{stem}_cost"] = figure([row["cost"]], "mean square, noise scales")
+        for name, unit in (("evaluations", "count"), ("seconds", "s"), ("held_out", "m")):
+            if row[name] is not None:
+                figures[f"{stem}_{name}"] = figure([row[name]], unit)
+    return figures
+
+
+def _trace(kept: dict[str, Any]) -> Trace:
+    values: dict[str, Any] = {name: np.array(one) if isinstance(one, list) else one for name, one in kept.items()}
+    return Trace(**values)

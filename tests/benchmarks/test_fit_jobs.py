@@ -1,0 +1,100 @@
+"""The fit's benchmark split over processes: which jobs are whose, what is kept, and what is counted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import fit_coverage, fit_searches
+from benchmarks.fit_jobs import labels_of, read_results, run_jobs
+from benchmarks.plant.chair import Chair
+from sysid.space import make_space
+from whill_mjx.presets import preset_params
+from whill_mjx.specs import WHILL_CR
+
+
+@pytest.mark.quick
+def test_parts_share_all_jobs_and_none_twice():
+    labels = [f"log_{n}" for n in range(10)]
+    parts = [labels_of(f"{i}/4", labels) for i in range(1, 5)]
+    assert sorted(sum(parts, [])) == labels
+    for wrong in ("0/4", "5/4", "3", "a/b"):
+        with pytest.raises(ValueError, match="I/N"):
+            labels_of(wrong, labels)
+
+
+@pytest.mark.quick
+def test_what_is_done_is_not_done_again_and_what_failed_is_left_out(tmp_path):
+    calls = []
+
+    def job(label):
+        calls.append(label)
+        if label == "bad":
+            raise ValueError("diverged")
+        return {"cost": len(label)}
+
+    assert run_jobs(tmp_path, ["a", "bad"], job) == 2
+    assert run_jobs(tmp_path, ["a", "bad", "abc"], job) == 1
+    assert calls == ["a", "bad", "abc"]
+    assert [one["cost"] for one in read_results(tmp_path)] == [1, 3]
+    assert "diverged" in json.loads((tmp_path / "bad.json").read_text())["error"]
+
+
+def row(truth, low, high, identifiable=True):
+    return {"truth": truth, "value": (low + high) / 2, "low": low, "high": high, "identifiable": identifiable}
+
+
+@pytest.mark.quick
+def test_coverage_counts_a_parameter_only_where_a_log_tells_it():
+    results = [{"seconds": 1.0, "parameters": {"a": row(1.0, 0.9, 1.2), "b": row(0.0, 1.0, 2.0),
+                                               "c": row(5.0, 0.0, 9.0, identifiable=False)}},
+               {"seconds": 3.0, "parameters": {"a": row(1.0, 1.1, 1.5), "b": row(0.0, 1.0, 2.0, identifiable=False),
+                                               "c": row(5.0, 0.0, 9.0, identifiable=False)}}]
+    found = {name: one["value"] for name, one in fit_coverage.summarise(results).items()}
+    assert found["coverage_90_a"] == 0.5 and found["coverage_90_b"] == 0.0
+    assert "coverage_90_c" not in found and found["identifiable_c"] == 0.0
+    assert (found["coverage_90_min"], found["coverage_90_max"]) == (0.0, 0.5)
+    assert found["half_width_90_a"] == pytest.approx(0.175) and found["seconds_coverage_log"] == 2.0
+
+
+@pytest.mark.quick
+def test_drawn_vehicles_lie_within_the_bounds_and_differ():
+    space = make_space(preset_params(WHILL_CR, "physical"), WHILL_CR)
+    drawn = np.stack([fit_coverage.draw_truth(space, np.random.default_rng(n)) for n in range(50)])
+    assert (drawn > space.low).all() and (drawn < space.high).all()
+    assert (np.ptp(drawn, axis=0) > 0.01 * (space.high - space.low)).sum() > 5
+    kp = drawn[:, space.names.index("torque_drive.kp")]
+    assert np.log(kp).std() == pytest.approx(fit_coverage.SPREAD, rel=0.4)
+
+
+@pytest.mark.quick
+def test_values_of_the_contact_plant_are_per_nominal_inertia():
+    """Twice the mass with the same torques is, to the model of nominal mass, nearly half the torques."""
+    light, heavy = (fit_coverage.plant_values(Chair(mass=mass), WHILL_CR) for mass in (54.0, 108.0))
+    assert heavy["torque_drive.kp"] == pytest.approx(light["torque_drive.kp"] / 2, rel=0.1)
+    assert light["torque_drive.limit"] / light["torque_drive.kp"] == pytest.approx(14.0 / 9.0)
+    assert light["command_delay.delay"] == 0.02 and light["body.com_y"] == pytest.approx(0.0, abs=1e-6)
+    # The centre of mass is ahead of the driven axle by a bit less than that of the frame alone.
+    assert 0.12 < light["body.com_x"] - WHILL_CR.rear_x < 0.2
+    assert 2.0 < light["body.yaw_inertia"] < 8.0
+
+
+@pytest.mark.quick
+def test_starts_agree_within_a_share_of_the_best_cost():
+    results = [{"cost": cost, "seconds": 1.0} for cost in (1.0, 1.009, 1.02, 1.2)]
+    found = fit_searches.summarise_starts(results, "")
+    assert found["starts_agreeing_of_32"]["value"] == 2
+    assert found["starts_within_10_percent_of_32"]["value"] == 3
+
+
+@pytest.mark.quick
+def test_batches_are_judged_by_the_median_of_searches_one_by_one():
+    batched = [{"cost": cost, "seconds": 2.0} for cost in (1.0, 1.04, 1.2)]
+    sequential = [{"cost": cost} for cost in (0.9, 1.0, 1.3)]
+    found = fit_searches.summarise_tpe(batched, sequential, "gpu")
+    assert found["tpe500_gpu_seconds"]["value"] == 2.0
+    assert found["tpe500_j_over_sequential"]["value"] == pytest.approx(1.04)
+    assert found["tpe500_within_5_percent"]["value"] == 1.0
+    assert "tpe500_j_over_sequential" not in fit_searches.summarise_tpe(batched, [], "cpu")
