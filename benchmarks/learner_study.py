@@ -72,6 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the study."""
     parser.add_argument("--batches", type=int, nargs="+", default=[], help="time these batch sizes")
     parser.add_argument("--seeds-under-vmap", type=int, nargs="+", default=[], help="time so many seeds side by side")
+    parser.add_argument("--host-replay", action="store_true", help="time it with the observations on the host")
     parser.add_argument("--profile", action="store_true", help="count the kernels of an update and share out its time")
     parser.add_argument("--tries", nargs="*", choices=TRIES, help="time other programs; all of them unless named")
     parser.add_argument("--compile-threads", type=int, default=1, help="programs compiled at once")
@@ -109,6 +110,8 @@ def variants(
     name: str, label: str, config: DreamerConfig, args: argparse.Namespace, tries: tuple[str, ...] | list[str]
 ) -> Iterator[Variant]:
     """Those that are timed in this process."""
+    if args.host_replay:
+        yield Variant(f"{label}_host_replay", dataclasses.replace(config, replay_memory="host"))
     for batch in args.batches:
         yield Variant(label_of(name, batch), dataclasses.replace(config, batch_size=batch))
     for runs in args.seeds_under_vmap:

@@ -8,10 +8,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dreamer import agent as agents
 from dreamer import replay, seeds
 from dreamer.config import DreamerConfig
+from dreamer.host_replay import HostFrames
 from dreamer.replay import Replay
 
 OBS_SHAPE = (64, 64, 3)
@@ -28,9 +30,15 @@ def random_replay(config: DreamerConfig, key: jax.Array) -> Replay:
     keys = jax.random.split(key, 4)
     rows = memory.reward.shape[0]
     starts = jnp.broadcast_to((jnp.arange(rows) % 100 == 0)[:, None], (rows, STREAMS))
+    if isinstance(memory.obs, HostFrames):
+        noise = np.random.default_rng(0).integers(0, 256, (rows, STREAMS, *OBS_SHAPE), np.uint8)
+        memory.obs.store.load(noise)
+        obs: Any = memory.obs
+    else:
+        obs = jax.random.bits(keys[0], memory.obs.shape, jnp.uint8)
     return dataclasses.replace(
         memory,
-        obs=jax.random.bits(keys[0], memory.obs.shape, jnp.uint8),
+        obs=obs,
         reward=jax.random.normal(keys[1], memory.reward.shape),
         is_first=starts,
         is_last=jnp.roll(starts, -1, 0),
@@ -77,7 +85,7 @@ class Updates:
             first = jax.vmap(first, out_axes=where)
             block = jax.vmap(block, in_axes=(where, 0), out_axes=where)
         self._first = jax.jit(first)
-        shapes = jax.eval_shape(first, self._keys)
+        shapes = jax.eval_shape(self._first, self._keys)  # of the same trace: a store on the host belongs to one
         self._lowered = jax.jit(block, donate_argnums=0).lower(shapes, self._keys)
         self._learner: Learner | None = None
         self.program: Any = None

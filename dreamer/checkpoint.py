@@ -101,7 +101,8 @@ def restore(folder: Path, template: Any, config: DreamerConfig) -> tuple[Any, di
 
     Args:
         folder: of all checkpoints.
-        template: a state of the wanted structure; gives shapes, dtypes and what is not stored.
+        template: a state of the wanted structure; gives shapes, dtypes and what is not stored. What is numpy's array in
+            it is one in the answer, the rest are JAX's.
         config: must equal the saved one.
 
     Raises:
@@ -215,6 +216,8 @@ def _from_numpy(path: Path, name: str, leaf: Any, arrays: dict[str, Any]) -> Any
         )
     if value.shape != shape:
         value = np.concatenate([value, np.zeros((shape[0] - value.shape[0], *shape[1:]), value.dtype)])
+    if isinstance(leaf, np.ndarray):
+        return value  # it belongs to the host
     # A copy of its own: the state is donated, and memory shared with numpy must not be.
     array = jnp.array(value, copy=True)
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else array

@@ -70,6 +70,9 @@ class DreamerConfig:
     `pretrain_steps` count too."""
     replay_capacity: int = 1_000_000
     """Control steps kept, summed over instances."""
+    replay_memory: Literal["auto", "device", "host"] = "auto"
+    """Where their observations lie. auto: on the device, unless they would take more than half of its memory and
+    `train` runs one seed on one device."""
     online: bool = True
     """Train on each fresh sequence once before sampling uniformly."""
     steps_per_iter: int = 1
@@ -160,6 +163,7 @@ class DreamerConfig:
             (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
             (self.representation in ("reconstruct", "barlow"), "representation", "must be 'reconstruct' or 'barlow'"),
             (self.representation != "barlow" or not self.decode_only, "decode_only", "must be () without a decoder"),
+            (self.replay_memory in ("auto", "device", "host"), "replay_memory", "must be 'auto', 'device' or 'host'"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
             (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),

@@ -1,4 +1,6 @@
-"""Replay memory on the device: one ring of rows, each row holding the same step of all N instance streams.
+"""Replay memory: one ring of rows, each row holding the same step of all N instance streams.
+
+All of it lies on the device, or all but the observations (`dreamer.host_replay`).
 
 Row t, column n is one step of stream n: the frame, what came with it, the action taken AFTER it, and the latent state
 inferred from it. A sampled window is consecutive rows of one column between the oldest and the newest row, so it
@@ -16,8 +18,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer import distributions as dist
-from dreamer import spaces
+from dreamer import host_replay, spaces
 from dreamer.config import DreamerConfig
+from dreamer.host_replay import HostFrames
 from dreamer.rssm import Latent
 from dreamer.spaces import ObsShape
 from dreamer.types import Transition
@@ -28,7 +31,7 @@ class Replay:
     """The memory, with L rows."""
 
     obs: Any
-    """(L, N, H, W, C) uint8 images, (L, N, D) float32 vectors, as the environment names them."""
+    """(L, N, H, W, C) uint8 images, (L, N, D) float32 vectors, as the environment names them; or `HostFrames`."""
     reward: jax.Array
     """(L, N) float32."""
     is_first: jax.Array
@@ -94,8 +97,9 @@ def rows_for(config: DreamerConfig, num_envs: int) -> int:
 def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int, copies: int = 1) -> Replay:
     """An empty memory for actions of so many numbers, with `copies` streams for each instance."""
     shape = (rows_for(config, num_envs), copies * num_envs)
+    on_host = config.replay_memory == "host"
     return Replay(
-        obs=spaces.zeros(obs_shape, shape),
+        obs=host_replay.init(obs_shape, shape) if on_host else spaces.zeros(obs_shape, shape),
         reward=jnp.zeros(shape, jnp.float32),
         is_first=jnp.zeros(shape, bool),
         is_last=jnp.zeros(shape, bool),
@@ -128,9 +132,13 @@ def write(config: DreamerConfig, replay: Replay, transition: Transition, action:
     def put(memory: jax.Array, value: jax.Array) -> jax.Array:
         return jax.lax.dynamic_update_index_in_dim(memory, value.astype(memory.dtype), row, 0)
 
+    if isinstance(replay.obs, HostFrames):
+        obs: Any = host_replay.write(replay.obs, row, transition.obs)
+    else:
+        obs = jax.tree.map(put, replay.obs, transition.obs)
     return dataclasses.replace(
         replay,
-        obs=jax.tree.map(put, replay.obs, transition.obs),
+        obs=obs,
         reward=put(replay.reward, transition.reward),
         is_first=put(replay.is_first, transition.is_first),
         is_last=put(replay.is_last, transition.is_last),
@@ -174,11 +182,12 @@ def sample(config: DreamerConfig, replay: Replay, key: jax.Array) -> tuple[Repla
         online_next = jnp.minimum(first + config.batch_size, jnp.maximum(first, generations * streams))
     row = (start + jnp.arange(length + 1)[:, None]) % rows
     window = Window(row, stream)
-    return dataclasses.replace(replay, online_next=online_next), gather(config, replay, window), window
+    replay, batch = gather(config, dataclasses.replace(replay, online_next=online_next), window)
+    return replay, batch, window
 
 
-def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
-    """The batch that lies at a window."""
+def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Replay, Batch]:
+    """The memory, and the batch that lies at a window."""
 
     def take(memory: jax.Array, row: jax.Array) -> jax.Array:
         return memory.at[row, window.stream].get(mode="promise_in_bounds")
@@ -186,8 +195,13 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
     context, trained = window.row[0], window.row[1:]
     index = take(replay.stoch, context).astype(jnp.int32)
     stoch = dist.one_hot(index, config.classes).reshape(index.shape[0], -1).astype(replay.deter.dtype)
-    return Batch(
-        obs=jax.tree.map(lambda memory: take(memory, trained), replay.obs),
+    if isinstance(replay.obs, HostFrames):
+        frames, obs = host_replay.read(replay.obs, trained, window.stream)
+        replay = dataclasses.replace(replay, obs=frames)
+    else:
+        obs = jax.tree.map(lambda memory: take(memory, trained), replay.obs)
+    batch = Batch(
+        obs=obs,
         prev_action=take(replay.action, window.row[:-1]),
         reward=take(replay.reward, trained),
         is_first=take(replay.is_first, trained),
@@ -195,6 +209,7 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> Batch:
         is_terminal=take(replay.is_terminal, trained),
         start=Latent(take(replay.deter, context), stoch),
     )
+    return replay, batch
 
 
 def write_back(config: DreamerConfig, replay: Replay, window: Window, latent: Latent) -> Replay:

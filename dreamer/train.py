@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dreamer import checkpoint, parallel, pretrain, seeds
+from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
 from dreamer.agent import AgentState
 from dreamer.board import Board
 from dreamer.config import DreamerConfig
@@ -143,7 +144,8 @@ def train(
 
     Raises:
         ImportError: tensorboard is asked for and tensorboardX is not installed.
-        ValueError: environment and configuration do not fit, or the checkpoint does not belong to them.
+        ValueError: environment and configuration do not fit, the checkpoint does not belong to them, or a replay in the
+            host's memory is asked for with several seeds or devices.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -232,6 +234,7 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     filled = ("replay.", used, rows) if state.replay.reward.ndim == 2 else None  # of several seeds all is written
     env_steps = int(state.env_steps)
     pretraining = 0 if env_steps else sum(pretrain.counters(state).values())
+    state = host_replay.revealed(state)
     path = checkpoint.save(out / "checkpoints", state, config, env_steps, wall_s, filled, pretraining)
     parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
     return path
@@ -242,10 +245,10 @@ def _first_state(
 ) -> tuple[TrainState, float]:
     """State to start from and the time [s] already spent."""
     if resume and checkpoint.complete(out / "checkpoints"):
-        template = _init(env, config, seed, None)()
-        restored = checkpoint.restore(out / "checkpoints", template, config)
+        template = _init(env, config, seed, None, split=mesh is not None)()
+        restored = checkpoint.restore(out / "checkpoints", host_replay.revealed(template), config)
         if restored is not None:
-            state = restored[0]
+            state = host_replay.hidden(restored[0], template)
             if mesh is not None:
                 state = parallel.place(state, parallel.state_shardings(mesh, state, env.num_envs))
             return state, float(restored[1]["wall_s"])
@@ -259,11 +262,37 @@ def _first_state(
     return state, 0.0
 
 
-def _init(env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], mesh: Mesh | None) -> Any:
-    """The compiled first state, () -> state."""
+def _init(
+    env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], mesh: Mesh | None, split: bool = False
+) -> Any:
+    """The compiled first state, () -> state; `split`: it will be placed on several devices."""
+    alone = isinstance(seed, int) and mesh is None and not split
+    config = replace(config, replay_memory=_memory(env, config, alone))
     if isinstance(seed, int):
         return compile_init(env, config, seed, mesh)
     return jax.jit(lambda: seeds.init_states(env, config, seed))
+
+
+def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["device", "host"]:
+    """Where the observations of the replay go; `alone`: one seed on one device."""
+    if config.replay_memory == "host" and not alone:
+        raise ValueError(
+            "DreamerConfig.replay_memory = 'host': a replay in the host's memory belongs to one seed on one device. "
+            "Give one seed and no devices, or leave it at 'auto' with a smaller replay_capacity."
+        )
+    if config.replay_memory != "auto" or not alone:
+        return "host" if config.replay_memory == "host" else "device"
+    there = replace(config, replay_memory="device")
+    memory = jax.eval_shape(lambda: replay.init(there, env.num_envs, env.obs_shape, 1, 1 + config.mirror))
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(memory.obs))
+    if host_replay.fits(size, jax.devices()[0]):
+        return "device"
+    print(
+        f"The replay's observations would take {size / 1e9:.1f} GB, more than half of the device's memory: they are "
+        "kept in the host's, which is slower. A smaller replay_capacity keeps them on the device.",
+        file=sys.stderr,
+    )
+    return "host"
 
 
 def _headline(line: dict[str, Any]) -> dict[str, str]:
