@@ -89,7 +89,8 @@ def fit(
 
 
 def profile_delays(
-    objective: Residuals, space: Space, u: np.ndarray, points: int = 16, near: float = 0.005, robust: bool = False
+    objective: Residuals, space: Space, u: np.ndarray, points: int = 16, near: tuple[float, ...] = (0.005, 0.0003),
+    robust: bool = False,
 ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
@@ -98,7 +99,8 @@ def profile_delays(
 
     Args:
         points: of an even grid over the whole range.
-        near: six more on both sides of u are this far apart [s].
+        near: six more on both sides of u are this far apart [s], for each: a step of the controller's clock, and what
+            a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it.
 
     Returns:
         Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
@@ -115,8 +117,8 @@ def profile_delays(
 
     for index in delays:
         values = space.to_values(u)
-        around = np.tile(values, (13, 1))
-        around[:, index] += near * np.arange(-6, 7)
+        around = np.tile(values, (13 * len(near), 1))
+        around[:, index] += np.outer(near, np.arange(-6, 7)).ravel()
         grid = np.concatenate([np.linspace(0.0, 1.0, points), space.to_unit(around)[:, index]])
         grid = np.unique(grid.round(9))
         at = np.tile(u, (len(grid), 1))

@@ -162,7 +162,9 @@ def test_a_delay_is_profiled_on_a_grid_and_the_others_follow(objective):
     behind = dataclasses.replace(objective, space=renamed)
     off = U_TRUTH + np.array([0.0, 0.1, 0.0])
     (name, grid, costs, followed), = gradient.profile_delays(behind, renamed, off)
-    assert name == "delay" and 16 < len(grid) == len(costs) == len(followed) <= 16 + 13
+    assert name == "delay" and 16 < len(grid) == len(costs) == len(followed) <= 16 + 2 * 13
+    near = np.sort(np.abs(grid - behind.space.to_values(off)[0]))
+    assert 0 < near[near > 1e-9].min() < 0.001  # s: finer than a step of the controller's clock
     assert grid[costs.argmin()] == pytest.approx(TRUTH[0], rel=0.1)
     assert np.abs(followed[costs.argmin(), 1:] - U_TRUTH[1:]).max() < 0.05
     np.testing.assert_allclose(behind.weighted_cost(followed), costs, rtol=1e-6)
