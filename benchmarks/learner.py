@@ -181,7 +181,7 @@ def main() -> None:
 
     if not args.skip_base:
         keep(base(name, config, args))
-    if args.parts or args.profile:
+    if args.parts:
         for figures in time_parts(label, config, args.per_block):
             keep(figures)
     learner_study.run(name, config, args, keep)
