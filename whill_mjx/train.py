@@ -155,7 +155,9 @@ def choose_preset(options: TrainOptions) -> Preset:
         learner = dataclasses.replace(learner, lr=options.lr)
         baseline = dataclasses.replace(baseline, lr=options.lr)
     if options.train_ratio is not None:
-        learner = dataclasses.replace(learner, train_ratio=options.train_ratio)
+        updates = round(learner.lr_decay * options.train_ratio / learner.train_ratio)  # the falling rate spans the run
+        decay = max(learner.warmup + 1, updates) if learner.lr_decay else 0
+        learner = dataclasses.replace(learner, train_ratio=options.train_ratio, lr_decay=decay)
     if options.targets:
         learner = dataclasses.replace(learner, decode_only=(TRUTH,))
     return dataclasses.replace(

@@ -216,6 +216,12 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
 
 
 @pytest.mark.quick
+def test_the_falling_rate_spans_the_run_whatever_its_train_ratio():
+    for ratio in (256.0, 512.0, 1024.0):
+        learner = choose_preset(TrainOptions(preset="paper", train_ratio=ratio)).learner
+        assert learner.lr_decay == 22_000 * ratio / (learner.batch_size * learner.batch_length)
+
+
 @pytest.mark.quick
 def test_targets_are_for_the_decoder_alone():
     plain, told = (choose_preset(TrainOptions(preset="paper", targets=asked)).learner for asked in (False, True))
