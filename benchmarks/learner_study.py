@@ -20,6 +20,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -102,7 +103,7 @@ def run(name: str, config: DreamerConfig, args: argparse.Namespace, keep: Callab
         if skipped(one, until):
             continue
         for key, value in in_process(one, args, FLAGS[one], ["--compile-threads", "1"]).items():
-            if "per_s" in key:
+            if re.search("per_s(_|$)", key):
                 keep({f"{key}_{one}": value})
 
 
