@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from benchmarks.harness import figure
-from sysid import gradient, starts, tpe
+from sysid import starts, tpe
 from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, gradient_search, make_problem
 from sysid.log import Log, load_log
 from sysid.objective import HUGE
@@ -52,10 +52,10 @@ def find_log(name: str, shared: Path, trials: int = 18) -> Log:
 def start_job(problem: Problem, track: float, index: int, iterations: int, seed: int = 0) -> dict[str, Any]:
     """The default search from one of STARTS starts: features, then poses with the delays profiled.
 
-    Start 0 has the initial values; the others are drawn over the whole range of every parameter.
+    Start 0 has the initial values; the others are drawn over the whole range of every parameter (`sysid.starts.draw`).
     """
-    point = gradient.random_starts(problem.space, STARTS, seed)[index : index + 1]
     began = time.perf_counter()
+    point = starts.draw(problem.objective, [index], seed)
     coarse = starts.fit(problem.objective, point, track, FEATURE_ITERATIONS)
     search, _, _ = gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
     return {"cost": search.cost, "coarse_cost": coarse.cost, "u": search.u.tolist(), "start": point[0].tolist(),
@@ -122,10 +122,10 @@ def summarise_tpe(
 def many_starts(log: Log, count: int, iterations: int, repeats: int) -> dict[str, dict[str, Any]]:
     """Seconds of the default search from `count` starts at once, the compilation apart."""
     problem = make_problem(log, FitConfig())
-    points = gradient.random_starts(problem.space, count, 0)
 
     def search() -> float:
         began = time.perf_counter()
+        points = starts.draw(problem.objective, range(count), 0)
         coarse = starts.fit(problem.objective, points, log.spec.track, FEATURE_ITERATIONS)
         gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
         return time.perf_counter() - began

@@ -64,8 +64,8 @@ class FitConfig:
     study: str = "fit"
     """Name of the study there."""
     starts: int = 1
-    """Starts of the gradient search: the initial values, and random ones or the best of the global search (both: at
-    least one of them)."""
+    """Starts of the gradient search: the initial values, and random ones (features: each the best of many) or the best
+    of the global search (both: at least one of them)."""
     iterations: int = 40
     """Iterations of the gradient search on poses."""
     seed: int = 0
@@ -161,6 +161,7 @@ def fit_log(
                        method="cmaes" if config.method == "cmaes" else "tpe")
         points = np.concatenate([points[:1], scan.starts])[:count]
     elif config.method == "features":
+        points = starts.draw(objective, range(config.starts), config.seed, progress=progress)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
     if config.vehicle is not None and config.method not in GLOBAL:

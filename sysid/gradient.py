@@ -7,6 +7,7 @@ the box is cut at its wall and the parameters at a wall whose gradient points ou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -84,7 +85,7 @@ def fit(
             break
     order = np.argsort(cost)
     return FitResult(u=u[order[0]], cost=float(cost[order[0]]), initial_cost=initial,
-                     evaluations=evaluations, starts=u[order], start_costs=cost[order],
+                     evaluations=evaluations, starts=u[order], start_costs=cost[order], order=order,
                      history=np.array(history))
 
 
@@ -134,7 +135,7 @@ def profile_delays(
     return profiles
 
 
-def random_starts(space: Space, count: int, seed: int) -> np.ndarray:
+def random_starts(space: Space, count: int, seed: int | Sequence[int]) -> np.ndarray:
     """(S, P): the initial values, then points drawn uniformly in unit coordinates, away from the walls."""
     draws = np.random.default_rng(seed).uniform(0.05, 0.95, (count, space.size))
     draws[0] = space.to_unit(space.initial)

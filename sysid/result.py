@@ -24,5 +24,7 @@ class FitResult:
     """(S, P) end points of the search: the best candidates of TPE, the end of each start of LM."""
     start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(S,) cost of each of them, where known."""
+    order: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """(S,) which of the given starts each of them comes from, in a gradient search."""
     history: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Best cost so far after each evaluation or iteration."""

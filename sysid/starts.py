@@ -2,12 +2,14 @@
 
 A pose adds up all motion before it, so that far from the truth its error has folds in which a search stays. The motion
 within a bin of a quarter of a second has not, and what differs between replicates is nearly the same in every bin. A
-search there needs few steps; poses then tell what adds up over a whole drive. Random starts within the full bounds of
-the physical model still end in valleys of a wrong delay or torque limit: what it starts from matters.
+search there needs few steps; poses then tell what adds up over a whole drive. Searches from random points within the
+full bounds of the physical model still end in valleys of a wrong delay or torque limit: a start is therefore the best
+of many random points, after a few steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +23,13 @@ from sysid.result import FitResult, Progress
 from sysid.rollout import Simulated
 from sysid.space import Space
 
+SCAN = 128
+"""Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
+KEPT = 3
+"""The best of them, from which a short search is made: two in three lead to the deepest valley."""
+SHORT = 8
+"""Iterations of that search."""
+CHUNK = 512  # points replayed together
 AGREE = 0.02
 """Starts agree where their costs differ by no more than this share of the best one."""
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
@@ -113,6 +122,36 @@ def fit(
     again = gradient.fit(fine, fine.space, starts=found.u[None], iterations=max(iterations // 2, 3),
                          tolerance=TOLERANCE, progress=progress)
     return replace(found, u=again.u, evaluations=found.evaluations + again.evaluations)
+
+
+def draw(
+    objective: Objective, numbers: Sequence[int], seed: int, scan: int = SCAN, progress: Progress | None = None
+) -> np.ndarray:
+    """Starts (S, P) of a search: number 0 has the initial values, any other the best of `scan` random points.
+
+    A start is the same whichever others are drawn with it.
+
+    Args:
+        objective: that of the poses; its replay is used.
+        numbers: of the starts.
+    """
+    space = objective.space
+    first = space.to_unit(space.initial)
+    scanned = [number for number in numbers if number > 0]
+    if not scanned:
+        return np.array([first for _ in numbers])
+    coarse = make_features_objective(objective)
+    tried = np.concatenate([gradient.random_starts(space, scan + 1, (seed, number))[1:] for number in scanned])
+    costs = np.concatenate([coarse.weighted_cost(tried[i : i + CHUNK]) for i in range(0, len(tried), CHUNK)])
+    costs, tried = costs.reshape(len(scanned), -1), tried.reshape(len(scanned), -1, space.size)
+    kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :KEPT, None], axis=1)  # (S, KEPT, P)
+    found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=SHORT, tolerance=TOLERANCE,
+                         progress=progress)
+    ends, costs = np.empty_like(found.starts), np.empty_like(found.start_costs)
+    ends[found.order], costs[found.order] = found.starts, found.start_costs
+    best = costs.reshape(len(scanned), -1).argmin(1)
+    ends = ends.reshape(kept.shape)[np.arange(len(scanned)), best]
+    return np.array([first if number == 0 else ends[scanned.index(number)] for number in numbers])
 
 
 def make_features_objective(objective: Objective) -> FeatureObjective:
