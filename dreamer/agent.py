@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import behavior, optim, rssm, sensors, spaces, world_model
+from dreamer import behavior, optim, parallel, rssm, sensors, spaces, world_model
 from dreamer.behavior import ReturnNorm
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch
@@ -150,9 +150,8 @@ def loss(
     losses, latent, model_metrics = world_model.loss(config, params, batch, model_key)
     outcome = (batch.reward, batch.is_last, batch.is_terminal)
     latest, tail = jax.tree.map(lambda x: x[-config.start_steps :], (latent, outcome))
-    start = Latent(latest.deter.reshape(-1, config.deter), latest.stoch.reshape(-1, config.stoch_size))
     behavior_losses, returns, norm, metrics = behavior.imagination_loss(
-        config, params, agent.slow_value, agent.return_norm, start, imagine_key
+        config, params, agent.slow_value, agent.return_norm, latest, imagine_key
     )
     losses.update(behavior_losses)
     start_return = returns.reshape(tail[0].shape)
@@ -175,6 +174,7 @@ def update(
     """
     objective = partial(loss, config, agent=agent, batch=batch, key=key)
     gradients, (latent, norm, metrics) = jax.grad(lambda params: objective(params=params), has_aux=True)(agent.params)
+    gradients, metrics = parallel.mean((gradients, metrics))
     params, opt = optim.update(config, agent.params, gradients, agent.opt)
     slow_value = _follow(agent.slow_value, params["value"], config.slow_rate)
     average = None if agent.average is None else _follow(agent.average, params, config.average_rate)
@@ -199,6 +199,7 @@ def update_model(
         return total, (latent, {**metrics, "loss": total, **{f"loss_{name}": x for name, x in means.items()}})
 
     gradients, (latent, metrics) = jax.grad(objective, has_aux=True)(model)
+    gradients, metrics = parallel.mean((gradients, metrics))
     mine = optim.OptState(_model_of(agent.opt.mu), _model_of(agent.opt.nu), agent.opt.count)
     model, mine = optim.update(config, model, gradients, mine)
     opt = optim.OptState({**agent.opt.mu, **mine.mu}, {**agent.opt.nu, **mine.nu}, mine.count)

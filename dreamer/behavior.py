@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer import distributions as dist
-from dreamer import rssm, spaces, world_model
+from dreamer import parallel, rssm, spaces, world_model
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent
 from dreamer.types import Params
@@ -86,14 +86,16 @@ def imagine(config: DreamerConfig, params: Params, start: Latent, key: jax.Array
     Args:
         config: sizes.
         params: of the whole agent.
-        start: states (M, ...).
+        start: states with any leading axes, which become the M rows; the last of them may be split over devices.
         key: consumed.
     """
-    rows, steps = start.deter.shape[0], config.imag_horizon
+    lead, steps = start.deter.shape[:-1], config.imag_horizon
+    start = Latent(start.deter.reshape(-1, config.deter), start.stoch.reshape(-1, config.stoch_size))
+    rows = start.deter.shape[0]
     actions = spaces.actions_of(params)
     latent_key, action_key = jax.random.split(key)
-    uniform = jax.random.uniform(latent_key, (steps, rows, config.stoch))
-    draws = actions.noise(action_key, (steps + 1, rows))
+    uniform = parallel.own_rows(lambda rows: jax.random.uniform(latent_key, (steps, rows, config.stoch)), lead)
+    draws = parallel.own_rows(lambda rows: actions.noise(action_key, (steps + 1, rows)), lead)
     params = jax.tree.map(lambda p: p.astype(config.dtype) if p.ndim >= 2 else p, params)  # once, not in every step
 
     def act(latent: Latent, noise: jax.Array) -> jax.Array:
@@ -115,7 +117,7 @@ def imagine(config: DreamerConfig, params: Params, start: Latent, key: jax.Array
 
 def update_return_norm(config: DreamerConfig, norm: ReturnNorm, returns: jax.Array) -> ReturnNorm:
     """Move the running percentiles towards those of returns (H, M)."""
-    low, high = jnp.quantile(returns, jnp.array(config.return_percentiles))
+    low, high = jnp.quantile(parallel.gather(returns, 1), jnp.array(config.return_percentiles))
     rate = config.return_norm_rate
     return ReturnNorm(norm.low + rate * (low - norm.low), norm.high + rate * (high - norm.high))
 
@@ -163,7 +165,7 @@ def imagination_loss(
         params: of the whole agent.
         slow: slow critic.
         norm: running percentiles of the returns.
-        start: states (M, ...).
+        start: states with any leading axes, M altogether, as `imagine` takes them.
         key: consumed.
 
     Returns:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import jax
@@ -22,6 +23,9 @@ from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
 
 Metrics = dict[str, jax.Array]
 Update = Callable[[DreamerConfig, AgentState, Batch, jax.Array], tuple[AgentState, Latent, Metrics]]
+_AXES: dict[str, Any] = {field.name: 0 if field.name == "start" else 1 for field in dataclasses.fields(Batch)}
+BATCH_AXES = Batch(**_AXES)
+"""The axis of a batch's sequences in each of its fields."""
 
 
 @struct.dataclass
@@ -195,12 +199,13 @@ def replayed_updates(
     config: DreamerConfig, state: TrainState, updates: jax.Array, key: jax.Array, update: Update, mesh: Mesh | None
 ) -> tuple[TrainState, Metrics]:
     """`updates` times () a batch, an `update` on it, and its latents written back; the metrics are sums."""
+    step = parallel.over_batch(mesh, partial(update, config), (None, BATCH_AXES, None), (None, 1, None))
 
     def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[tuple[AgentState, Replay], Metrics]:
         agent, memory = carry
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         memory, batch, window = replay.sample(config, memory, sample_key)
-        agent, latent, metrics = update(config, agent, split_batch(mesh, batch), update_key)
+        agent, latent, metrics = step(agent, batch, update_key)
         return (agent, replay.write_back(config, memory, window, latent)), metrics
 
     (agent, memory), sums = sum_over(updates, one, (state.agent, state.replay))
@@ -219,12 +224,6 @@ def sum_over(
 
     shapes = jax.eval_shape(body, jnp.zeros((), jnp.int32), carry)[1]
     return jax.lax.fori_loop(0, count, add, (carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)))
-
-
-def split_batch(mesh: Mesh | None, batch: Batch) -> Batch:
-    """The batch with its sequences split over the devices."""
-    steps = {field.name: getattr(batch, field.name) for field in dataclasses.fields(batch) if field.name != "start"}
-    return Batch(**parallel.split(mesh, steps, 1), start=parallel.split(mesh, batch.start, 0))
 
 
 def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:

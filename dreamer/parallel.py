@@ -1,13 +1,17 @@
 """A training run over several devices and hosts: instances, replay and batches are split, parameters are everywhere.
 
-The program stays the one of a single device. Only the placement of its arrays is said here; XLA adds the communication,
-among it the sum of the gradients. Every draw of random numbers is that of a single device, so that results differ by
-the order of floating-point sums alone.
+Collecting and the replay stay the program of a single device: only the placement of their arrays is said here, and XLA
+adds the communication. A gradient step is cut by hand (`over_batch`): each device runs the single device's program on
+its own sequences. XLA cannot do that, since time leads: rows merged from (T, B) with B split are no split that it
+knows, so it would bring all sequences to every device. What concerns the whole batch says so there, by `mean`, `total`,
+`gather` and `own_rows`, which change nothing on a single device. Every draw of random numbers is that of a single
+device, so that results differ by the order of floating-point sums alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -31,11 +35,66 @@ def make_mesh(devices: Sequence[jax.Device], instances: int, batch_size: int) ->
     return Mesh(np.asarray(devices), (AXIS,))
 
 
-def split(mesh: Mesh | None, tree: Any, axis: int) -> Any:
-    """The tree with this axis of its leaves split over the devices; inside a compiled function."""
+def over_batch(mesh: Mesh | None, function: Callable[..., Any], in_axes: Any, out_axes: Any) -> Callable[..., Any]:
+    """The function with each device computing its own share of the batch; unchanged without a mesh.
+
+    Args:
+        mesh: from `make_mesh`.
+        function: treats its sequences alike and apart, but for the functions below.
+        in_axes: the axis of each argument that is split, as for `jax.vmap`: a number, None for a copy on every device,
+            or a tree of them.
+        out_axes: that of the results. What has none must be the same on every device.
+    """
     if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec(*[None] * axis, AXIS)))
+        return function
+
+    def specs(axes: Any) -> Any:
+        return jax.tree.map(_spec, axes, is_leaf=lambda axis: axis is None)
+
+    # Gradients are those of a device's own share (check_vma would sum them one by one, where they are used).
+    return jax.shard_map(function, mesh=mesh, in_specs=specs(in_axes), out_specs=specs(out_axes), check_vma=False)
+
+
+def _spec(axis: int | None) -> PartitionSpec:
+    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
+
+
+def _divided() -> bool:
+    """Whether this is traced inside `over_batch`."""
+    return AXIS in jax.sharding.get_abstract_mesh().manual_axes
+
+
+def mean(tree: Any) -> Any:
+    """The means over the devices of what each has found in its share."""
+    return jax.lax.pmean(tree, AXIS) if _divided() else tree
+
+
+def total(tree: Any) -> Any:
+    """The sums over the devices of what each has found in its share."""
+    return jax.lax.psum(tree, AXIS) if _divided() else tree
+
+
+def gather(x: jax.Array, axis: int) -> jax.Array:
+    """The shares of all devices joined along an axis, for what only the whole batch tells."""
+    return jax.lax.all_gather(x, AXIS, axis=axis, tiled=True) if _divided() else x
+
+
+def own_rows(draw: Callable[[int], jax.Array], lead: tuple[int, ...]) -> jax.Array:
+    """Random numbers for the rows of this device: (steps, M, ...) of those that a single device draws for all rows.
+
+    Args:
+        draw: number of rows -> array (steps, rows, ...).
+        lead: axes that were merged into the M rows here; the last one is split over the devices.
+    """
+    rows = math.prod(lead)
+    if not _divided():
+        return draw(rows)
+    count = jax.lax.axis_size(AXIS)
+    everyone = draw(rows * count)
+    steps, *each = everyone.shape[0], *everyone.shape[2:]
+    everyone = everyone.reshape(steps, rows // lead[-1], count, lead[-1], *each)
+    own = jax.lax.dynamic_index_in_dim(everyone, jax.lax.axis_index(AXIS), 2, keepdims=False)
+    return own.reshape(steps, rows, *each)
 
 
 def state_shardings(mesh: Mesh, state: Any, instances: int) -> Any:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from dreamer import distributions as dist
-from dreamer import image, nets
+from dreamer import image, nets, parallel
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent
 from dreamer.spaces import ObsShape, image_of, image_shape, vector_of, vector_size
@@ -112,10 +112,11 @@ def barlow_loss(projected: jax.Array, tokens: jax.Array, redundancy: float) -> j
 
     def standard(x: jax.Array) -> jax.Array:
         x = x.astype(jnp.float32).reshape(-1, x.shape[-1])
-        return (x - jnp.mean(x, 0)) / (jnp.std(x, 0) + 1e-4)
+        x = x - parallel.mean(jnp.mean(x, 0))
+        return x / (jnp.sqrt(parallel.mean(jnp.mean(jnp.square(x), 0))) + 1e-4)
 
     first, second = standard(projected), standard(jax.lax.stop_gradient(tokens))
-    correlation = first.T @ second / first.shape[0]
+    correlation = parallel.mean(first.T @ second / first.shape[0])
     agreement = jnp.diagonal(correlation)
     others = jnp.sum(jnp.square(correlation)) - jnp.sum(jnp.square(agreement))
     return jnp.sum(jnp.square(agreement - 1.0)) + redundancy * others

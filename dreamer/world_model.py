@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from dreamer import distributions as dist
-from dreamer import nets, rssm, sensors
+from dreamer import nets, parallel, rssm, sensors
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch
 from dreamer.rssm import Latent
@@ -83,7 +83,7 @@ def loss(
     """
     steps = batch.reward.shape
     tokens = sensors.encode(config, params["enc"], batch.obs)
-    uniform = jax.random.uniform(key, (*steps, config.stoch))
+    uniform = parallel.own_rows(lambda rows: jax.random.uniform(key, (steps[0], rows, config.stoch)), steps[1:])
     latent, post = rssm.observe(
         config, params["dyn"], batch.start, batch.prev_action, tokens, batch.is_first, uniform
     )
@@ -107,7 +107,7 @@ def loss(
     metrics = {
         "kl": jnp.mean(dist.categorical_kl(post, prior)),
         "post_entropy": jnp.mean(jnp.sum(-post * jnp.log(post), (-2, -1))),
-        "goal_reward_sum": jnp.sum(goal * predicted),
-        "goal_frames": jnp.sum(goal),
+        "goal_reward_sum": parallel.total(jnp.sum(goal * predicted)),
+        "goal_frames": parallel.total(jnp.sum(goal)),
     }
     return losses, latent, metrics

@@ -14,12 +14,13 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
 from dreamer_toys import corridor_env, tiny_config  # noqa: E402
 
-from dreamer import iteration, parallel  # noqa: E402
+from dreamer import iteration, parallel, sensors  # noqa: E402
 from dreamer.train import _first_state, train  # noqa: E402
 
 # Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
 # two-hot critic are near 5e8, so that runs agree in what they learn but not in every digit.
-CONFIG = tiny_config(batch_size=8, learning_starts=72, train_ratio=16.0, warmup=1)
+# Of 16 sequences each of the eight devices has two: what is merged with time lies in another order than on one device.
+CONFIG = tiny_config(batch_size=16, learning_starts=72, train_ratio=32.0, warmup=1)
 ENV = corridor_env(8)
 QUIET = dict(progress=False, log_every_s=1e9, checkpoint_every_s=1e9)
 
@@ -47,10 +48,27 @@ def flat(params):
     return np.concatenate([np.asarray(leaf).ravel() for leaf in jax.tree.leaves(params)])
 
 
+def redundancy(mesh):
+    """Loss by correlations over a batch (4, 16) of one projection, its gradient, and random numbers for all rows."""
+    inputs, tokens = jax.random.normal(jax.random.key(0), (2, 4, 16, 3))
+    weight = jax.random.normal(jax.random.key(1), (3, 3))
+
+    def share(weight, inputs, tokens):
+        value, gradient = jax.value_and_grad(lambda w: sensors.barlow_loss(inputs @ w, tokens, 0.1))(weight)
+        drawn = parallel.own_rows(lambda rows: jax.random.uniform(jax.random.key(2), (2, rows)), inputs.shape[:2])
+        return *parallel.mean((value, gradient)), drawn.reshape(2, *inputs.shape[:2])
+
+    value, gradient, drawn = jax.jit(parallel.over_batch(mesh, share, (None, 1, 1), (None, None, 2)))(
+        weight, inputs, tokens
+    )
+    return np.concatenate([np.ravel(value), np.ravel(gradient), np.ravel(drawn)])
+
+
 def several_devices(out):
     alone, alone_sums, _ = run(jax.devices()[:1])
     many, many_sums, placed = run(jax.devices())
-    np.savez(out, alone=alone, many=many)
+    mesh = parallel.make_mesh(jax.devices(), 8, 16)
+    np.savez(out, alone=alone, many=many, statistics_alone=redundancy(None), statistics_many=redundancy(mesh))
     out.with_suffix(".json").write_text(json.dumps({"alone": alone_sums, "many": many_sums, **placed}))
 
 

@@ -47,6 +47,11 @@ def test_eight_devices_give_the_run_of_one(several):
         np.testing.assert_allclose(told["many"][name], value, rtol=1e-3, atol=1e-3, err_msg=name)
 
 
+def test_what_the_whole_batch_tells_is_that_of_one_device(several):
+    result, _ = several
+    np.testing.assert_allclose(result["statistics_many"], result["statistics_alone"], rtol=1e-5, atol=1e-6)
+
+
 def test_two_processes_train_save_and_restore_like_one(several, tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))
