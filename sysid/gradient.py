@@ -7,7 +7,6 @@ the box is cut at its wall and the parameters at a wall whose gradient points ou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -135,7 +134,7 @@ def profile_delays(
     return profiles
 
 
-def random_starts(space: Space, count: int, seed: int | Sequence[int]) -> np.ndarray:
+def random_starts(space: Space, count: int, seed: int) -> np.ndarray:
     """(S, P): the initial values, then points drawn uniformly in unit coordinates, away from the walls."""
     draws = np.random.default_rng(seed).uniform(0.05, 0.95, (count, space.size))
     draws[0] = space.to_unit(space.initial)

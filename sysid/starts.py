@@ -4,7 +4,7 @@ A pose adds up all motion before it, so that far from the truth its error has fo
 within a bin of a quarter of a second has not, and what differs between replicates is nearly the same in every bin. A
 search there needs few steps; poses then tell what adds up over a whole drive. Searches from random points within the
 full bounds of the physical model still end in valleys of a wrong delay or torque limit: a start is therefore the best
-of many random points, after a few steps.
+end of searches from the best of many random points.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from sysid.result import FitResult, Progress
 from sysid.rollout import Simulated
 from sysid.space import Space
 
-SCAN = 128
+SCAN = 256
 """Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
 KEPT = 3
-"""The best of them, from which a short search is made: two in three lead to the deepest valley."""
-SHORT = 8
-"""Iterations of that search."""
+"""The best of them, from each of which is searched: a few steps do not tell yet which valley is the deepest."""
+STEPS = 20
+"""Iterations of those searches, at most."""
+EDGE = 0.02  # of the range, at both ends, without random points
 CHUNK = 512  # points replayed together
 AGREE = 0.02
 """Starts agree where their costs differ by no more than this share of the best one."""
@@ -141,11 +142,13 @@ def draw(
     if not scanned:
         return np.array([first for _ in numbers])
     coarse = make_features_objective(objective)
-    tried = np.concatenate([gradient.random_starts(space, scan + 1, (seed, number))[1:] for number in scanned])
+    # Close to the walls as well: of many parameters the likely values are a small share of the range.
+    tried = np.concatenate([np.random.default_rng((seed, number)).uniform(EDGE, 1 - EDGE, (scan, space.size))
+                            for number in scanned])
     costs = np.concatenate([coarse.weighted_cost(tried[i : i + CHUNK]) for i in range(0, len(tried), CHUNK)])
     costs, tried = costs.reshape(len(scanned), -1), tried.reshape(len(scanned), -1, space.size)
     kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :KEPT, None], axis=1)  # (S, KEPT, P)
-    found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=SHORT, tolerance=TOLERANCE,
+    found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=STEPS, tolerance=TOLERANCE,
                          progress=progress)
     ends, costs = np.empty_like(found.starts), np.empty_like(found.start_costs)
     ends[found.order], costs[found.order] = found.starts, found.start_costs

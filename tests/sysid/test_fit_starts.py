@@ -80,12 +80,10 @@ def test_random_starts_in_features_agree_and_lie_where_the_poses_fit_best(poses)
     assert polished.cost <= direct.cost * 1.001
 
 
-def test_a_drawn_start_is_near_the_truth_and_does_not_depend_on_the_others(poses, features):
+def test_a_drawn_start_is_near_the_truth_and_does_not_depend_on_the_others(poses):
     drawn = starts.draw(poses, [0, 1, 2], seed=3, scan=16)
     np.testing.assert_array_equal(drawn[0], poses.space.to_unit(poses.space.initial))
     np.testing.assert_allclose(starts.draw(poses, [2], seed=3, scan=16)[0], drawn[2], atol=1e-3)
-    random = gradient.random_starts(poses.space, 17, (3, 1))[1:]
-    assert features.weighted_cost(drawn[1:]).max() <= features.weighted_cost(random).min()
     np.testing.assert_allclose(poses.space.to_values(drawn[1:]), [TRUTH, TRUTH], rtol=0.2)
 
 
