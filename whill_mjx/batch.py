@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +43,7 @@ class BatchEnv:
 
     def reset(self, key: jax.Array) -> tuple[BatchState, TimeStep]:
         """Start N episodes; leaves of the time step are (N, ...)."""
-        keys = self._split(jax.random.split(key, self.count))
-        state, outcome = jax.vmap(self._begin)(keys)
-        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)
-        return self._split((state, time_step(obs, outcome, jnp.ones(self.count, bool))))
+        return self._split(self._reset)(jax.random.split(key, self.count))
 
     def step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
         """Advance N instances by one environment step.
@@ -56,9 +55,17 @@ class BatchEnv:
             state: from `reset` or the previous `step`.
             actions: (N, 2), each in [-1, 1].
         """
+        return self._split(self._step)(state, actions)
+
+    def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
+        state, outcome = jax.vmap(self._begin)(keys)
+        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)
+        return state, time_step(obs, outcome, jnp.ones(keys.shape[:1], bool))
+
+    def _step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome, first = jax.vmap(self._advance)(state, actions)
         obs = jax.vmap(lambda one: observe(self.env, one))(state.env)  # once, after the choice between step and reset
-        return self._split((state, time_step(obs, outcome, first)))
+        return state, time_step(obs, outcome, first)
 
     def _begin(self, key: jax.Array) -> tuple[BatchState, Outcome]:
         key, params_key = jax.random.split(key)
@@ -76,13 +83,16 @@ class BatchEnv:
         )
         return chosen, outcome, ended
 
-    def _split(self, tree):
-        """The tree with its first axis split over the devices."""
+    def _split(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function with each device computing its own instances.
+
+        Left to XLA, every device would draw the images of all: it cannot cut the camera's kernel.
+        """
         if not self.devices:
-            return tree
+            return function
         mesh = jax.sharding.Mesh(self.devices, ("instance",))
-        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("instance"))
-        return jax.lax.with_sharding_constraint(tree, sharding)
+        rows = jax.sharding.PartitionSpec("instance")
+        return jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
 
 
 def make_batch(env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = ()) -> BatchEnv:

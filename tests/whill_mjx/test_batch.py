@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +17,31 @@ from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, step
 from whill_mjx.task import ObstacleCourse
 
+ROOT = Path(__file__).parents[2]
+TWO_DEVICES = """
+import json
+import jax, jax.numpy as jnp, numpy as np
+from whill_mjx.batch import make_batch
+from whill_mjx.env import make_env
+from whill_mjx.task import ObstacleCourse
+env, params = make_env(ObstacleCourse(max_steps=1), height=16, width=16)
+told = {}
+def run(devices):
+    batch = make_batch(env, params, 4, 0.1, devices)
+    def drive(key):
+        state, _ = batch.reset(key)
+        return jax.lax.scan(batch.step, state, jnp.ones((2, 4, 2)))
+    compiled = jax.jit(drive).lower(jax.random.key(0)).compile()
+    state, frames = compiled(jax.random.key(0))
+    told["exchanged"] = any(name in compiled.as_text() for name in ("all-gather", "all-reduce", "collective-permute"))
+    told["rows"] = [shard.data.shape[1] for shard in frames.obs.addressable_shards]
+    told["firsts"] = np.asarray(frames.first).tolist()
+    return np.asarray(frames.obs, int), np.append(state.env.vehicle.qpos, frames.reward)
+alone, many = run(()), run(tuple(jax.devices()))
+told["equal_pixels"] = float((np.abs(alone[0] - many[0]) <= 1).mean())
+told["difference"] = float(np.abs(alone[1] - many[1]).max())
+print(json.dumps(told))
+"""
 COUNT = 3
 
 
@@ -67,6 +98,18 @@ def test_instances_have_their_own_worlds_and_vehicles(batch):
 def test_the_same_key_gives_the_same_worlds(batch):
     one, other = (batch[1](jax.random.key(4))[1] for _ in range(2))
     np.testing.assert_array_equal(one.obs, other.obs)
+
+
+def test_devices_step_their_own_instances_and_give_what_one_device_gives():
+    flags = "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    command = [sys.executable, "-c", TWO_DEVICES]
+    answer = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr[-3000:]
+    told = json.loads(answer.stdout.splitlines()[-1])
+    assert told["rows"] == [2, 2] and not told["exchanged"]
+    assert told["firsts"] == [[False] * 4, [True] * 4]  # the second step begins new episodes
+    assert told["difference"] < 1e-5 and told["equal_pixels"] > 0.99
 
 
 def test_instances_can_be_split_over_devices_and_uneven_splits_are_refused():
