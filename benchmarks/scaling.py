@@ -1,7 +1,7 @@
 """Measures how stepping the environment and learning scale over the devices of one host, at a fixed work per device.
 
     python -m benchmarks.scaling                          # 1, 2 and 4 devices, those that exist
-    python -m benchmarks.scaling --devices 1 2 --manual   # and with the chairs' step cut by hand
+    python -m benchmarks.scaling --devices 1 2 --parts learner
     XLA_FLAGS=--xla_force_host_platform_device_count=4 python -m benchmarks.scaling --tiny --out DIR   # on a CPU
 
 Efficiency is the share of linear scaling, rate_n / (n * rate_1). All device counts are compiled first and then take
@@ -22,7 +22,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
 from benchmarks.harness import RESULTS, figure, record
 from dreamer import agent as agents
@@ -43,7 +43,6 @@ TINY: dict[str, Any] = dict(
     deter=16, hidden=8, units=8, stoch=2, classes=4, blocks=2, patch_units=4, depth=1, imag_horizon=2, scan_unroll=1,
     value_layers=1, policy_layers=1,
 )  # fmt: skip
-BY_HAND = "_manual"
 Name = tuple[str, int]
 """Part and device count."""
 BYTES = {"pred": 1, "s8": 1, "u8": 1, "bf16": 2, "f16": 2, "s64": 8, "u64": 8, "f64": 8}
@@ -74,8 +73,6 @@ class Options:
     """Size of the learner."""
     blocks: int = 7
     """Timed blocks of each device count."""
-    manual: bool = False
-    """Also step the chairs with each device on its own (`shard_map`), which leaves the compiler nothing to place."""
     parts: tuple[str, ...] = ("env", "learner")
     """What to measure."""
     tiny: bool = False
@@ -115,17 +112,16 @@ def sized(options: Options) -> Options:
     )  # fmt: skip
 
 
-def env_program(options: Options, count: int, manual: bool = False) -> Program:
+def env_program(options: Options, count: int) -> Program:
     """`steps` steps of `instances` chairs on each device: obstacle course, camera image, auto-reset, random actions."""
     devices = choose_devices(count)
     total = count * options.instances
     task = make_task("obstacle_course")
     env = functional_env(make_training_env(task, "whill_cr_ramp", total, devices=devices))
-    advance = by_hand(options, devices) if manual and devices else env.step
 
     def body(carry: tuple[Any, Transition, jax.Array], key: jax.Array) -> tuple[Any, None]:
         state, transition, earned = carry
-        state, transition = advance(state, jax.random.uniform(key, (total, ACTION_DIM), minval=-1.0))
+        state, transition = env.step(state, jax.random.uniform(key, (total, ACTION_DIM), minval=-1.0))
         return (state, transition, earned + transition.reward), None
 
     def block(carry: tuple[Any, Transition, jax.Array, jax.Array]) -> tuple[Any, Transition, jax.Array, jax.Array]:
@@ -145,16 +141,8 @@ def env_program(options: Options, count: int, manual: bool = False) -> Program:
     placement = jax.tree.map(lambda leaf: leaf.sharding, state)
     compiled = jax.jit(block, donate_argnums=0, out_shardings=placement).lower(state).compile()
     compile_s = time.perf_counter() - start
-    show_exchange(f"environment, {count} devices{', by hand' if manual else ''}, {compile_s:.1f} s", compiled)
+    show_exchange(f"environment, {count} devices, {compile_s:.1f} s", compiled)
     return Program(compiled, state, total * options.steps, compile_s)
-
-
-def by_hand(options: Options, devices: tuple[jax.Device, ...]) -> Callable[[Any, jax.Array], tuple[Any, Transition]]:
-    """The step of all chairs, each device stepping its own as a single device would."""
-    alone = functional_env(make_training_env(make_task("obstacle_course"), "whill_cr_ramp", options.instances))
-    rows = PartitionSpec("instance")
-    mesh = Mesh(devices, ("instance",))
-    return jax.shard_map(alone.step, mesh=mesh, in_specs=(rows, rows), out_specs=(rows, rows), check_vma=False)
 
 
 def learner_program(options: Options, count: int) -> Program:
@@ -259,8 +247,7 @@ def measure(unit: str, programs: dict[Name, Program], blocks: int) -> dict[str, 
         figures[f"{part}_{unit}_{count}"] = figure(each, "1/s")
         figures[f"{part}_compile_s_{count}"] = figure([programs[part, count].compile_s], "s")
         if count > 1:
-            alone = found[part, 1] if (part, 1) in found else found[part.removesuffix(BY_HAND), 1]
-            share = statistics.median(each) / (count * statistics.median(alone))
+            share = statistics.median(each) / (count * statistics.median(found[part, 1]))
             figures[f"{part}_efficiency_{count}"] = figure([share], "of linear")
     for name, one in figures.items():
         print(f"{name}: {one['value']:,.4g} {one['unit']}", flush=True)
@@ -275,8 +262,6 @@ def main(options: Options) -> None:
     figures: dict[str, dict[str, Any]] = {}
     if "env" in options.parts:
         programs = {("env", count): env_program(options, count) for count in counts}
-        if options.manual:  # on one device there is nothing to cut: its rate is the base of both
-            programs |= {("env" + BY_HAND, count): env_program(options, count, True) for count in counts if count > 1}
         figures |= measure("steps_per_s", programs, options.blocks)
         programs.clear()
     if "learner" in options.parts:

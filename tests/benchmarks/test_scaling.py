@@ -37,9 +37,9 @@ def machine(monkeypatch):
     """Two devices by name, and programs that only take turns; the order of their calls."""
     calls = []
 
-    def make(options, count, manual=False):
+    def make(options, count):
         def run(state):
-            calls.append((count, manual))
+            calls.append(count)
             return state + 1
 
         return Program(run, 0, 1000 * count, 0.5)
@@ -52,21 +52,19 @@ def machine(monkeypatch):
 
 @pytest.mark.quick
 def test_efficiencies_are_the_rates_over_so_many_times_that_of_one_device(machine, tmp_path):
-    scaling.main(Options(out=tmp_path, manual=True))
+    scaling.main(Options(out=tmp_path))
     content = json.loads((tmp_path / "scaling.json").read_text())
     figures = {name: one["value"] for name, one in content["figures"].items()}
     for part, unit in (("env", "steps_per_s"), ("learner", "replayed_steps_per_s")):
         share = figures[f"{part}_{unit}_2"] / (2 * figures[f"{part}_{unit}_1"])
         assert figures[f"{part}_efficiency_2"] == pytest.approx(share)
         assert figures[f"{part}_compile_s_2"] == 0.5
-    share = figures["env_manual_steps_per_s_2"] / (2 * figures["env_steps_per_s_1"])
-    assert figures["env_manual_efficiency_2"] == pytest.approx(share)
 
 
 @pytest.mark.quick
 def test_device_counts_take_turns_block_by_block(machine, tmp_path):
     scaling.main(Options(out=tmp_path, parts=("learner",), blocks=5))
-    assert machine == [(1, False), (2, False)] * 6  # one round is not counted
+    assert machine == [1, 2] * 6  # one round is not counted
     figures = json.loads((tmp_path / "scaling.json").read_text())["figures"]
     assert len(figures["learner_replayed_steps_per_s_2"]["repeats"]) == 5
 
