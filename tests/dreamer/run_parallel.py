@@ -39,6 +39,7 @@ def run(devices, iterations=9):
         "columns": state.replay.obs.addressable_shards[0].data.shape[1],
         "replicated": all(leaf.sharding.is_fully_replicated for leaf in jax.tree.leaves(state.agent)),
         "reduces": "all-reduce" in step.as_text(),
+        "flops": step.cost_analysis()["flops"],
     }  # fmt: skip
     return flat(state.agent.params), sums, placed
 
@@ -65,11 +66,12 @@ def redundancy(mesh):
 
 
 def several_devices(out):
-    alone, alone_sums, _ = run(jax.devices()[:1])
+    alone, alone_sums, before = run(jax.devices()[:1])
     many, many_sums, placed = run(jax.devices())
     mesh = parallel.make_mesh(jax.devices(), 8, 16)
     np.savez(out, alone=alone, many=many, statistics_alone=redundancy(None), statistics_many=redundancy(mesh))
-    out.with_suffix(".json").write_text(json.dumps({"alone": alone_sums, "many": many_sums, **placed}))
+    told = {"alone": alone_sums, "many": many_sums, "flops_alone": before["flops"], **placed}
+    out.with_suffix(".json").write_text(json.dumps(told))
 
 
 def one_of_two(out, port, index):

@@ -47,6 +47,12 @@ def test_eight_devices_give_the_run_of_one(several):
         np.testing.assert_allclose(told["many"][name], value, rtol=1e-3, atol=1e-3, err_msg=name)
 
 
+def test_eight_devices_share_the_arithmetic_of_one(several):
+    _, told = several
+    rest = 0.25  # what each does with the whole parameters and replay, which counts in so small a net
+    assert told["flops"] < (1 + rest) * told["flops_alone"] / 8
+
+
 def test_what_the_whole_batch_tells_is_that_of_one_device(several):
     result, _ = several
     np.testing.assert_allclose(result["statistics_many"], result["statistics_alone"], rtol=1e-5, atol=1e-6)
