@@ -84,13 +84,20 @@ def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
     return {name: _bind(jax.jit(function), arguments) for name, (function, arguments) in calls.items()}
 
 
-def peer(size: str, batch: int | None, blocks: int, per_block: int) -> dict[str, Any]:
-    """Updates/s of SheepRL's learner, plain and through `torch.compile`; of the faster one as the peer's."""
+def peer(size: str, batch: int | None, blocks: int, per_block: int, limit_s: float) -> dict[str, Any]:
+    """Updates/s of SheepRL's learner, plain and through `torch.compile`; of the faster one as the peer's.
+
+    One that takes longer than `limit_s` is left out.
+    """
     found = {}
     for name, more in (("eager", []), ("compiled", ["--compile"])):
         command = [sys.executable, "-m", "benchmarks.learner_peer", "--size", size, "--blocks", str(blocks),
                    "--per-block", str(per_block), "--batch-size", str(batch or 16), *more]
-        answer = subprocess.run(command, capture_output=True, text=True)
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            print(f"peer, {name}: left out, not done after {limit_s:g} s", flush=True)
+            continue
         if answer.returncode:
             print(f"peer, {name}: left out, {answer.stderr.strip().splitlines()[-1]}", flush=True)
             continue
@@ -129,6 +136,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--per-block", type=int, default=10)
     parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
     parser.add_argument("--peer", action="store_true", help="also time the learner of SheepRL at this size")
+    parser.add_argument("--peer-limit-s", type=float, default=600.0, help="for each of the peer's two ways")
     learner_study.add_arguments(parser)
     parser.add_argument("--dry", action="store_true", help="print only")
     return parser
@@ -186,7 +194,7 @@ def main() -> None:
             keep(figures)
     learner_study.run(name, config, args, keep)
     if args.peer:
-        keep(peer(name.removeprefix("size").upper(), args.batch_size, args.blocks, args.per_block))
+        keep(peer(name.removeprefix("size").upper(), args.batch_size, args.blocks, args.per_block, args.peer_limit_s))
     if args.json:
         print(json.dumps(known))
 
