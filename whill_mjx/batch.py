@@ -84,9 +84,9 @@ class BatchEnv:
         return chosen, outcome, ended
 
     def _split(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function with each device computing its own instances.
+        """The function with each device computing its own instances, by the program of a single device.
 
-        Left to XLA, every device would draw the images of all: it cannot cut the camera's kernel.
+        Nothing is left to XLA, which cuts plain arithmetic as well, but would have every device run a kernel for all.
         """
         if not self.devices:
             return function
