@@ -57,6 +57,8 @@ class Benchmark:
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
     """The logs of 4 times that size against a catalogue that lacks the effect; after those logs are driven."""
+    only: tuple[str, ...] = ()
+    """Only logs with these effects, of those from `base` and `scales`."""
     full: int = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -137,10 +139,10 @@ def plant(settings: Benchmark) -> None:
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
     judge(contact.null_jobs(settings.nulls, part))
-    while settings.base and (listed := contact.probe_jobs(work, part)):
+    while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
     if settings.scales:
-        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, noise))
+        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, noise, settings.only))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:

@@ -36,8 +36,10 @@ POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
 NEAR, FAR = (0.3, 3.0), (0.1, 10.0)
 """How far an effect may stand out, of what 80 % power needs, where its size is taken for found, and at all used."""
-PROBES = 5
-"""Sizes at which an effect is driven at most."""
+PROBES = 6
+"""Logs with which the size of an effect is looked for at most."""
+BESIDE = 2.0
+"""Factor on a size within which a second log must have been driven, before what one log showed there is believed."""
 REACH = 100.0
 """Factor on the base size, up or down, beyond which no size is tried."""
 SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
@@ -96,24 +98,27 @@ def null_jobs(nulls: int, part: str) -> list[Job]:
     return [Job(f"null_{n:03d}", {}, 20000 + n) for n in range(nulls) if mine(n, part)]
 
 
-def probe_jobs(work: Path, part: str) -> list[Job]:
-    """The next log of each effect that brings its size nearer to where it would be noticed with 80 % power."""
+def probe_jobs(work: Path, part: str, only: Sequence[str] = ()) -> list[Job]:
+    """The next log of each effect (of those in `only`, if any) that brings its size nearer to where it would be noticed
+    with 80 % power."""
     out = []
     for i, name in enumerate(sorted(EFFECTS)):
         points = seen_at(work, name)
-        size = next_size(EFFECTS[name].base, points) if mine(i, part) else None
+        size = next_size(EFFECTS[name].base, points) if mine(i, part) and name in (only or EFFECTS) else None
         if size is not None:
             label = f"{name}_probe_{len(points)}" if points else f"{name}_base"
             out.append(Job(label, {name: size}, 30000 + 50 * i + 40 + len(points), stage="base"))
     return out
 
 
-def scaled_jobs(work: Path, scales: Sequence[float], seeds: int, part: str, noise: float = 1.0) -> list[Job]:
-    """Logs with one effect each, at multiples of that size, as far as the chair still drives with it."""
+def scaled_jobs(
+    work: Path, scales: Sequence[float], seeds: int, part: str, noise: float = 1.0, only: Sequence[str] = ()
+) -> list[Job]:
+    """Logs with one effect each (of `only`, if any), at multiples of that size, as far as the chair still drives."""
     sizes = power_sizes(work, noise)
     return [Job(f"{name}_x{scale:g}_{seed}", {name: capped(name, scale * sizes[name])},
                 30001 + 50 * i + 10 * j + seed, scale, "scaled")
-            for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part)
+            for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part) and name in (only or sizes)
             for j, scale in enumerate(scales) for seed in range(seeds)]
 
 
@@ -156,31 +161,53 @@ def seen_at(work: Path, name: str) -> list[Point]:
     return sorted(points)
 
 
+def rising(points: Sequence[Point]) -> list[Point]:
+    """The same sizes with how far an effect stands out there made to rise with the size, each log counting alike.
+
+    An effect that strikes at random, or differently on another day, may stand out at a small size and not at a larger
+    one: such logs are taken together.
+    """
+    from scipy.optimize import isotonic_regression
+
+    points = sorted(points)
+    level = isotonic_regression(np.log([found for _, found in points])).x
+    return [(size, float(np.exp(one))) for (size, _), one in zip(points, level, strict=True)]
+
+
 def next_size(base: float, points: Sequence[Point]) -> float | None:
-    """Where to drive an effect next; None where a size is close enough, or none is in reach."""
+    """Where to drive an effect next; None where a size is close enough and two logs tell so, or none is in reach."""
     if not points:
         return base
-    near = min(points, key=lambda point: abs(np.log(point[1])))
-    if NEAR[0] < near[1] < NEAR[1] or len(points) >= PROBES:
+    if len(points) >= PROBES:
         return None
+    points = rising(points)
+    near = min(points, key=lambda point: abs(np.log(point[1])))
+    if NEAR[0] < near[1] < NEAR[1]:
+        size = crossing(points)
+        return None if size is None or _beside(size, points) > 1 else size
     below = [size for size, found in points if found < 1]
     above = [size for size, found in points if found > 1]
-    if below and above and max(below) < min(above):
+    if below and above:
         return float(np.sqrt(max(below) * min(above)))
     size, found = max(points) if below else min(points)
     size *= float(np.clip(found**-0.5, 1 / 8, 3.0))  # what stands out grows with the square of the size
     return size if abs(np.log(size / base)) < np.log(REACH) else None
 
 
+def _beside(size: float, points: Sequence[Point]) -> int:
+    """Number of logs with about this size."""
+    return sum(1 / BESIDE <= one / size <= BESIDE for one, _ in points)
+
+
 def power_sizes(work: Path, noise: float = 1.0) -> dict[str, float]:
     """Size of each effect that would be noticed with 80 % power; without those for which no such size was found.
 
-    Where no effect was driven to find its size, the sizes are the recorded ones, times the noise.
+    Of an effect that was not driven to find its size, it is the recorded one, times the noise.
     """
     driven = {name: seen_at(work, name) for name in EFFECTS}
-    found = {name: size_between(EFFECTS[name].base, points) for name, points in driven.items()}
-    if not any(driven.values()) and RECORDED.exists():
-        found = {name: noise * one["value"] for name, one in json.loads(RECORDED.read_text())["sizes"].items()}
+    recorded = json.loads(RECORDED.read_text())["sizes"] if RECORDED.exists() else {}
+    found = {name: size_between(EFFECTS[name].base, points) if points
+             else noise * recorded[name]["value"] if name in recorded else None for name, points in driven.items()}
     return {name: size for name, size in found.items() if size is not None}
 
 
@@ -188,13 +215,18 @@ def size_between(base: float, points: Sequence[Point]) -> float | None:
     """The size at which an effect stands out by 1, once the search for it is over."""
     if not points or next_size(base, points) is not None:
         return None
+    return crossing(rising(points))
+
+
+def crossing(points: Sequence[Point]) -> float | None:
+    """Where rising points pass 1, or would; None where they are too far from it."""
     above = min((point for point in points if point[1] >= 1), default=None)
-    below = max((point for point in points if point[1] < 1 and (above is None or point[0] < above[0])), default=None)
+    below = max((point for point in points if point[1] < 1), default=None)
     if above and below:
         rate = np.log(above[1] / below[1]) / np.log(above[0] / below[0])
         return float(below[0] * below[1] ** (-1 / rate))
     size, found = above or below or points[0]
-    return size * found**-0.5 if FAR[0] < found < FAR[1] else None
+    return float(size * found**-0.5) if FAR[0] < found < FAR[1] else None
 
 
 def judge(
@@ -294,14 +326,19 @@ def figures(work: Path, noise: float = 1.0) -> None:
              for name, size in power_sizes(work).items()} if noise == 1.0 else recorded.get("sizes", {})
     path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
     content = {**json.loads(path.read_text()), "sizes": sizes}
-    stages = {one["stage"] for _, one in cases}  # logs of other kinds may have been judged in another folder
+    judged = {_kind(truth, one["stage"]) for truth, one in cases}  # others may have been judged in another folder
     kept = [row for row in recorded.get("confusion", [])
-            if row["stage"] not in stages or row.get("noise", 1.0) != noise]
+            if _kind(row["truth"], row["stage"]) not in judged or row.get("noise", 1.0) != noise]
     content["confusion"] = kept + [
         {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": noise, "verdict": one["verdict"],
          "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
          "explained": one["share"]} for truth, one in cases]
     write_report(path, content)
+
+
+def _kind(truth: Mapping[str, float], stage: str) -> tuple[str, ...]:
+    """What is judged in one folder: all logs of a stage, or all with which the size of one effect is looked for."""
+    return (stage, *truth) if stage == "base" else (stage,)
 
 
 Case = tuple[dict[str, float], dict[str, Any]]

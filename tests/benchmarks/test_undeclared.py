@@ -149,3 +149,55 @@ def test_committed_classes_are_small_and_of_the_catalogue():
     for one in sensors.values():
         for name, members in one["classes"].items():
             assert members[0] == name and len(members) <= 4 and set(members) <= set(one["classes"])
+
+
+@pytest.mark.quick
+def test_one_lucky_log_does_not_set_the_size_of_an_effect_that_strikes_at_random(tmp_path):
+    """Lost messages: a few of them may hit the start of a drive, and many may hit nothing."""
+    name, right, base = "command_dropouts", 0.05, 0.08
+    lucky = iter([3.0, 0.8, 2.0, 0.5, 1.2, 0.9])
+    write(tmp_path, name, 7, 0.0024, 1.1)  # in another search's path a lucky log came first
+    write(tmp_path, name, 8, 0.0097, 0.02)
+    tried = []
+    while (size := contact.next_size(base, contact.seen_at(tmp_path, name))) is not None:
+        write(tmp_path, name, len(tried), size, (size / right) ** 2 * next(lucky))
+        tried.append(size)
+    assert len(tried) + 2 <= contact.PROBES
+    assert 0.02 < contact.power_sizes(tmp_path)[name] < 0.12
+
+
+@pytest.mark.quick
+def test_a_size_is_believed_only_after_a_second_log(tmp_path):
+    name = "command_dropouts"
+    write(tmp_path, name, 0, 0.08, 1.0)
+    again = contact.next_size(0.08, contact.seen_at(tmp_path, name))
+    assert again == pytest.approx(0.08)
+    assert contact.size_between(0.08, contact.seen_at(tmp_path, name)) is None
+    write(tmp_path, name, 1, again * 1.0001, 0.05)  # it was luck
+    assert contact.next_size(0.08, contact.seen_at(tmp_path, name)) > 0.1
+
+
+@pytest.mark.quick
+def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path, monkeypatch):
+    recorded = json.loads(contact.RECORDED.read_text())
+    path = tmp_path / "undeclared.json"
+    path.write_text(json.dumps(recorded))
+    monkeypatch.setattr(contact, "RECORDED", path)
+    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+    assert [job.effects for job in contact.probe_jobs(tmp_path, "1/1", ["slope"])] == [
+        {"slope": contact.EFFECTS["slope"].base}]
+    for number in (0, 1):
+        write(tmp_path, "slope", number, 0.03 + 1e-6 * number, 1.0)
+    for one in (tmp_path / "verdicts").iterdir():
+        one.write_text(json.dumps({**json.loads(one.read_text()), "scale": 0.0, "verdict": "named", "share": 0.9,
+                                   "effects": [], "p_value": 0.001}))
+    contact.figures(tmp_path)
+    after = json.loads(path.read_text())
+    assert after["sizes"].pop("slope")["value"] == pytest.approx(0.03, rel=1e-3)
+    recorded["sizes"].pop("slope")
+    assert after["sizes"] == recorded["sizes"]
+
+    def others(content):
+        return [row for row in content["confusion"] if not (row["stage"] == "base" and "slope" in row["truth"])]
+
+    assert others(after) == others(recorded)
