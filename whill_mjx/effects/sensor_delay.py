@@ -17,10 +17,10 @@ GAP = 0.02  # [s] between them
 
 @struct.dataclass
 class PastReadings:
-    """Readings of the past, newest first. Scalars apart from one another, which a compiler makes one loop of."""
+    """Readings of the past, newest first."""
 
-    value: tuple[tuple[jax.Array, ...], ...]  # SLOTS times x, y, yaw, v, omega
-    age: jax.Array  # () s, of the newest; the others follow at the same distance
+    value: jax.Array  # (SLOTS, 5) x, y, yaw, v, omega
+    age: jax.Array  # () s, of the newest; each of the others is one gap older than the one before
 
 
 @struct.dataclass
@@ -37,24 +37,19 @@ class SensorDelay(Effect):
     delay: jax.Array = parameter("s", 0.0, 0.3, 0.0, "age of a reading when it is reported")
 
     def init(self) -> PastReadings:
-        return PastReadings(tuple(tuple(jnp.zeros(5)) for _ in range(SLOTS)), jnp.asarray(GAP))
+        return PastReadings(jnp.zeros((SLOTS, 5)), jnp.asarray(GAP))
 
     def sensing(self, memory: PastReadings, reading: Odometry, motion: Motion) -> tuple[PastReadings, Odometry]:
         """Late reading."""
         gap = motion.dt * jnp.maximum(jnp.floor(GAP / motion.dt + 0.5), 1.0)  # a whole number of steps
-        now = (reading.x, reading.y, reading.yaw, reading.v, reading.omega)
-        late, newer = list(now), now
-        for slot, older in enumerate(memory.value):
-            # How much of the stretch between the two readings lies within the delay.
-            since, length = (0.0, memory.age) if slot == 0 else (memory.age + (slot - 1) * gap, gap)
-            share = jnp.clip((self.delay - since) / length, 0.0, 1.0)
-            late = [value + share * (then - after) for value, then, after in zip(late, older, newer, strict=True)]
-            newer = older
+        now = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
+        value = jnp.concatenate([now[None], memory.value])
+        since = jnp.concatenate([jnp.zeros(1), memory.age + gap * jnp.arange(SLOTS - 1)])
+        length = jnp.concatenate([memory.age[None], jnp.full(SLOTS - 1, gap)])
+        # How much of each stretch between two readings lies within the delay.
+        share = jnp.clip((self.delay - since) / length, 0.0, 1.0)
+        late = now + (share[:, None] * (value[1:] - value[:-1])).sum(0)
         keep = memory.age > gap - motion.dt / 2
-        kept = tuple(
-            tuple(jnp.where(keep, after, then) for after, then in zip(newer, older, strict=True))
-            for newer, older in zip((now, *memory.value), memory.value, strict=False)
-        )
         x, y, yaw, v, omega = late
-        age = jnp.where(keep, 0.0, memory.age) + motion.dt
-        return PastReadings(kept, age), replace(reading, x=x, y=y, yaw=yaw, v=v, omega=omega)
+        kept = PastReadings(jnp.where(keep, value[:-1], memory.value), jnp.where(keep, 0.0, memory.age) + motion.dt)
+        return kept, replace(reading, x=x, y=y, yaw=yaw, v=v, omega=omega)
