@@ -7,7 +7,8 @@
 Steps are those of the suite (0.01 s), of which a decision takes two (grid: one); the train ratio counts decisions, so
 that published curves with 256 for each step or 512 for each decision of two both mean --ratio 512, a quarter of an
 update per step. All seeds run in one program. The same command goes on where it was stopped, by the clock or by a kill;
-the curve of every seed goes into results/dreamer_control.json.
+the curve of every seed goes into results/dreamer_control.json. Seeds that ran in processes of their own (--seeds 1
+--first-seed N --separate --dry) are put together by the command of all seeds with --separate --collect DEVICE.
 """
 
 from __future__ import annotations
@@ -103,24 +104,38 @@ def run(options: argparse.Namespace) -> None:
     config = make_config(options, task)
     seeds = tuple(range(options.first_seed, options.first_seed + options.seeds))
     began = time.monotonic()
-    runs = [
-        (group, train_group(options, task, config, group, began))
-        for group in ([(seed,) for seed in seeds] if options.separate else [seeds])
-    ]
+    groups = [(seed,) for seed in seeds] if options.separate else [seeds]
+    if options.collect:
+        runs = [(group, read_log(folder(options, group))) for group in groups]
+    else:
+        runs = [(group, train_group(options, task, config, group, began)) for group in groups]
     figures = summary(options, task, config, runs)
     for name, entry in figures.items():
         print(f"{name}: {entry['value']:.4g} {entry['unit']} {[round(x, 3) for x in entry['repeats']]}", flush=True)
     if any(not lines or lines[-1]["env_steps"] * task.repeat < options.steps for _, lines in runs):
         print("stopped by the clock; the same command goes on.")
+    if options.collect:
+        made_there = (name for name in figures if "random" not in name)
+        figures = {name: {**figures[name], "device": options.collect} for name in made_there}
     if figures and not options.dry:
         print(f"written to {record('dreamer_control', CLAIM, figures)}")
+
+
+def folder(options: argparse.Namespace, seeds: tuple[int, ...]) -> Path:
+    """Where seeds that share a program leave their run."""
+    return options.out / f"{label(options)}_{options.steps}_{'-'.join(map(str, seeds))}"
+
+
+def read_log(out: Path) -> list[dict[str, float]]:
+    """All lines of a run's log."""
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
 def train_group(
     options: argparse.Namespace, task: Task, config: DreamerConfig, seeds: tuple[int, ...], began: float
 ) -> list[dict[str, float]]:
     """Train these seeds as one program, or go on with them, and return all lines of the log."""
-    out = options.out / f"{label(options)}_{options.steps}_{'-'.join(map(str, seeds))}"
+    out = folder(options, seeds)
 
     def evaluation(params: Any, decisions: int) -> dict[str, float]:
         result = evaluate(
@@ -132,8 +147,7 @@ def train_group(
         return {f"return_{seed}": float(value) for seed, value in zip(seeds, each, strict=True)}
 
     left = None if options.minutes is None else max(0.0, 60 * options.minutes - (time.monotonic() - began))
-    log = out / "metrics.jsonl"
-    if left == 0.0 and not log.exists():
+    if left == 0.0 and not (out / "metrics.jsonl").exists():
         return []
     train(
         task.train, config, out, options.steps // task.repeat, seeds[0] if options.separate else seeds,
@@ -141,7 +155,7 @@ def train_group(
         checkpoint_every_s=options.checkpoint_s, log_every_s=10.0, on_metrics=progress(task, began), progress=False,
         time_limit_s=left,
     )  # fmt: skip
-    return [json.loads(line) for line in log.read_text().splitlines()]
+    return read_log(out)
 
 
 def progress(task: Task, began: float) -> Any:
@@ -216,6 +230,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--checkpoint-s", type=float, default=600.0, help="seconds between checkpoints")
     parser.add_argument("--out", type=Path, default=Path("runs/control"))
     parser.add_argument("--separate", action="store_true", help="one seed after the other, each a program of its own")
+    parser.add_argument("--collect", metavar="DEVICE", help="only record the runs in --out, which were made there")
     parser.add_argument("--dry", action="store_true", help="print only")
     return parser.parse_args()
 
