@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from fractions import Fraction
-from functools import partial
 from typing import Any
 
 import jax
@@ -23,9 +22,6 @@ from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
 
 Metrics = dict[str, jax.Array]
 Update = Callable[[DreamerConfig, AgentState, Batch, jax.Array], tuple[AgentState, Latent, Metrics]]
-_AXES: dict[str, Any] = {field.name: 0 if field.name == "start" else 1 for field in dataclasses.fields(Batch)}
-BATCH_AXES = Batch(**_AXES)
-"""The axis of a batch's sequences in each of its fields."""
 
 
 @struct.dataclass
@@ -199,15 +195,16 @@ def replayed_updates(
     config: DreamerConfig, state: TrainState, updates: jax.Array, key: jax.Array, update: Update, mesh: Mesh | None
 ) -> tuple[TrainState, Metrics]:
     """`updates` times () a batch, an `update` on it, and its latents written back; the metrics are sums."""
-    step = parallel.over_batch(mesh, partial(update, config), (None, BATCH_AXES, None), (None, 1, None))
 
     def one(i: jax.Array, carry: tuple[AgentState, Replay]) -> tuple[tuple[AgentState, Replay], Metrics]:
         agent, memory = carry
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         memory, batch, window = replay.sample(config, memory, sample_key)
-        agent, latent, metrics = step(agent, batch, update_key)
+        agent, latent, metrics = update(config, agent, batch, update_key)
         return (agent, replay.write_back(config, memory, window, latent)), metrics
 
+    columns = jax.tree.map(lambda leaf: 1 if leaf.ndim >= 2 else None, state.replay)
+    one = parallel.over_batch(mesh, one, (None, (None, columns)), ((None, columns), None))
     (agent, memory), sums = sum_over(updates, one, (state.agent, state.replay))
     metrics = {**{f"update/{name}": value for name, value in sums.items()}, "updates": updates}
     return dataclasses.replace(state, agent=agent, replay=memory), metrics

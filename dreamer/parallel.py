@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -77,6 +78,40 @@ def total(tree: Any) -> Any:
 def gather(x: jax.Array, axis: int) -> jax.Array:
     """The shares of all devices joined along an axis, for what only the whole batch tells."""
     return jax.lax.all_gather(x, AXIS, axis=axis, tiled=True) if _divided() else x
+
+
+def devices() -> int:
+    """Devices that share a batch; 1 outside of `over_batch`."""
+    return jax.lax.axis_size(AXIS) if _divided() else 1
+
+
+def own_columns(column: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """Where columns of an array that is split over the devices lie here, and whether they do, else it is `count`.
+
+    Args:
+        column: int32 numbers in the whole array.
+        count: columns on each device.
+    """
+    if not _divided():
+        return column, jnp.ones(column.shape, bool)
+    here = column - jax.lax.axis_index(AXIS) * count
+    mine = (here >= 0) & (here < count)
+    return jnp.where(mine, here, count), mine
+
+
+def deal(x: jax.Array, mine: jax.Array, axis: int) -> jax.Array:
+    """To each device its share along an axis, of entries of which each lies on one device.
+
+    Args:
+        x: every device's entries, for the whole batch.
+        mine: (B,) bool, which of them count.
+        axis: that of the B sequences.
+    """
+    if not _divided():
+        return x
+    x = jnp.where(mine.reshape(mine.shape + (1,) * (x.ndim - axis - 1)), x, jnp.zeros((), x.dtype))
+    kind = jnp.uint8 if x.dtype == bool else x.dtype
+    return jax.lax.psum_scatter(x.astype(kind), AXIS, scatter_dimension=axis, tiled=True).astype(x.dtype)
 
 
 def own_rows(draw: Callable[[int], jax.Array], lead: tuple[int, ...]) -> jax.Array:

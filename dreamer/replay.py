@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer import distributions as dist
-from dreamer import host_replay, spaces
+from dreamer import host_replay, parallel, spaces
 from dreamer.config import DreamerConfig
 from dreamer.host_replay import HostFrames
 from dreamer.rssm import Latent
@@ -164,7 +164,7 @@ def sample(config: DreamerConfig, replay: Replay, key: jax.Array) -> tuple[Repla
     Returns:
         The memory with the queue advanced, the batch, and its place.
     """
-    rows, streams = replay.reward.shape
+    rows, streams = replay.reward.shape[0], replay.reward.shape[1] * parallel.devices()
     length = config.batch_length
     filled = size(replay)
     stream_key, start_key = jax.random.split(key)
@@ -187,10 +187,12 @@ def sample(config: DreamerConfig, replay: Replay, key: jax.Array) -> tuple[Repla
 
 
 def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Replay, Batch]:
-    """The memory, and the batch that lies at a window."""
+    """The memory, and the batch that lies at a window; of several devices, each gets its own sequences."""
+    column, mine = parallel.own_columns(window.stream, replay.reward.shape[1])
 
     def take(memory: jax.Array, row: jax.Array) -> jax.Array:
-        return memory.at[row, window.stream].get(mode="promise_in_bounds")
+        mode = "promise_in_bounds" if parallel.devices() == 1 else "clip"
+        return parallel.deal(memory.at[row, column].get(mode=mode), mine, row.ndim - 1)
 
     context, trained = window.row[0], window.row[1:]
     index = take(replay.stoch, context).astype(jnp.int32)
@@ -213,15 +215,18 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Repla
 
 
 def write_back(config: DreamerConfig, replay: Replay, window: Window, latent: Latent) -> Replay:
-    """Replace the stored states of a window's trained steps by latent (T, B, ...).
+    """Replace the stored states of a window's trained steps by latent (T, B, ...), of which devices hold their share.
 
     Where sequences overlap, those of the last one are kept, as if they were written one after the other. Which of two
     writes to one place a GPU keeps is open: a state could be mixed of both.
     """
     outside = replay.reward.shape[0]  # a row that does not exist: what goes there is dropped
-    place = (jnp.where(overwritten(window, outside), outside, window.row[1:]), window.stream)
-    deter = replay.deter.at[place].set(latent.deter.astype(replay.deter.dtype), mode="drop")
-    stoch = replay.stoch.at[place].set(to_index(config, latent.stoch), mode="drop")
+    column, _ = parallel.own_columns(window.stream, replay.reward.shape[1])
+    place = (jnp.where(overwritten(window, outside), outside, window.row[1:]), column)
+    deter = parallel.gather(latent.deter.astype(replay.deter.dtype), 1)
+    stoch = parallel.gather(to_index(config, latent.stoch), 1)
+    deter = replay.deter.at[place].set(deter, mode="drop")
+    stoch = replay.stoch.at[place].set(stoch, mode="drop")
     return dataclasses.replace(replay, deter=deter, stoch=stoch)
 
 
