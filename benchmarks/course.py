@@ -64,10 +64,11 @@ def together(options: argparse.Namespace) -> None:
     preset = find_preset(options.preset, "obstacle_course")
     task = dataclasses.replace(preset.task, layout=options.layout)
     steps = options.steps or preset.total_steps
-    rows = min(preset.learner.replay_capacity, steps + 2 * preset.instances)
     changes = {name: json.loads(value) for name, value in (one.split("=", 1) for one in options.change)}
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    learner = dataclasses.replace(preset.learner, replay_capacity=rows, **changes)
+    learner = dataclasses.replace(preset.learner, **changes)
+    rows = steps + 2 * preset.instances + learner.pretrain_steps
+    learner = dataclasses.replace(learner, replay_capacity=min(learner.replay_capacity, rows))
     vehicle = options.vehicle or "whill_cr_ramp"
     held_out = functional_env(make_training_env(task, vehicle, preset.eval_episodes), shaped=False)
 

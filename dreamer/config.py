@@ -73,6 +73,8 @@ class DreamerConfig:
     replay_memory: Literal["auto", "device", "host"] = "auto"
     """Where their observations lie. auto: on the device, unless they would take more than half of its memory and
     `train` runs one seed on one device."""
+    stored_latents: bool = True
+    """Begin a sequence in the state that is stored at the step before it; False: in the state of an episode's start."""
     online: bool = True
     """Train on each fresh sequence once before sampling uniformly."""
     steps_per_iter: int = 1

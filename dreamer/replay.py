@@ -202,6 +202,9 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Repla
         replay = dataclasses.replace(replay, obs=frames)
     else:
         obs = jax.tree.map(lambda memory: take(memory, trained), replay.obs)
+    start = Latent(take(replay.deter, context), stoch)
+    if not config.stored_latents:
+        start = jax.tree.map(jnp.zeros_like, start)
     batch = Batch(
         obs=obs,
         prev_action=take(replay.action, window.row[:-1]),
@@ -209,7 +212,7 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Repla
         is_first=take(replay.is_first, trained),
         is_last=take(replay.is_last, trained),
         is_terminal=take(replay.is_terminal, trained),
-        start=Latent(take(replay.deter, context), stoch),
+        start=start,
     )
     return replay, batch
 

@@ -62,6 +62,14 @@ def test_the_start_is_the_stored_latent_of_the_step_before():
     np.testing.assert_array_equal(classes, np.repeat((before.round(1) // 1 % CONFIG.classes)[:, None], CONFIG.stoch, 1))
 
 
+def test_without_stored_latents_sequences_begin_as_episodes_do_and_are_the_same_otherwise():
+    memory, key = written(33), jax.random.PRNGKey(0)
+    plain = replay.sample(CONFIG, memory, key)[1]
+    found = replay.sample(dataclasses.replace(CONFIG, stored_latents=False), memory, key)[1]
+    assert not np.asarray(found.start.deter).any() and not np.asarray(found.start.stoch).any()
+    jax.tree.map(np.testing.assert_array_equal, found, dataclasses.replace(plain, start=found.start))
+
+
 def test_refreshed_latents_replace_the_stored_ones_and_nothing_else():
     memory = written(33)
     _, batch, window = draw(memory, jax.random.PRNGKey(0))
