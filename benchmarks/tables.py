@@ -23,7 +23,8 @@ single times.
 | `python -m benchmarks.environment` | control steps/s of the obstacle course, image included |
 | `python -m benchmarks.learner` | DreamerV3 updates/s |
 | `python -m benchmarks.cartpole` | cart-pole of the Control Suite and a grid world, every seed's curve |
-| `python -m benchmarks.course` | trainings of the obstacle course, every seed; the ground-truth planner |
+| `python -m benchmarks.scaling` | environment and learner on 1, 2 and 4 devices of one host |
+| `python -m benchmarks.course` | trainings of the obstacle course and the corridor, every seed; the ground-truth planner |
 | `python -m benchmarks.fit` | fits against planted truth, contact-plant logs and measured robots |
 | `python -m benchmarks.undeclared` | verdicts of the closed loop on logs with effects that nobody declared |
 | `python -m benchmarks.bridge` | latencies, stops and losses of the ROS 2 bridge |
@@ -37,7 +38,9 @@ TITLES = {
     "environment": "Environment",
     "learner": "Learner",
     "dreamer_control": "Learner on other tasks",
+    "scaling": "Several devices",
     "course": "Obstacle course",
+    "corridor": "Corridor",
     "fit": "Fit: planted truth and contact-plant logs",
     "measured": "Fit: measured robots",
     "undeclared": "Undeclared effects: logs of the contact plant",
