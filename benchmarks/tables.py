@@ -24,7 +24,7 @@ single times.
 | `python -m benchmarks.learner` | DreamerV3 updates/s |
 | `python -m benchmarks.cartpole` | cart-pole of the Control Suite and a grid world, every seed's curve |
 | `python -m benchmarks.scaling` | environment and learner on 1, 2 and 4 devices of one host |
-| `python -m benchmarks.course` | trainings of the obstacle course and the corridor, every seed; the ground-truth planner |
+| `python -m benchmarks.course` | trainings of both tasks, every seed; the ground-truth planner |
 | `python -m benchmarks.fit` | fits against planted truth, contact-plant logs and measured robots |
 | `python -m benchmarks.undeclared` | verdicts of the closed loop on logs with effects that nobody declared |
 | `python -m benchmarks.bridge` | latencies, stops and losses of the ROS 2 bridge |
