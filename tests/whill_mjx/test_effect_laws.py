@@ -23,8 +23,29 @@ from whill_mjx.vehicle import add_payload, measure, nominal_world, place
 @quick
 @pytest.mark.parametrize(("sent", "heard"), [(0.03, 0.0), (-0.03, 0.0), (0.061, 0.061), (-0.5, -0.5), (0.0, 0.0)])
 def test_a_dead_zone_loses_small_commands_and_leaves_large_ones(sent, heard):
-    _, command = make_effect("command_dead_zone", linear=0.05).command((), jnp.array([sent, 0.02]), still())
+    effect = make_effect("command_dead_zone", linear=0.05)
+    _, command = effect.command(effect.init(), jnp.array([sent, 0.02]), still())
     np.testing.assert_array_equal(command, np.float32([heard, 0.02]))
+
+
+@quick
+def test_a_dead_zone_of_each_wheel_stops_the_inner_wheel_of_a_bend():
+    half = still().track / 2
+    effect = make_effect("command_dead_zone", wheel=0.05)
+    _, (v, omega) = effect.command(effect.init(), jnp.array([0.3, 0.29 / half]), still())  # wheels at 0.01, 0.59 m/s
+    np.testing.assert_allclose([v - half * omega, v + half * omega], [0.0, 0.59], atol=1e-6)
+
+
+@quick
+@pytest.mark.parametrize("axis", ["linear", "wheel"])
+def test_a_dead_zone_lets_go_of_a_command_later_than_it_takes_it(axis):
+    """Wakes at 0.1 m/s and falls asleep at 0.04 m/s."""
+    ramp = jnp.concatenate([jnp.linspace(0.0, 0.2, 201), jnp.linspace(0.2, 0.0, 201)])
+    sent = jnp.stack([ramp, 0 * ramp], axis=-1)
+    heard = np.asarray(run(make_effect("command_dead_zone", **{axis: 0.1, "release": 0.4}), sent))[:, 0]
+    passing = heard > 0.5 * np.maximum(ramp, 1e-6)
+    np.testing.assert_allclose(ramp[np.argmax(passing)], 0.1, atol=0.01)
+    np.testing.assert_allclose(ramp[200 + np.argmax(~passing[200:])], 0.04, atol=0.01)
 
 
 @quick
@@ -115,6 +136,16 @@ def test_actuator_lag_reaches_63_percent_after_its_time_constant():
 
 
 @quick
+def test_two_lags_behind_one_another_are_as_slow_together_and_begin_gently():
+    drives = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (400, 2)), signal((100.0, 100.0), (0.0, 0.0)))
+    one, two = (np.asarray(run(make_effect("actuator_lag", time_constant=0.1, cascade=c), drives).force)[:, 0] / 100
+                for c in (0.0, 0.5))
+    for lagged in (one, two):
+        np.testing.assert_allclose((1 - lagged).sum() * DT, 0.1, rtol=0.02)
+    assert two[1] < 0.3 * one[1] and np.diff(two).argmax() > 5
+
+
+@quick
 def test_saturation_limits_each_side():
     effect = make_effect("torque_saturation", limit=80.0)
     np.testing.assert_allclose(both(effect, [1000.0, -1000.0]), [80.0, -80.0], rtol=1e-3)
@@ -146,6 +177,14 @@ def test_supply_sags_with_time():
 
 
 @quick
+def test_a_session_drains_the_supply_before_the_drive_begins_and_on():
+    drives = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2001, 2)), signal((100.0, -50.0), (10.0, 5.0)))
+    weak = run(make_effect("supply_sag", drain=0.001, session=300.0), drives)
+    np.testing.assert_allclose(weak.force[0], drives.force[0] / 1.3, rtol=1e-5)
+    np.testing.assert_allclose(weak.torque[-1], drives.torque[-1] / 1.31, rtol=1e-3)
+
+
+@quick
 @pytest.mark.parametrize(("v", "gain"), [(1.0, 1 / 1.2), (-1.0, 1.0), (0.0, 1.0)])
 def test_supply_sags_with_the_power_drawn_and_not_with_power_fed_back(v, gain):
     """Two sides of 100 N at 1 m/s are 200 W."""
@@ -159,16 +198,19 @@ def test_a_gain_difference_strengthens_the_left_drive():
 
 
 @quick
-def test_backlash_loses_a_reversal_for_the_time_to_cross_the_gap():
-    """sqrt(4 beta I / T): 0.05 rad, 0.02 kg m^2 and 4 N m give 32 ms."""
+@pytest.mark.parametrize("rotor", [1.0, 0.5])
+def test_after_a_reversal_backlash_passes_nothing_and_then_what_the_motor_gathered(rotor):
+    """0.05 rad, 0.02 kg m^2 and 4 N m: late by sqrt(4 beta I / T), 32 ms, and nothing of the momentum is lost."""
     torque = jnp.concatenate([jnp.full((40, 2), 4.0), jnp.full((40, 2), -4.0)])
     drives = Drive(jnp.zeros_like(torque), jnp.zeros_like(torque), torque)
-    passed = np.asarray(run(make_effect("backlash", play=0.05), drives).torque)[:, 0]
-    np.testing.assert_allclose(passed[39], 4.0, rtol=1e-3)
-    np.testing.assert_allclose(passed[-1], -4.0, rtol=1e-3)
-    lost = (1 - np.abs(passed[40:]) / 4.0).sum() * DT
-    assert abs(lost - np.sqrt(4 * 0.05 * 0.02 / 4)) < 2 * DT
-    assert passed[40:].max() == 0.0 and np.abs(passed[40:44]).max() == 0.0
+    effect = make_effect("backlash", play=0.05, rotor=rotor)
+    passed = np.asarray(run(effect, drives).torque)[40:, 0]
+    late = np.sqrt(4 * 0.05 * rotor * 0.02 / 4)
+    first = np.argmax(np.abs(passed) > 1e-3)
+    assert abs(first * DT - late) < 2 * DT
+    assert passed[first : first + 2].sum() < -4.0 * late / DT  # the blow
+    np.testing.assert_allclose(passed.sum(), -4.0 * 40, rtol=1e-3)
+    np.testing.assert_allclose(passed[first + 2 :], -4.0, rtol=1e-3)
 
 
 # World
@@ -277,6 +319,15 @@ def test_casters_kick_after_a_reversal_until_they_have_swivelled():
     np.testing.assert_allclose(np.abs(fy).max(), 10.0, rtol=0.03)  # two casters; F_k sin cos is half of F_k at most
     np.testing.assert_allclose(np.cos(angle[-1]), -1.0, atol=0.01)
     np.testing.assert_allclose(fy[-1], 0.0, atol=0.05)
+
+
+@quick
+def test_a_sharp_caster_pushes_nearly_all_at_a_small_angle():
+    def push(**values):
+        return np.abs(kick(0.5, 0.05, start_angle=0.2, **values)[1][0]) / 2
+
+    assert push() < 3.0
+    assert 8.0 < push(sharpness=30.0) < 10.0
 
 
 @quick

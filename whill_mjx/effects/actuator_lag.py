@@ -1,4 +1,4 @@
-"""First-order lag of the drive."""
+"""Lag of the drive."""
 
 from __future__ import annotations
 
@@ -14,19 +14,28 @@ from whill_mjx.types import Drive, Motion, parameter
 
 @struct.dataclass
 class ActuatorLag(Effect):
-    """T dF/dt + F = F_wanted, on the force or the torque of each side (backward Euler)."""
+    """(1 + (1 - c) T d/dt) (1 + c T d/dt) F = F_wanted, on the force or the torque of each side (backward Euler).
+
+    One lag where c = 0; a filter and a winding behind one another, as slow together, where it is more.
+    """
 
     name = "actuator_lag"
-    typical = {"time_constant": (0.02, 0.15)}
+    typical = {"time_constant": (0.02, 0.15), "cascade": (0.0, 0.5)}
     source = "estimate"
-    time_constant: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time constant of the drive")
+    time_constant: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time constant of the drive, the sum of both lags")
+    cascade: jax.Array = parameter("-", 0.0, 0.5, 0.0, "share of it in the second lag, c")
 
-    def init(self) -> jax.Array:
-        return jnp.zeros((2, 2))  # force and torque of each side so far
+    def init(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros((2, 2)), jnp.zeros((2, 2))  # force and torque of each side so far, after each lag
 
-    def actuation(self, memory: jax.Array, drive: Drive, motion: Motion) -> tuple[jax.Array, Drive]:
+    def actuation(
+        self, memory: tuple[jax.Array, jax.Array], drive: Drive, motion: Motion
+    ) -> tuple[tuple[jax.Array, jax.Array], Drive]:
         """Drive with lagging force (2,) and torque (2,)."""
-        wanted = jnp.stack([drive.force, drive.torque])
-        kept = self.time_constant / (self.time_constant + motion.dt)
-        lagged = wanted + (memory - wanted) * kept
-        return lagged, replace(drive, force=lagged[0], torque=lagged[1])
+        first = self._lagged(jnp.stack([drive.force, drive.torque]), memory[0], 1 - self.cascade, motion)
+        second = self._lagged(first, memory[1], self.cascade, motion)
+        return (first, second), replace(drive, force=second[0], torque=second[1])
+
+    def _lagged(self, wanted: jax.Array, before: jax.Array, share: jax.Array, motion: Motion) -> jax.Array:
+        lag = self.time_constant * share
+        return wanted + (before - wanted) * (lag / (lag + motion.dt))

@@ -15,19 +15,22 @@ TIE_BREAK = 0.02  # [rad], lets an exactly straight reversal start the swivel, c
 
 @struct.dataclass
 class CasterKick(Effect):
-    """d(delta)/dt = (|v| / L) sin(phi - delta) - omega; F = F_k sin(phi - delta) across each free wheel.
+    """d(delta)/dt = (|v| / L) sin(phi - delta) - omega; F = F_k (1 + k) s / (1 + k |s|), s = sin(phi - delta), across
+    each free wheel.
 
     delta is the direction in which a caster's wheel rolls, phi that of the motion at its pivot. A caster that trails
     gives no force; after a reversal or from a parked angle it pushes until it has swivelled, over a path of a few
-    trails L. The force fades below 0.05 m/s. A skid drive has no free wheels: nothing happens there.
+    trails L. The force fades below 0.05 m/s. A tyre that slips sideways reaches its largest force at an angle of some
+    degrees, about 1 / k. A skid drive has no free wheels: nothing happens there.
     """
 
     name = "caster_kick"
-    typical = {"force_limit": (5.0, 30.0), "trail": (0.1, 0.3), "start_angle": (-1.57, 1.57)}
+    typical = {"force_limit": (5.0, 30.0), "trail": (0.1, 0.3), "start_angle": (-1.57, 1.57), "sharpness": (0.0, 10.0)}
     source = "estimate; the largest error at a start angle of 90 degrees: reverse directional stability, 2003"
     force_limit: jax.Array = parameter("N", 0.0, 200.0, 0.0, "sideways force of one caster across its wheel, F_k")
     trail: jax.Array = parameter("m", 0.03, 0.5, 0.15, "path over which a caster swivels, L")
     start_angle: jax.Array = parameter("rad", -3.2, 3.2, 0.0, "swivel angle at the start of the drive")
+    sharpness: jax.Array = parameter("-", 0.0, 50.0, 0.0, "how early the force is near its largest, k")
 
     def init(self) -> jax.Array:
         return jnp.broadcast_to(jnp.asarray(self.start_angle), (4,)) + jnp.zeros(4)  # delta at each contact
@@ -38,5 +41,7 @@ class CasterKick(Effect):
         speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
         across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK * (speed - REST_SPEED)
         swivelled = memory + (across / self.trail - yaw_rate(motion)) * motion.dt  # the chassis turns under it
-        push = -self.force_limit * (1 - motion.world.geometry.driven) * across / speed
+        slide = across / speed
+        share = slide * (1 + self.sharpness) / (1 + self.sharpness * jnp.abs(slide))
+        push = -self.force_limit * (1 - motion.world.geometry.driven) * share
         return swivelled, contact_wrench(motion, -push * sin, push * cos)
