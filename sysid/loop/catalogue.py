@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.loop.drives import ROUND
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, place_of
 from whill_mjx.parameters import describe, get_values
@@ -33,7 +34,8 @@ class Axis:
     """Change of the parameter at q = 1; for `inverse` its value there."""
     signed: bool = False
     form: str = "add"
-    """add: value = neutral + unit q.  inverse: unit / q.  factor: base value x exp(unit q).  moment: unit q / mass."""
+    """add: value = neutral + unit q.  inverse: unit / q.  factor: base value x exp(unit q).  moment: unit q / mass.
+    along: neutral + unit q q_0, with q_0 that of the first axis."""
     limit: float = 12.0
     """Largest |q| that a refit may reach."""
     dependent: bool = False
@@ -78,6 +80,8 @@ class Hypothesis:
             elif axis.form == "moment":
                 mass = max(found["payload_shift.mass"], 1e-3)
                 found[axis.parameter] = float(np.clip(axis.unit * size / mass, -0.6, 0.6))
+            elif axis.form == "along":
+                found[axis.parameter] = start + axis.unit * size * float(q[0])
             else:
                 found[axis.parameter] = start + axis.unit * size
         return found
@@ -103,10 +107,12 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
     shift: dict[str, Any] = {"kind": "parameter_shift"}
     brakes = [axis(f"acceleration_limit.{way}", 0.25, form="factor", signed=True, dependent=True, limit=6.0)
               for way in ("slowing", "reversing", "turn_slowing")]
+    release = axis("command_dead_zone.release", -0.1, dependent=True, limit=8.0)
     every = [
         one("command_delay", axis("command_delay.delay", 0.04, limit=10.0), **shift),
-        one("command_dead_zone", axis("command_dead_zone.linear", 0.02 * speed),
-            axis("command_dead_zone.angular", 0.04)),
+        one("command_dead_zone", axis("command_dead_zone.linear", 0.02 * speed, limit=16.0),
+            axis("command_dead_zone.angular", 0.04, limit=16.0), release),
+        one("command_dead_zone", axis("command_dead_zone.wheel", 0.02 * speed, limit=16.0), release, variant="wheel"),
         one("acceleration_limit", axis("acceleration_limit.linear", 1.5, form="inverse"), variant="linear"),
         one("acceleration_limit", axis("acceleration_limit.angular", 3.0, form="inverse"), variant="angular"),
         one("acceleration_limit", axis("acceleration_limit.linear", 1.5, form="inverse"),
@@ -116,11 +122,14 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
             axis("jerk_limit.angular", 40.0, form="inverse")),
         one("command_scale", axis("command_scale.linear", 0.02, signed=True),
             axis("command_scale.angular", 0.03, signed=True)),
-        one("actuator_lag", axis("actuator_lag.time_constant", 0.03, limit=10.0)),
+        one("actuator_lag", axis("actuator_lag.time_constant", 0.03, limit=10.0),
+            axis("actuator_lag.cascade", 0.1, dependent=True, limit=5.0)),
         one("torque_saturation", axis("torque_drive.limit", -0.1, form="factor"), **shift)
         if "torque_drive.limit" in base else
         one("torque_saturation", axis("torque_saturation.limit", 0.2 * weight, form="inverse")),
         one("supply_sag", axis("supply_sag.per_second", 0.004), variant="time"),
+        one("supply_sag", axis("supply_sag.drain", 0.0002), variant="session",
+            constants=(("supply_sag.session", 1.5 * ROUND),)),
         one("supply_sag", axis("supply_sag.per_watt", 0.0006), variant="power"),
         one("supply_sag", axis("torque_drive.kp", -0.1, form="factor", signed=True), variant="gain", **shift),
         one("drive_gain_difference", axis("drive_gain_difference.difference", 0.05, signed=True)),
@@ -132,10 +141,12 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
             axis("payload_shift.x", 0.01 * spec.mass * spec.wheelbase, form="moment", signed=True, dependent=True),
             axis("payload_shift.y", 0.01 * spec.mass * track, form="moment", signed=True, dependent=True),
             constants=(("payload_shift.z", 0.3),)),
-        one("yaw_scrub", axis("yaw_scrub.torque", 0.008 * weight * track), **shift),
+        one("yaw_scrub", axis("yaw_scrub.torque", 0.008 * weight * track),
+            axis("track_width.error", 0.005, form="along", dependent=True, limit=4.0), **shift),
         one("omni_roller_friction", axis("omni_roller_friction.mu_t", 0.02)),
         one("caster_kick", axis("caster_kick.force_limit", force),
-            axis("caster_kick.trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0)),
+            axis("caster_kick.trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0),
+            axis("caster_kick.sharpness", 2.0, dependent=True)),
         one("traction_limit", axis("slip_traction.mu", -0.15, form="factor"), **shift),
         one("rolling_resistance_speed", axis("rolling_resistance_speed.mu_1", 0.004 / speed)),
         one("quadratic_drag", axis("quadratic_drag.coefficient", force / speed**2)),
@@ -150,7 +161,7 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
     ]
     if spec.drive == "skid":
         every.append(one("turn_efficiency", axis("turn_efficiency.efficiency", 0.02, signed=True)))
-    return tuple(one for one in every if one.kind == "effect" or all(axis.parameter in base for axis in one.axes))
+    return tuple(one for one in every if one.kind == "effect" or all(one.axes[i].parameter in base for i in one.main))
 
 
 def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> VehicleParams:

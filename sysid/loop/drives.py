@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +17,8 @@ from sysid.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Si
 from whill_mjx.parameters import get_values, set_values
 from whill_mjx.types import parameters_of
 
+SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
+ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
 CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow the cache
 
 
@@ -30,7 +33,7 @@ class Courses:
     first: np.ndarray  # (U,) one trial of each course
     of_trial: np.ndarray  # (B,) course of each trial
     room: tuple[tuple[int, float], ...]
-    """Free parameters that tie the motion to the room: index and neutral value."""
+    """Free parameters that tie the motion to the room or to the session: index and neutral value."""
     shared: bool
     """False where a parameter that is not free does so."""
 
@@ -82,12 +85,23 @@ class Drives:
         once = [self.courses.repeat(row) for row in values]
         rows = [self.courses.first if shared else every for shared in once]
         sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
-        paths = self.paths(values[sets], self.batch, np.concatenate(rows))
+        drives = np.concatenate(rows)
+        paths = self.paths(self._in_session(values[sets], drives), self.batch, drives)
         start = 0
         for shared, each in zip(once, rows, strict=True):
             mine = paths[start : start + len(each)]
             start += len(each)
             yield (mine[self.courses.of_trial] if shared else mine), shared
+
+    def _in_session(self, values: np.ndarray, drives: np.ndarray) -> np.ndarray:
+        """Values (N, P) of one drive each (N,), with the time of the session at which that drive began."""
+        if SESSION not in self.names or DRAIN not in self.names:
+            return values
+        began = np.array([began_at(trial) for trial in self.trials])[drives]
+        known = np.isfinite(began) & (values[:, self.names.index(DRAIN)] != 0)
+        out = values.copy()
+        out[known, self.names.index(SESSION)] = began[known]
+        return out
 
     def _sampled(self, paths: np.ndarray) -> Simulated:
         """Paths (B, R + 1, 9) at the measurements' times."""
@@ -122,6 +136,13 @@ class Drives:
                       features.of(measured))
 
 
+def began_at(trial: Trial) -> float:
+    """Time of the session at which a trial began [s], as replicates are driven round by round: the middle of the round
+    that its name counts. nan where the name counts none."""
+    number = re.fullmatch(r".*_(\d{1,2})", trial.name)
+    return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
+
+
 def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
     """Points (2 P of (P,)), above and below u in each of its P coordinates in turn, and how far each pair is apart."""
     points, spans = [], []
@@ -154,6 +175,8 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     held = [name for name in neutral if name not in names]
     shared = all(float(get_values(params, [name])[0]) == neutral[name] for name in held)
     room = tuple((names.index(name), neutral[name]) for name in neutral if name in names)
+    if DRAIN in names and SESSION in names:
+        room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width)
     paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))

@@ -20,6 +20,7 @@ from sysid.loop.reference import Leftover, Reference, alike, difference_sizes
 from sysid.result import Progress
 from whill_mjx.types import VehicleParams
 
+UNSEEN = 1e-3  # change by an axis that only acts through others, as a share of theirs, below which it does nothing
 PARTS = 10  # in which signatures are simulated, for the progress bar
 
 
@@ -65,21 +66,24 @@ def signature_columns(
 ) -> tuple[np.ndarray, list[Columns]]:
     """(B, K, C, S) change of the features per unit of each coordinate, and which column is which.
 
-    Two-sided axes: central differences at 1. One-sided: the change at each level, per unit.
+    Two-sided axes: central differences at 1. One-sided: the change at each level, per unit; of those that only change
+    what the others do, against the others alone.
     """
     base = dict(zip(names, values.tolist(), strict=True))
     sets: list[np.ndarray] = []
-    jobs: list[tuple[int, float, int, bool]] = []
+    jobs: list[tuple[int, float, int, float]] = []
     for number, one in enumerate(hypotheses):
         for level in ((1.0,) if one.signed else LEVELS):
             for position, axis in enumerate(one.axes):
                 q = np.zeros(len(one.axes))
                 if axis.dependent:
-                    q[one.main] = level  # what it changes is taken relative to the others alone
-                for sign in ((1, -1) if axis.signed else (1,)):
-                    q[position] = sign * (1.0 if axis.signed else level)
+                    q[one.main] = level
+                top = 1.0 if axis.signed else min(level, axis.limit)
+                bottom = -1.0 if axis.signed else 0.0
+                for size in (top, bottom) if axis.signed or axis.dependent else (top,):
+                    q[position] = size
                     sets.append(with_values(values, names, one.values(q, base)))
-                jobs.append((number, level, position, axis.signed))
+                jobs.append((number, level, position, top - bottom))
     seen = []
     for part in np.array_split(np.stack(sets), min(PARTS, len(sets))):
         seen.append(drives.simulate(part))
@@ -87,13 +91,14 @@ def signature_columns(
             progress(1, "signatures")
     flat, cursor = np.concatenate(seen), 0
     parts, columns = [], []
-    for number, level, position, signed in jobs:
-        if signed:
-            parts.append((flat[cursor] - flat[cursor + 1]) / 2)
-            cursor += 2
-        else:
-            parts.append((flat[cursor] - at) / level)
-            cursor += 1
+    for number, level, position, span in jobs:
+        axis = hypotheses[number].axes[position]
+        pair = axis.signed or axis.dependent
+        change = flat[cursor] - (flat[cursor + 1] if pair else at)
+        if axis.dependent and np.abs(change).max() < UNSEEN * np.abs(flat[cursor] - at).max():
+            change = flat[cursor] - at  # nothing tells the two apart here: not a column of its own
+        parts.append(change / span)
+        cursor += 2 if pair else 1
         if position == 0:
             columns.append(Columns(number, level, ()))
         columns[-1] = Columns(number, level, (*columns[-1].index, len(parts) - 1))

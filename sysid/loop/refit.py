@@ -190,8 +190,8 @@ class Refitter:
         values = self.values.copy()
         values[self.base_index] = self.reference.space.to_values(u)
         start = 0
-        base = dict(zip(self.names, values.tolist(), strict=True))
         for one in hypotheses:
+            base = dict(zip(self.names, values.tolist(), strict=True))  # two may move the same parameter
             part = q[start : start + len(one.axes)]
             values = with_values(values, self.names, one.values(part, base))
             start += len(one.axes)

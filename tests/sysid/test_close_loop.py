@@ -10,13 +10,13 @@ import pytest
 from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after, vehicle_before
 from sysid.log import load_log
 from sysid.loop.agreement import disagreement, foretold
-from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
-from sysid.loop.drives import make_drives
-from sysid.loop.evidence import Columns
+from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives, make_drives
+from sysid.loop.evidence import Columns, signature_columns
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
-from sysid.loop.refit import Refit
+from sysid.loop.refit import Refit, Refitter
 from sysid.loop.report import make_report, replay, warnings, write_run
 from sysid.loop.search import Candidate, Thresholds, _own
 from sysid.loop.wander import _pooled
@@ -260,6 +260,41 @@ def test_keys_are_unique():
     spec, params = preset("whill_cr_physical")
     keys = [one.key for one in hypotheses(spec, params)]
     assert len(keys) == len(set(keys))
+
+
+@pytest.mark.quick
+def test_what_only_acts_through_another_axis_has_a_column_of_that_alone():
+    """The motion is a (1 + b): at a = 2, b = 2 the second axis adds a, and nothing of what a does by itself."""
+    one = Hypothesis("some", (Axis("some.a", 1.0), Axis("some.b", 1.0, dependent=True)))
+
+    def simulate(sets):
+        return (sets[:, 0] * (1 + sets[:, 1]))[:, None, None, None]
+
+    columns, listed = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
+                                        np.zeros((1, 1, 1)))
+    [at] = [columns[0, 0, 0, list(each.index)] for each in listed if each.level == 2.0]
+    np.testing.assert_allclose(at, [1.0, 2.0])
+
+
+@pytest.mark.quick
+def test_two_effects_that_move_one_parameter_add_up():
+    scrub = Hypothesis("scrub", (Axis("scrub.torque", 2.0), Axis("track.error", 0.01, form="along", dependent=True)))
+    track = Hypothesis("track", (Axis("track.error", 0.1, signed=True),))
+    space = SimpleNamespace(to_values=lambda u: u)
+    refitter = SimpleNamespace(values=np.array([1.0, 0.5]), base_index=[], names=["scrub.torque", "track.error"],
+                               reference=SimpleNamespace(space=space))
+    both = Refitter._set(refitter, (track, scrub), np.zeros(0), np.array([1.0, 3.0, 2.0]))
+    np.testing.assert_allclose(both, [1.0 + 2 * 3, 0.5 + 0.1 + 0.01 * 3 * 2])
+
+
+@pytest.mark.quick
+def test_replicates_are_driven_round_by_round_of_a_session():
+    """Only where the supply drains does it matter when a drive began; a drive without a number keeps its time."""
+    trials = [SimpleNamespace(name=name) for name in ("turn_1", "turn_3", "long")]
+    drives = SimpleNamespace(names=(DRAIN, SESSION), trials=trials)
+    drained, fresh = (Drives._in_session(drives, np.array([[drain, 7.0]] * 3), np.arange(3)) for drain in (1e-3, 0.0))
+    np.testing.assert_allclose(drained[:, 1], [0.5 * ROUND, 2.5 * ROUND, 7.0])
+    np.testing.assert_allclose(fresh[:, 1], 7.0)
 
 
 @pytest.mark.quick
