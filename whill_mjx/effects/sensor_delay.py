@@ -37,7 +37,7 @@ class SensorDelay(Effect):
     delay: jax.Array = parameter("s", 0.0, 0.3, 0.0, "age of a reading when it is reported")
 
     def init(self) -> PastReadings:
-        return PastReadings(jnp.zeros((SLOTS, 5)), jnp.asarray(GAP))
+        return PastReadings(jnp.zeros((SLOTS, 5)), GAP * jnp.ones(()))
 
     def sensing(self, memory: PastReadings, reading: Odometry, motion: Motion) -> tuple[PastReadings, Odometry]:
         """Late reading."""
