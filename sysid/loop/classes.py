@@ -16,7 +16,8 @@ def imitation(evidence: Evidence, hypotheses: Sequence[Hypothesis]) -> np.ndarra
     """(H, H) |cos| between what hypothesis i changes and the best that hypothesis j does instead.
 
     Base parameters may move within their spread on both sides. An effect of several axes counts by the axis that the
-    other imitates worst; of several sizes of j the best.
+    other imitates worst, but not by one-sided ones that only change what the others do: it is the same effect without
+    them. Of several sizes of j the best.
     """
     size = evidence.base_size
     products = evidence.products.sum(0)
@@ -28,18 +29,20 @@ def imitation(evidence: Evidence, hypotheses: Sequence[Hypothesis]) -> np.ndarra
     out = np.eye(len(hypotheses))
     for i in range(len(hypotheses)):
         mine = min(groups[i], key=lambda one: abs(one.level - LEVEL))
+        own = [column for column, axis in zip(mine.index, hypotheses[i].axes, strict=True)
+               if axis.signed or not axis.dependent]
         for j in range(len(hypotheses)):
             if i != j:
-                out[i, j] = max(_cosine(left, mine, other, size) for other in groups[j])
+                out[i, j] = max(_cosine(left, own, other, size) for other in groups[j])
     return out
 
 
-def _cosine(left: np.ndarray, mine: Columns, other: Columns, size: int) -> float:
+def _cosine(left: np.ndarray, mine: Sequence[int], other: Columns, size: int) -> float:
     index = [i - size for i in other.index]
     inside = left[np.ix_(index, index)]
     inverse = np.linalg.pinv(inside, rcond=1e-8)
     cosines = []
-    for column in mine.index:
+    for column in mine:
         cross = left[column - size, index]
         own = left[column - size, column - size]
         if own > 1e-9:

@@ -11,6 +11,7 @@ from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after,
 from sysid.log import load_log
 from sysid.loop.agreement import disagreement, foretold
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.loop.classes import imitation
 from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives, make_drives
 from sysid.loop.evidence import Columns, signature_columns
 from sysid.loop.features import CHANNELS, make_features
@@ -274,6 +275,17 @@ def test_what_only_acts_through_another_axis_has_a_column_of_that_alone():
                                         np.zeros((1, 1, 1)))
     [at] = [columns[0, 0, 0, list(each.index)] for each in listed if each.level == 2.0]
     np.testing.assert_allclose(at, [1.0, 2.0])
+
+
+@pytest.mark.quick
+def test_a_form_that_an_effect_may_take_does_not_hide_what_it_looks_like():
+    """Two effects change the motion alike; one of them may also do something that the other cannot."""
+    plain = Hypothesis("plain", (Axis("plain.a", 1.0),))
+    formed = Hypothesis("formed", (Axis("formed.a", 1.0), Axis("formed.b", 1.0, dependent=True)))
+    motion = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 3.0]])  # (n, columns)
+    evidence = SimpleNamespace(base_size=0, products=(motion.T @ motion)[None], precision=np.zeros((0, 0)),
+                               columns=(Columns(0, 2.0, (0,)), Columns(1, 2.0, (1, 2))))
+    np.testing.assert_allclose(imitation(evidence, (plain, formed)), 1.0)
 
 
 @pytest.mark.quick
