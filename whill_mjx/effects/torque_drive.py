@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -12,7 +13,18 @@ from whill_mjx.effects.base import Effect
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.types import Drive, Motion, parameter
 
-TINY = 1e-6  # [N m], keeps the share defined where the torque does not change
+TINY = 1e-6  # [N m] or [rad/s], keeps shares defined where torque or target does not change
+
+
+@struct.dataclass
+class Last:
+    """What the controller of each wheel did in the step before."""
+
+    target: jax.Array  # (2,) [rad/s]
+    before: jax.Array  # (2,) target of the step before that [rad/s]
+    error: jax.Array  # (2,) in the middle of the step [rad/s]
+    wanted: jax.Array  # (2,) torque without its limit [N m]
+    crossing: jax.Array  # (2,) by how much that torque changed within the step [N m]
 
 
 @struct.dataclass
@@ -22,6 +34,7 @@ class DriveMemory:
     integral: jax.Array  # (2,) of the speed error [rad]
     expected: jax.Array  # (2,) spin that the last torque alone would have led to [rad/s]
     begun: jax.Array  # () 0 before the first step, 1 after it
+    last: Last
 
 
 @struct.dataclass
@@ -32,7 +45,10 @@ class TorqueDrive(Effect):
     rolling wheels under the load of the step before: a controller that acts all the time, not once in a step.
 
     While the torque is at its limit the integral goes on at `windup` times its rate: 1 is a plain PI controller, which
-    overshoots after a long acceleration, 0 stops integrating (anti-windup).
+    overshoots after a long acceleration, 0 stops integrating (anti-windup). A target that jumps within a step comes as
+    the mean of before and after. The torque follows that mean, but whether the limit is met does not: once the next
+    step shows where the target went, the integral becomes that of a jump, or the chair's path would depend on the time
+    of a command by fits and starts.
     """
 
     name = "torque_drive"
@@ -44,28 +60,47 @@ class TorqueDrive(Effect):
     windup: jax.Array = parameter("-", 0.0, 1.0, 0.0, "rate of the integral while the torque is at its limit")
 
     def init(self) -> DriveMemory:
-        return DriveMemory(jnp.zeros(2), jnp.zeros(2), jnp.zeros(()))
+        none = jnp.zeros(2)
+        return DriveMemory(none, none, jnp.zeros(()), Last(none, none, none, none, jnp.ones(2)))
 
     def actuation(self, memory: DriveMemory, drive: Drive, motion: Motion) -> tuple[DriveMemory, Drive]:
         """Adds the motor torque (2,) [N m]."""
         half = motion.dt / 2
-        error = drive.target / motion.wheel_radius - motion.spin
+        target = drive.target / motion.wheel_radius
+        error = target - motion.spin
         response = spin_response(motion)
+        damping = 1 / (1 + half * self.kp * response)
+        last = memory.last
+        gain_of_target = lambda change: by_mode((self.kp + half * self.ki) * change, damping)  # noqa: E731
+        integral = memory.integral + motion.dt * self.jump(last, target, gain_of_target)
         # What else than the torque changes the spin [rad/s^2]; bounded, as a wheel that spins up has little inertia.
         largest = self.limit * response.max()
         load = jnp.clip(memory.begun * (motion.spin - memory.expected) / motion.dt, -largest, largest)
         # T = kp (e - half (response T + load)) + ki (integral + half e), solved for T.
-        wanted = by_mode(
-            self.kp * (error - half * load) + self.ki * (memory.integral + half * error),
-            1 / (1 + half * self.kp * response),
-        )
+        wanted = by_mode(self.kp * (error - half * load) + self.ki * (integral + half * error), damping)
         torque = jnp.clip(wanted, -self.limit, self.limit)
         gain = by_mode(torque, response)
         acceleration = gain + load
-        # Share of the step within the limit, which the wanted torque crosses at the rate kp * acceleration.
+        # The wanted torque crosses the limit at the rate kp * acceleration.
         crossing = jnp.maximum(self.kp * jnp.abs(acceleration) * motion.dt, TINY)
+        done = Last(target, last.target, error - half * acceleration, wanted, crossing)
+        rate = self.rate(done.error, wanted, crossing)
+        after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
+        return after, replace(drive, torque=drive.torque + torque)
+
+    def rate(self, error: jax.Array, wanted: jax.Array, crossing: jax.Array) -> jax.Array:
+        """(2,) of the integral [rad/s], by the share of a step in which the torque is within its limit."""
         share = jnp.clip(0.5 + (self.limit - jnp.abs(wanted)) / crossing, 0.0, 1.0)
         share = jnp.where(wanted * error < 0, 1.0, share)  # coming back
-        rate = (self.windup + (1 - self.windup) * share) * (error - half * acceleration)
-        after = DriveMemory(memory.integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()))
-        return after, replace(drive, torque=drive.torque + torque)
+        return (self.windup + (1 - self.windup) * share) * error
+
+    def jump(self, last: Last, target: jax.Array, torque_of: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """(2,) to add to the rate of the step before [rad/s], if its target was the mean of a jump to `target`."""
+        back, forth = last.target - last.before, target - last.target
+        span = back + forth
+        moved = jnp.abs(span) > TINY
+        late = jnp.where(moved, jnp.clip(back / jnp.where(moved, span, 1.0), 0.0, 1.0), 0.0)  # share after the jump
+        before = self.rate(last.error - back, last.wanted - torque_of(back), last.crossing)
+        after = self.rate(last.error + forth, last.wanted + torque_of(forth), last.crossing)
+        jumped = (1 - late) * before + late * after - self.rate(last.error, last.wanted, last.crossing)
+        return jnp.where(back * forth > 0, jumped, 0.0)
