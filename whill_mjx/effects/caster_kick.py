@@ -39,7 +39,8 @@ class CasterKick(Effect):
         """Wrench of the casters, and their swivel angles (4,) one step on."""
         cos, sin = jnp.cos(memory), jnp.sin(memory)
         speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
-        across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK * (speed - REST_SPEED)
+        backward = speed - REST_SPEED - (motion.contact_vx * cos + motion.contact_vy * sin)  # 0 for one that trails
+        across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK / 2 * backward
         swivelled = memory + (across / self.trail - yaw_rate(motion)) * motion.dt  # the chassis turns under it
         slide = across / speed
         share = slide * (1 + self.sharpness) / (1 + self.sharpness * jnp.abs(slide))
