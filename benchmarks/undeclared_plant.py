@@ -36,10 +36,16 @@ POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
 NEAR, FAR = (0.3, 3.0), (0.1, 10.0)
 """How far an effect may stand out, of what 80 % power needs, where its size is taken for found, and at all used."""
-PROBES = 6
+PROBES = 10
 """Logs with which the size of an effect is looked for at most."""
 BESIDE = 2.0
 """Factor on a size within which a second log must have been driven, before what one log showed there is believed."""
+ALIKE = 10.0
+"""Factor by which such logs may differ, beyond the square of their sizes, where an effect does not strike at random."""
+SURE = 4
+"""Logs at up to `BESIDE`^2 times a size that must all have stood out where it does."""
+BRACKET = 1.3
+"""Factor between a size that does not stand out enough and one that does at which they are close enough."""
 REACH = 100.0
 """Factor on the base size, up or down, beyond which no size is tried."""
 SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
@@ -162,41 +168,45 @@ def seen_at(work: Path, name: str) -> list[Point]:
 
 
 def rising(points: Sequence[Point]) -> list[Point]:
-    """The same sizes with how far an effect stands out there made to rise with the size, each log counting alike.
+    """The same sizes, each with how far the effect stood out at least there and at every larger size.
 
-    An effect that strikes at random, or differently on another day, may stand out at a small size and not at a larger
-    one: such logs are taken together.
+    What strikes at random may stand out at a small size by luck: it must not have been missed at a larger one.
     """
-    from scipy.optimize import isotonic_regression
-
     points = sorted(points)
-    level = isotonic_regression(np.log([found for _, found in points])).x
-    return [(size, float(np.exp(one))) for (size, _), one in zip(points, level, strict=True)]
+    least = np.minimum.accumulate([found for _, found in reversed(points)])[::-1]
+    return [(size, float(found)) for (size, _), found in zip(points, least, strict=True)]
 
 
 def next_size(base: float, points: Sequence[Point]) -> float | None:
-    """Where to drive an effect next; None where a size is close enough and two logs tell so, or none is in reach."""
+    """Where to drive an effect next; None where a size is close enough and the logs around it agree, or none is in
+    reach."""
     if not points:
         return base
     if len(points) >= PROBES:
         return None
-    points = rising(points)
-    near = min(points, key=lambda point: abs(np.log(point[1])))
-    if NEAR[0] < near[1] < NEAR[1]:
-        size = crossing(points)
-        return None if size is None or _beside(size, points) > 1 else size
-    below = [size for size, found in points if found < 1]
-    above = [size for size, found in points if found > 1]
+    steady = rising(points)
+    near = min(steady, key=lambda point: abs(np.log(point[1])))
+    below = [size for size, found in steady if found < 1]
+    above = [size for size, found in steady if found >= 1]
+    if NEAR[0] < near[1] < NEAR[1] or (below and above and min(above) < BRACKET * max(below)):
+        return _check_at(crossing(steady), points)
     if below and above:
         return float(np.sqrt(max(below) * min(above)))
-    size, found = max(points) if below else min(points)
+    size, found = max(steady) if below else min(steady)
     size *= float(np.clip(found**-0.5, 1 / 8, 3.0))  # what stands out grows with the square of the size
     return size if abs(np.log(size / base)) < np.log(REACH) else None
 
 
-def _beside(size: float, points: Sequence[Point]) -> int:
-    """Number of logs with about this size."""
-    return sum(1 / BESIDE <= one / size <= BESIDE for one, _ in points)
+def _check_at(size: float | None, points: Sequence[Point]) -> float | None:
+    """Where to drive once more to believe in a size; None where that is not needed."""
+    if size is None:
+        return None
+    beside = [found / one**2 for one, found in points if 1 / BESIDE <= one / size <= BESIDE]
+    if len(beside) < 2:
+        return size
+    if max(beside) <= ALIKE * min(beside) or sum(size <= one <= BESIDE**2 * size for one, _ in points) >= SURE:
+        return None
+    return size * float(np.sqrt(BESIDE))
 
 
 def power_sizes(work: Path, noise: float = 1.0) -> dict[str, float]:
