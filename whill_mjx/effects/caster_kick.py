@@ -10,7 +10,7 @@ from whill_mjx.effects.base import Effect, contact_wrench, yaw_rate
 from whill_mjx.types import Motion, Wrench, parameter
 
 REST_SPEED = 0.05  # [m/s], fades the kick at rest
-TIE_BREAK = 0.02  # [rad], lets an exactly straight reversal start the swivel, counter-clockwise
+TIE_BREAK = 0.03  # [rad], lets an exactly straight reversal start the swivel, counter-clockwise
 
 
 @struct.dataclass
@@ -39,9 +39,12 @@ class CasterKick(Effect):
         """Wrench of the casters, and their swivel angles (4,) one step on."""
         cos, sin = jnp.cos(memory), jnp.sin(memory)
         speed = jnp.sqrt(motion.contact_vx**2 + motion.contact_vy**2 + REST_SPEED**2)
-        backward = speed - REST_SPEED - (motion.contact_vx * cos + motion.contact_vy * sin)  # 0 for one that trails
-        across = motion.contact_vy * cos - motion.contact_vx * sin + TIE_BREAK / 2 * backward
-        swivelled = memory + (across / self.trail - yaw_rate(motion)) * motion.dt  # the chassis turns under it
+        along = motion.contact_vx * cos + motion.contact_vy * sin
+        moving = along**2 / (along**2 + REST_SPEED**2)
+        backward = moving * (jnp.sqrt(along**2 + REST_SPEED**2) - along) / 2  # next to 0 for one that trails or stands
+        across = motion.contact_vy * cos - motion.contact_vx * sin
+        turning = (across + TIE_BREAK * backward) / self.trail
+        swivelled = memory + (turning - yaw_rate(motion)) * motion.dt  # the chassis turns under it
         slide = across / speed
         share = slide * (1 + self.sharpness) / (1 + self.sharpness * jnp.abs(slide))
         push = -self.force_limit * (1 - motion.world.geometry.driven) * share
