@@ -61,20 +61,31 @@ def test_every_log_belongs_to_one_process():
     assert not set(both[0]) & set(both[1])
 
 
-@pytest.mark.quick
-def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, monkeypatch):
-    recorded = json.loads(contact.RECORDED.read_text())
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """A copy of the recorded figures, into which the benchmark writes."""
     path = tmp_path / "undeclared.json"
-    path.write_text(json.dumps(recorded))
+    path.write_text(contact.RECORDED.read_text())
     monkeypatch.setattr(contact, "RECORDED", path)
     monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+    return path
+
+
+def judged(work, label, verdict, truth):
+    """Leave one verdict, and what was in its log."""
+    for folder, content in (("verdicts", verdict), ("truth", truth)):
+        (work / folder).mkdir()
+        (work / folder / f"{label}.json").write_text(json.dumps(content))
+
+
+@pytest.mark.quick
+def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
+    recorded = json.loads(results.read_text())
     verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
                "seconds": 1.0}
-    for folder, content in (("verdicts", verdict), ("truth", {})):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "null_000.json").write_text(json.dumps(content))
+    judged(tmp_path, "null_000", verdict, {})
     contact.figures(tmp_path)
-    after = json.loads(path.read_text())
+    after = json.loads(results.read_text())
     others = [row for row in recorded["confusion"] if row["stage"] != "null"]
     assert [row for row in after["confusion"] if row["stage"] != "null"] == others
     assert after["sizes"] == recorded["sizes"]
@@ -83,19 +94,13 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, monkeypatch)
 
 
 @pytest.mark.quick
-def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, monkeypatch):
-    recorded = json.loads(contact.RECORDED.read_text())
-    path = tmp_path / "undeclared.json"
-    path.write_text(json.dumps(recorded))
-    monkeypatch.setattr(contact, "RECORDED", path)
-    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, results):
+    recorded = json.loads(results.read_text())
     verdict = {"stage": "scaled", "scale": 4.0, "verdict": "named", "share": 0.9, "p_value": 0.01, "seconds": 1.0,
                "effects": [{"name": "slope", "class": ["slope", "wind"], "parameters": {}}]}
-    for folder, content in (("verdicts", verdict), ("truth", {"wind": 0.1})):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "wind_x4_0.json").write_text(json.dumps(content))
+    judged(tmp_path, "wind_x4_0", verdict, {"wind": 0.1})
     contact.figures(tmp_path, 2.0)
-    after = json.loads(path.read_text())
+    after = json.loads(results.read_text())
     assert after["figures"]["class_accuracy_4x_noise_2"]["value"] == 1.0
     assert after["figures"]["class_accuracy_4x"] == recorded["figures"]["class_accuracy_4x"]
     assert [row for row in after["confusion"] if row.get("noise", 1.0) == 1.0] == recorded["confusion"]
@@ -178,12 +183,8 @@ def test_a_size_is_believed_only_after_a_second_log(tmp_path):
 
 
 @pytest.mark.quick
-def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path, monkeypatch):
-    recorded = json.loads(contact.RECORDED.read_text())
-    path = tmp_path / "undeclared.json"
-    path.write_text(json.dumps(recorded))
-    monkeypatch.setattr(contact, "RECORDED", path)
-    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path, results):
+    recorded = json.loads(results.read_text())
     assert [job.effects for job in contact.probe_jobs(tmp_path, "1/1", ["slope"])] == [
         {"slope": contact.EFFECTS["slope"].base}]
     for number in (0, 1):
@@ -192,7 +193,7 @@ def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path
         one.write_text(json.dumps({**json.loads(one.read_text()), "scale": 0.0, "verdict": "named", "share": 0.9,
                                    "effects": [], "p_value": 0.001}))
     contact.figures(tmp_path)
-    after = json.loads(path.read_text())
+    after = json.loads(results.read_text())
     assert after["sizes"].pop("slope")["value"] == pytest.approx(0.03, rel=1e-3)
     recorded["sizes"].pop("slope")
     assert after["sizes"] == recorded["sizes"]
