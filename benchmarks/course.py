@@ -27,7 +27,7 @@ from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
 from whill_mjx.train import TrainOptions, main, mean_figures
-from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env
+from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
@@ -40,6 +40,7 @@ def run(options: argparse.Namespace) -> None:
         TrainOptions(
             out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
+            action_repeat=options.repeat,
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip
@@ -61,7 +62,7 @@ def together(options: argparse.Namespace) -> None:
 
     The time is that of all of them, so it says nothing of one run's.
     """
-    preset = find_preset(options.preset, "obstacle_course")
+    preset = with_repeat(find_preset(options.preset, options.task), options.repeat)
     task = dataclasses.replace(preset.task, layout=options.layout)
     steps = options.steps or preset.total_steps
     changes = {name: json.loads(value) for name, value in (one.split("=", 1) for one in options.change)}
@@ -322,6 +323,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--steps", type=int)
     one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
+    one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
     one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
     one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
@@ -330,6 +332,8 @@ def parse() -> argparse.Namespace:
     side.add_argument("--out", type=Path, required=True)
     side.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     side.add_argument("--preset", default="paper")
+    side.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
+    side.add_argument("--repeat", type=int, default=1, help="control periods that a decision holds")
     side.add_argument("--layout", default="randomised")
     side.add_argument("--vehicle", type=Path)
     side.add_argument("--steps", type=int)

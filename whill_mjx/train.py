@@ -39,6 +39,7 @@ from whill_mjx.training import (
     make_training_env,
     ppo_policy,
     step_driver,
+    with_repeat,
 )
 
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
@@ -79,6 +80,9 @@ class TrainOptions:
     """Learning rate; none takes the preset's."""
     train_ratio: float | None = None
     """Replayed steps per environment step; none takes the preset's."""
+    action_repeat: int | None = None
+    """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
+    seconds stay the preset's. None takes the preset's."""
     targets: bool = False
     """Let the world model also tell goal, speeds and free distances, which the simulator knows (`whill_mjx.truth`). The
     policy still sees the camera alone."""
@@ -149,6 +153,8 @@ def choose_preset(options: TrainOptions) -> Preset:
     on_cpu = jax.devices()[0].platform == "cpu"
     name = options.preset if options.preset != "auto" else ("cpu" if on_cpu else "paper")
     preset = find_preset(name, options.task)
+    if options.action_repeat is not None:
+        preset = with_repeat(preset, options.action_repeat)
     say(f"preset {name}")
     learner, baseline = preset.learner, preset.ppo
     if options.lr is not None:

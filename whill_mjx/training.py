@@ -65,7 +65,7 @@ def find_preset(name: str, task: str) -> Preset:
                 replay_capacity=250_000, mirror=True, average_rate=0.002,
                 horizon=100.0 if task == "obstacle_course" else 333.0,
             )  # fmt: skip
-            return Preset(make_task(task), learner, steps, eval_episodes=200)
+            return Preset(make_task(task), learner, steps, eval_every=max(1000, steps // 40), eval_episodes=200)
         case "wallclock":
             learner = learner_preset("size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000)
             return Preset(
@@ -84,6 +84,32 @@ def find_preset(name: str, task: str) -> Preset:
             return Preset(course, tiny, 400, instances=4, eval_every=200, eval_episodes=8, ppo=small)
     known = "'paper', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
     raise ValueError(f"unknown preset {name!r}; use {known}.")
+
+
+def with_repeat(preset: Preset, repeat: int) -> Preset:
+    """The same training with a decision every `repeat` control periods.
+
+    Control periods, updates and the horizon in seconds stay what they are; what counts decisions is scaled. A batch has
+    as many steps as before, in sequences of about the same time, so that learning begins as early.
+    """
+    factor = repeat / preset.task.action_repeat
+    learner = preset.learner
+    length = max(8, round(learner.batch_length / factor))
+    learner = dataclasses.replace(
+        learner,
+        train_ratio=learner.train_ratio * factor,
+        horizon=learner.horizon / factor,
+        learning_starts=round(learner.learning_starts / factor),
+        batch_length=length,
+        batch_size=max(1, round(learner.replayed_per_update / length)),
+    )
+    return dataclasses.replace(
+        preset,
+        task=dataclasses.replace(preset.task, action_repeat=repeat),
+        learner=learner,
+        total_steps=round(preset.total_steps / factor),
+        eval_every=max(1, round(preset.eval_every / factor)),
+    )
 
 
 def to_transition(step: TimeStep) -> Transition:
