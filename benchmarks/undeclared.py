@@ -3,9 +3,12 @@
     python -m benchmarks.undeclared --shared            the sets of ../shared/data/undeclared against plant/plain*
     python -m benchmarks.undeclared --nulls 200 --base --scales 2 4 --pairs 10
 
-The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`). Verdicts are kept in
-`runs/undeclared` and a run that was stopped goes on where it was; the figures are written at the end from all verdicts
-there.
+    for i in $(seq 44); do python -m benchmarks.undeclared --nulls 200 --reference-sets 44 --part $i/44 & done; wait
+    python -m benchmarks.undeclared --collect
+
+The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the third does so in processes
+that share a folder. Verdicts are kept in `runs/undeclared` and a run that was stopped goes on where it was; the figures
+are written at the end from all verdicts there.
 """
 
 from __future__ import annotations
@@ -21,13 +24,12 @@ import numpy as np
 
 from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
+from benchmarks.undeclared_reference import prepared, reference_days, reference_of
 from sysid.close_loop import LoopConfig, Prepared, close_loop, prepare
-from sysid.log import Log, load_log
-from sysid.loop.reference import Reference, make_reference
+from sysid.log import load_log
 from sysid.loop.report import make_report, write_run
 from sysid.rollout import vehicle_plant
 from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset_params
 
 REFERENCES = ("plain", "plain_2", "plain_3", "plain_4", "plain_5", "plain_6")
 SETS = ("a", "b", "c", "d", "e", "f", "g", "h")
@@ -45,6 +47,9 @@ class Benchmark:
     """Folder with `plant` and `undeclared`."""
     nulls: int = 0
     """Logs of the contact plant with nothing in them."""
+    reference_sets: int = 1
+    """Sets of reference days that these are judged against in turn; all else is judged against the first. With as many
+    sets as there are processes (`part`), each makes one."""
     base: bool = False
     """Logs of the contact plant with one effect each, from its base size to the one that is noticed with 80 % power."""
     scales: tuple[float, ...] = ()
@@ -72,7 +77,7 @@ class Benchmark:
     work: Path = Path("runs/undeclared")
     """Folder for logs and verdicts."""
     part: str = "1/1"
-    """I/N: only every N-th log or effect from the I-th on, for several processes."""
+    """I/N: only every N-th log or effect from the I-th on, for several processes; `collect` then writes the figures."""
 
 
 def main(settings: Benchmark) -> None:
@@ -114,31 +119,25 @@ def shared(settings: Benchmark) -> None:
         write_json(path, content)
 
 
-def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
-    """The reference, made once for all logs of one vehicle."""
-    plant = vehicle_plant(logs[0].spec, VehicleConfig(physics_dt=config.physics_dt))
-    return make_reference(plant, preset_params(logs[0].spec, config.preset), logs, True, config.iterations,
-                          progress=lambda _, remark: print(remark, flush=True))
-
-
 def plant(settings: Benchmark) -> None:
     """Logs of the contact plant."""
     work, config, part, noise = settings.work / "plant", LoopConfig(), settings.part, settings.noise
-    days = contact.reference_days(work, noise)
-    ready: list[Prepared] = []
+    ready: dict[int, Prepared] = {}
 
     def judge(listed: Sequence[contact.Job]) -> None:
         for number, job in enumerate(listed):
             if (work / "verdicts" / f"{job.label}.json").exists():
                 continue
-            if not ready:
-                ready.append(prepare(reference_of(days, config), days[0].spec, config))
+            if job.reference not in ready:
+                ready.clear()  # one at a time: each has its compiled replay
+                ready[job.reference] = prepared(work, job.reference, noise, config)
             full = job.stage in ("scaled", "pair") and bool(job.effects) and number % settings.full == 0
-            one = contact.judge(job, ready[0], work, config, full, noise)
+            one = contact.judge(job, ready[job.reference], work, config, full, noise)
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
-    judge(contact.null_jobs(settings.nulls, part))
+    nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
+    judge(sorted(nulls, key=lambda job: job.reference))
     while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
     if settings.scales:
@@ -147,7 +146,8 @@ def plant(settings: Benchmark) -> None:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:
         judge(contact.pair_jobs(work, settings.pairs, part, noise))
-    contact.figures(work, noise)
+    if part == "1/1":
+        contact.figures(work, noise)
 
 
 def look_alikes(settings: Benchmark) -> None:
@@ -157,7 +157,7 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.loop.drives import make_drives
     from sysid.loop.evidence import gather
 
-    days = contact.reference_days(settings.work / "plant")
+    days = reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
     for sensors, keep in (("odometry", False), ("odometry and outside pose", True)):
         logs = [log if keep else replace(log, trials=tuple(replace(t, ground_truth=None) for t in log.trials))

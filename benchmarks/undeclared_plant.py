@@ -22,8 +22,9 @@ import numpy as np
 from benchmarks.harness import RESULTS, figure, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
+from benchmarks.undeclared_reference import reference_days
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
-from sysid.log import Log, load_log
+from sysid.log import load_log
 from sysid.loop.report import effects as named_effects
 from sysid.loop.report import make_report, write_run
 from sysid.report import write_report
@@ -31,7 +32,6 @@ from sysid.statistics import upper_rate
 
 RECORDED = RESULTS / "undeclared.json"
 CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
-DAYS = 6
 POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
 NEAR, FAR = (0.3, 3.0), (0.1, 10.0)
@@ -76,21 +76,8 @@ class Job:
     """Label of the log, where another job drives it."""
     without: tuple[str, ...] = ()
     """Effects that the catalogue does not have."""
-
-
-def reference_days(work: Path, noise: float = 1.0) -> list[Log]:
-    """Days of the contact plant with nothing in them: one with three replicates, the others with one."""
-    days = []
-    for number in range(DAYS):
-        path = work / "reference" / f"day_{number + 1}"
-        if not path.exists():
-            try:
-                make_log(path, seed=11001 + number, noise=noise, replicates=3 if number == 0 else 1)
-            except OSError:
-                if not path.exists():  # else another part was quicker
-                    raise
-        days.append(load_log(path))
-    return days
+    reference: int = 0
+    """Set of reference days that it is judged against."""
 
 
 def mine(number: int, part: str) -> bool:
@@ -99,9 +86,18 @@ def mine(number: int, part: str) -> bool:
     return number % count == first - 1
 
 
-def null_jobs(nulls: int, part: str) -> list[Job]:
-    """Logs with nothing in them."""
-    return [Job(f"null_{n:03d}", {}, 20000 + n) for n in range(nulls) if mine(n, part)]
+def null_jobs(nulls: int, part: str, sets: int = 1) -> list[Job]:
+    """Logs with nothing in them, dealt over sets of reference days."""
+    return [Job(f"null_{n:03d}", {}, 20000 + n, reference=n % sets) for n in range(nulls)
+            if mine(_dealt(n, sets, part), part)]
+
+
+def _dealt(null: int, sets: int, part: str) -> int:
+    """Number by which a null goes to a process, such that each needs as few sets of reference days as can be."""
+    [_, count] = part.split("/")
+    number = null % sets
+    sharing = len(range(number, int(count), sets))  # processes that can have this set for their only one
+    return number + sets * (null // sets % sharing) if sharing else number
 
 
 def probe_jobs(work: Path, part: str, only: Sequence[str] = ()) -> list[Job]:
@@ -252,7 +248,8 @@ def judge(
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = close_loop(load_log(folder), (), config, reference=ready)
-    content = {"stage": job.stage, "scale": job.scale, **brief(result), "seconds": time.perf_counter() - began}
+    content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, **brief(result),
+               "seconds": time.perf_counter() - began}
     if full and result.search.verdict == "named":
         report = make_report(result)
         write_run(work / "reports" / job.label, result, report)
@@ -368,10 +365,12 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
     if not nulls:
         return {}
     false = sum(one["verdict"] != "none" for one in nulls)
+    sets = len({one.get("reference", 0) for one in nulls})
     return {
         "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
         "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share"),
-        "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)], "-")}
+        "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)],
+                            f"of {len(nulls)} logs over {sets} sets of reference days")}
 
 
 def said(truth: str, one: dict[str, Any]) -> bool:

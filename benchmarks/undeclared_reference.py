@@ -1,0 +1,89 @@
+"""The reference days that undeclared effects are looked for against: sets of drives with nothing in them.
+
+Verdicts against one set share its luck, so their p-values are not independent. Nulls are therefore dealt over several
+sets; set 0 is the one that everything else is judged against. The fit to a set is kept beside its drives, under the
+hash of the code that made it, for processes that come later.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.plant.make import make_log
+from sysid.close_loop import LoopConfig, Prepared, prepare
+from sysid.log import Log, load_log
+from sysid.loop.reference import Reference, make_reference
+from sysid.report import code_hashes
+from sysid.rollout import vehicle_plant
+from whill_mjx.config import VehicleConfig
+from whill_mjx.presets import preset_params
+
+DAYS = 6
+FIRST_SEED, SEEDS = 11001, 10
+"""Seed of the first day of set 0, and how far the next set's first is from it; nulls start at 20000."""
+SETS = 800
+"""More sets would use the seeds of other logs."""
+
+
+def folder_of(work: Path, number: int) -> Path:
+    """Where the days of a set are."""
+    return work / ("reference" if number == 0 else f"reference_{number}")
+
+
+def reference_days(work: Path, noise: float = 1.0, number: int = 0) -> list[Log]:
+    """Days of the contact plant with nothing in them: one with three replicates, the others with one.
+
+    Args:
+        number: of the set, from 0.
+
+    Raises:
+        ValueError: if there is no such set.
+    """
+    if not 0 <= number < SETS:
+        raise ValueError(f"set of reference days {number}: must be 0 to {SETS - 1}. Ask for fewer sets.")
+    days = []
+    for day in range(DAYS):
+        path = folder_of(work, number) / f"day_{day + 1}"
+        if not path.exists():
+            try:
+                make_log(path, seed=FIRST_SEED + SEEDS * number + day, noise=noise, replicates=3 if day == 0 else 1)
+            except OSError:
+                if not path.exists():  # else another part was quicker
+                    raise
+        days.append(load_log(path))
+    return days
+
+
+def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
+    """The reference, made once for all logs of one vehicle."""
+    plant = vehicle_plant(logs[0].spec, VehicleConfig(physics_dt=config.physics_dt))
+    return make_reference(plant, preset_params(logs[0].spec, config.preset), logs, True, config.iterations,
+                          progress=lambda _, remark: print(remark, flush=True))
+
+
+def prepared(work: Path, number: int, noise: float, config: LoopConfig) -> Prepared:
+    """A set ready for `close_loop`; its days are driven, and fitted, where that was not done before."""
+    days = reference_days(work, noise, number)
+    path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
+    if path.exists():
+        reference = pickle.loads(path.read_bytes())
+    else:
+        reference = reference_of(days, config)
+        _write(path, pickle.dumps(reference))
+    return prepare(reference, days[0].spec, config)
+
+
+def _key(days: Sequence[Log], config: LoopConfig) -> str:
+    """Of everything that a fit depends on: code, versions, data and settings."""
+    told = repr((sorted(code_hashes().items()), [day.sha256 for day in days], config))
+    return hashlib.sha256(told.encode()).hexdigest()[:16]
+
+
+def _write(path: Path, content: bytes) -> None:
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    temporary.write_bytes(content)
+    os.replace(temporary, path)
