@@ -81,8 +81,14 @@ class Start:
     """Standard error of x and y [m]."""
     yaw_sigma: float = 0.0
     """Standard error of yaw [rad]."""
+    odometry_position_sigma: float = 0.0
+    """Standard error of the origin from which the odometry counts x and y [m]."""
+    odometry_yaw_sigma: float = 0.0
+    """Standard error of the heading from which it counts yaw, and along which x points [rad]."""
     measured: bool = False
     """Whether the pose is the outside measurement at t = 0 itself."""
+    rest: float = 0.0
+    """Until when poses were averaged for it [s]."""
 
 
 @dataclass(frozen=True)
@@ -190,16 +196,17 @@ def make_trial(
     """
     still = standstill_end(command)
     v, omega = _start_speeds(command, odometry)
-    start = Start(v=v, omega=omega)
+    start = Start(v=v, omega=omega, rest=still)
     if ground_truth is not None:
         rest = _rest(ground_truth.t, still)
         x, y, yaw = ground_truth.x[rest], ground_truth.y[rest], ground_truth.yaw[rest]
-        spread = np.sqrt((_variance(x) + _variance(y)) / 2)
-        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()), v, omega,
-                      position_sigma=float(spread / np.sqrt(len(x))),
-                      yaw_sigma=float(np.sqrt(_variance(yaw) / len(x))))
+        position_sigma, yaw_sigma = _standard_errors(x, y, yaw)
+        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()), v, omega, position_sigma, yaw_sigma,
+                      rest=still)
     if odometry is not None and odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
         rest = _rest(odometry.t, still)
+        position_sigma, yaw_sigma = _standard_errors(odometry.x[rest], odometry.y[rest], odometry.yaw[rest])
+        start = replace(start, odometry_position_sigma=position_sigma, odometry_yaw_sigma=yaw_sigma)
         x, y = odometry.x - odometry.x[rest].mean(), odometry.y - odometry.y[rest].mean()
         yaw0 = odometry.yaw[rest].mean()
         cos, sin = np.cos(yaw0), np.sin(yaw0)
@@ -365,5 +372,9 @@ def _rest(t: np.ndarray, still: float) -> np.ndarray:
     return indices if len(indices) else np.array([0])
 
 
-def _variance(values: np.ndarray) -> float:
-    return float(values.var(ddof=1)) if len(values) > 1 else 0.0
+def _standard_errors(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[float, float]:
+    """Of the mean position, per axis, and of the mean yaw over samples (M,) at rest; 0 of a single sample."""
+    if len(x) < 2:
+        return 0.0, 0.0
+    position = np.sqrt((x.var(ddof=1) + y.var(ddof=1)) / 2 / len(x))
+    return float(position), float(np.sqrt(yaw.var(ddof=1) / len(x)))

@@ -9,10 +9,12 @@ noise as prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
+from sysid.gradient import huber_weight
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
 from sysid.prior import Prior
@@ -77,7 +79,18 @@ class Objective:
     @property
     def counted(self) -> int:
         """Number of measured values."""
-        return int(self.measured.pose_mask.sum() + self.measured.odometry_mask.sum())
+        return int(sum(mask.sum() for mask in self._masks))
+
+    @cached_property
+    def _masks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Masks of pose (B, M, 3) and odometry (B, L, 5) without what the start was averaged from: counted once."""
+        pose, odometry = self.measured.pose_mask.copy(), self.measured.odometry_mask.copy()
+        for i, trial in enumerate(self.trials):
+            for mask, stream, known in ((pose, trial.ground_truth, trial.start.position_sigma),
+                                        (odometry, trial.odometry, trial.start.odometry_position_sigma)):
+                if stream is not None and known > 0:
+                    mask[i, : int((stream.t <= trial.start.rest).sum()), :3] = 0.0
+        return pose, odometry
 
     def with_noise(self, noise: Noise) -> Objective:
         return replace(self, noise=noise)
@@ -139,8 +152,8 @@ class Objective:
         pose = residual[:, :pose_size].reshape(self.measured.pose.shape)
         odometry_size = self.measured.odometry[0].size
         odometry = residual[:, pose_size : pose_size + odometry_size].reshape(self.measured.odometry.shape)
-        columns = [*np.where(self.measured.pose_mask > 0, pose, np.nan).transpose(2, 0, 1),
-                   *np.where(self.measured.odometry_mask > 0, odometry, np.nan).transpose(2, 0, 1)]
+        columns = [*np.where(self._masks[0] > 0, pose, np.nan).transpose(2, 0, 1),
+                   *np.where(self._masks[1] > 0, odometry, np.nan).transpose(2, 0, 1)]
         return dict(zip(self.noise.as_dict(), columns, strict=True))
 
     def _bad(self, simulated: Simulated) -> np.ndarray:
@@ -151,7 +164,8 @@ class Objective:
         measured, noise = self.measured, self.noise
         count, trials = simulated.pose.shape[:2]
         bad = self._bad(simulated)[:, :, None]
-        pose_weight, odometry_weight = measured.pose_mask / noise.pose, measured.odometry_mask / noise.odometry
+        pose_weight, odometry_weight = (
+            mask / scale for mask, scale in zip(self._masks, (noise.pose, noise.odometry), strict=True))
 
         def flat(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
             return np.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
@@ -174,30 +188,54 @@ class Objective:
         """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
 
         A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
-        linear map of r that is applied to the Jacobian as well.
+        linear map of r that is applied to the Jacobian as well. Samples that are far off (`gradient.HUBER`) weigh less
+        in it: one start must not follow them, when all samples suffer from it. The odometry, which is counted from its
+        own standstill, has such an error of its own.
         """
-        sigma = np.array([[t.start.position_sigma, t.start.position_sigma, t.start.yaw_sigma] for t in self.trials])
-        if not (sigma > 0).any():
-            return residual, jacobian
-        sigma = np.maximum(sigma, 1e-9)  # (B, 3)
-        start = np.array([[t.start.x, t.start.y] for t in self.trials])
-        weight = self.measured.pose_mask / self.noise.pose  # (B, M, 3)
-        arm = np.nan_to_num(simulated.pose[..., :2] - start[:, None, :])  # (N, B, M, 2)
-        design = np.zeros((*simulated.pose.shape, 3))  # (N, B, M, 3 of the pose, 3 of the start error)
-        design[..., 0, 0] = design[..., 1, 1] = design[..., 2, 2] = 1.0
-        design[..., 0, 2], design[..., 1, 2] = -arm[..., 1], arm[..., 0]
-        design = (design * weight[..., None]).reshape(*residual.shape[:2], -1, 3)
-        size = design.shape[2]
-        normal = np.einsum("nbki,nbkj->nbij", design, design) + np.einsum("bi,ij->bij", sigma**-2.0, np.eye(3))
-        gain = -np.linalg.solve(normal, design.swapaxes(-1, -2))  # (N, B, 3, K)
-        error = np.einsum("nbik,nbk->nbi", gain, residual[:, :, :size])
-        residual = np.concatenate([residual, error / sigma], axis=2)
-        residual[:, :, :size] += np.einsum("nbki,nbi->nbk", design, error)
-        if jacobian is not None:
-            slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, :size])
-            jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
-            jacobian[:, :, :size] += np.einsum("nbki,nbip->nbkp", design, slope)
+        noise, starts = self.noise, [trial.start for trial in self.trials]
+        begin = 0
+        for values, weight, origin, sigmas in (
+            (simulated.pose, self._masks[0] / noise.pose, [(one.x, one.y) for one in starts],
+             [(one.position_sigma, one.position_sigma, one.yaw_sigma) for one in starts]),
+            (simulated.odometry, self._masks[1] / noise.odometry, np.zeros((len(starts), 2)),
+             [(one.odometry_position_sigma, one.odometry_position_sigma, one.odometry_yaw_sigma) for one in starts]),
+        ):
+            part = slice(begin, begin + values[0, 0].size)
+            begin = part.stop
+            if not np.any(sigmas):
+                continue
+            sigma = np.maximum(sigmas, 1e-9)  # (B, 3)
+            design = _start_design(np.asarray(values), np.asarray(origin), weight)
+            gain = _start_gain(design, huber_weight(residual[:, :, part]), sigma)  # (N, B, 3, K)
+            error = np.einsum("nbik,nbk->nbi", gain, residual[:, :, part])
+            residual = np.concatenate([residual, error / sigma], axis=2)
+            residual[:, :, part] += np.einsum("nbki,nbi->nbk", design, error)
+            if jacobian is not None:
+                slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, part])
+                jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
+                jacobian[:, :, part] += np.einsum("nbki,nbip->nbkp", design, slope)
         return residual, jacobian
+
+
+def _start_design(values: np.ndarray, origin: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Whitened derivative (N, B, K, 3) of poses by an error of their start.
+
+    Args:
+        values: (N, B, M, C) of which the first three columns are x, y, yaw.
+        origin: (B, 2) where they start.
+        weight: (B, M, C) one over the noise, 0 where masked.
+    """
+    arm = np.nan_to_num(values[..., :2] - origin[:, None, :])  # (N, B, M, 2)
+    design = np.zeros((*values.shape, 3))
+    design[..., 0, 0] = design[..., 1, 1] = design[..., 2, 2] = 1.0
+    design[..., 0, 2], design[..., 1, 2] = -arm[..., 1], arm[..., 0]
+    return (design * weight[..., None]).reshape(*values.shape[:2], -1, 3)
+
+
+def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
+    weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
+    return -np.linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
 
 
 def _append(table: np.ndarray, more: np.ndarray) -> np.ndarray:

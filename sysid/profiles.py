@@ -18,7 +18,7 @@ from sysid import gradient
 from sysid.objective import Objective
 from sysid.result import Progress
 from sysid.space import Space
-from sysid.uncertainty import CONFIDENCE, Uncertainty
+from sysid.uncertainty import Uncertainty
 
 POINTS = 9
 ITERATIONS = 4
@@ -74,19 +74,15 @@ def profile(
     Raises:
         ValueError: a name is not searched.
     """
-    from scipy import stats
-
     space = objective.space
     check_names(space, names)
-    quantile = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(len(objective.trials) - 1, 1)))
-    # The intervals take the larger of two variances for each parameter; the covariance is one of the two.
-    ends = [space.to_unit(np.array([getattr(one, end) for one in known.estimates])) for end in ("low", "high")]
-    sd = np.maximum((ends[1] - ends[0]) / (2 * quantile), 1e-8)
+    sd = np.maximum(known.deviation, 1e-8)
     scale = _scale(objective, u, known, sd)
     best = float(gradient.robust_cost(objective.residuals(u[None]), robust)[0]) / objective.counted
     found = []
     for name in names:
         index = space.names.index(name)
+        quantile = float(known.quantile[index])
         reach = REACH * quantile * sd[index] if known.estimates[index].identifiable else 1.0
         low, high = max(u[index] - reach, 0.0), min(u[index] + reach, 1.0)
         grid = np.unique(np.round(np.append(np.linspace(low, high, points), u[index]), 9))

@@ -1,8 +1,9 @@
 """Confidence intervals of fitted parameters, and which of them the log cannot tell.
 
-Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. The middle
-of the sandwich H^-1 M H^-1 is therefore summed over blocks of neighbouring samples whose contributions are added before
-they are squared: over whole trials, and over pieces of a few seconds; the larger variance is taken.
+Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. Trials are
+independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive.
+Where too few trials tell a parameter for that, blocks are pieces of trials, and errors are taken to be no less than
+those of independent samples.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ import numpy as np
 
 from sysid.gradient import HUBER, huber_weight
 from sysid.objective import Objective
+from sysid.sandwich import Variance, sandwich
 
 CONFIDENCE = 0.90
 PIECES = 8
-"""Blocks that each trial is cut into for the second estimate."""
+"""Blocks that each trial is cut into where trials are too few."""
+ENOUGH = 2.0
+"""Degrees of freedom from which the variance between trials is taken: three or four drives that tell a parameter."""
 PRIOR_SD = 0.29
 """Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
 UNIDENTIFIABLE = 0.5
@@ -47,6 +51,8 @@ class Uncertainty:
     information: np.ndarray  # (P,) eigenvalues of J^T J / s^2, ascending
     directions: np.ndarray  # (P, P) eigenvectors in the columns
     covariance: np.ndarray  # (P, P) in unit coordinates
+    deviation: np.ndarray  # (P,) standard errors in unit coordinates
+    quantile: np.ndarray  # (P,) of their Student distributions, at the confidence of the intervals
 
     def weak_combinations(self) -> list[str]:
         """Directions that the log does not tell, as the parameters that make them up."""
@@ -71,68 +77,78 @@ def estimate(
 
     space = objective.space
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
-    trials = len(residual)
     if objective.prior is not None:  # not a measurement: it comes back as a precision
         residual, jacobian = residual[:, : -space.size], jacobian[:, : -space.size]
+    told = jacobian
     if robust:
-        inside = np.abs(residual) <= HUBER
+        told = jacobian * (np.abs(residual) <= HUBER)[..., None]
         residual = residual * huber_weight(residual)
-        hessian = np.einsum("bkp,bkq->pq", jacobian * inside[..., None], jacobian)
-    else:
-        hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
+    scores, blocks = _pieces(objective, jacobian, residual, told)  # (B, PIECES, P), (B, PIECES, P, P)
+    hessian = blocks.sum((0, 1))
     variance = max(float(np.square(residual).sum()) / max(objective.counted - space.size, 1), 1e-12)
-    prior = np.eye(space.size) / PRIOR_SD**2
-    by_trial = np.einsum("bkp,bk->bp", jacobian, residual)  # (B, P)
-    by_piece = _piece_sums(objective, jacobian, residual)
-    inflation = trials / max(trials - 1, 1)
-    middles = [variance * hessian, np.einsum("bp,bq->pq", by_piece, by_piece)]
-    if trials > space.size:  # fewer blocks than parameters would leave directions without any variance
-        middles.append(np.einsum("bp,bq->pq", by_trial, by_trial) * inflation)
     # The prior is weak: it matters only along directions of which the log says nothing.
-    scale = max(np.mean([np.trace(middle) for middle in middles]) / max(np.trace(hessian), 1e-12), 1e-12)
-    inverse = np.linalg.inv(hessian + scale * prior)
-    covariances = [inverse @ (middle + scale**2 * prior) @ inverse for middle in middles]
-    if objective.prior is not None:
-        # Weighed as it was, that is in units of the data's precision over `scale`; its own variance is 1.
-        told = objective.prior.precision
-        inverse = np.linalg.inv(hessian + told)
-        covariances = [inverse @ (middle + objective.prior.share * told) @ inverse for middle in middles]
-    largest = max(covariances, key=np.trace)
-    deviation = np.sqrt(np.max([np.diag(covariance) for covariance in covariances], axis=0))
-    quantile = float(stats.t.ppf((1 + confidence) / 2, max(trials - 1, 1)))
+    scale = max(variance, float(np.square(scores).sum()) / max(np.trace(hessian), 1e-12), 1e-12)
+    weak, share = np.eye(space.size) / PRIOR_SD**2 * scale, scale
+    if objective.prior is not None:  # weighed as it was; its own variance is 1
+        weak, share = objective.prior.precision, objective.prior.share
+    inverse = np.linalg.inv(hessian + weak)
+    between = sandwich(scores.sum(1), blocks.sum(1), inverse)
+    within = sandwich(scores.reshape(-1, space.size), blocks.reshape(-1, space.size, space.size), inverse)
+    known = inverse @ weak @ inverse * share  # what the prior's own error adds
+    deviation, freedom = _choose(between, within, np.diag(inverse @ hessian @ inverse) * variance)
+    deviation = np.sqrt(deviation**2 + np.diag(known))
+    quantile = stats.t.ppf((1 + confidence) / 2, freedom)
+    covariance = max((one.covariance for one in (between, within)), key=np.trace) + known
     information, directions = np.linalg.eigh(hessian / scale)
     estimates = []
     for index, name in enumerate(space.names):
         low = space.to_values(u - quantile * deviation)[index]
         high = space.to_values(u + quantile * deviation)[index]
-        told = deviation[index] < UNIDENTIFIABLE * PRIOR_SD
-        remark = "" if told else "not identifiable: the log hardly narrows its bounds"
-        if told and min(u[index], 1 - u[index]) < WALL:
+        narrow = deviation[index] < UNIDENTIFIABLE * PRIOR_SD
+        remark = "" if narrow else "not identifiable: the log hardly narrows its bounds"
+        if narrow and min(u[index], 1 - u[index]) < WALL:
             remark = f"on its {'lower' if u[index] < 0.5 else 'upper'} bound"
-        if not told:
+        if not narrow:
             low, high = min(low, space.high[index]), max(high, space.low[index])
         estimates.append(Estimate(name, float(space.initial[index]), float(space.to_values(u)[index]), float(low),
-                                  float(high), bool(told), remark))
-    return Uncertainty(tuple(estimates), information, directions, largest)
+                                  float(high), bool(narrow), remark))
+    return Uncertainty(tuple(estimates), information, directions, covariance, deviation, quantile)
 
 
 def inflation(objective: Objective, u: np.ndarray) -> float:
     """How many times the squared residuals count what they tell: their sum over neighbours against that one by one."""
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
-    pieces = _piece_sums(objective, jacobian, residual * huber_weight(residual))
+    pieces = _pieces(objective, jacobian, residual * huber_weight(residual), jacobian)[0].reshape(-1, len(u))
     told = np.diag(hessian) > 1e-9 * np.diag(hessian).max()
     return max(float(np.median(np.square(pieces).sum(0)[told] / np.diag(hessian)[told])), 1.0)
 
 
-def _piece_sums(objective: Objective, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """(B * PIECES, P) gradient contributions of pieces of trials, all channels of a piece together."""
-    measured = objective.measured
-    product = jacobian * residual[..., None]
-    sums, offset = [], 0
-    for table in (measured.pose, measured.odometry):
-        size = table[0].size
-        part = product[:, offset : offset + size].reshape(len(residual), table.shape[1], table.shape[2], -1).sum(2)
-        sums.append(np.stack([piece.sum(1) for piece in np.array_split(part, PIECES, axis=1)], axis=1))
-        offset += size
-    return (sums[0] + sums[1]).reshape(-1, jacobian.shape[-1])
+def _choose(between: Variance, within: Variance, independent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard errors (P,) and their degrees of freedom: between trials where they know it, or else within them.
+
+    Args:
+        independent: (P,) variances if all samples were independent.
+    """
+    enough = (between.freedom >= ENOUGH) & (between.told > 0.5)
+    pieces = np.maximum(np.diag(within.covariance), independent)
+    deviation = np.sqrt(np.where(enough, np.diag(between.covariance), pieces))
+    return deviation, np.maximum(np.where(enough, between.freedom, within.freedom), 1.0)
+
+
+def _pieces(
+    objective: Objective, jacobian: np.ndarray, residual: np.ndarray, told: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """J^T r (B, PIECES, P) and J^T J (B, PIECES, P, P) of pieces of trials, all channels of a piece together.
+
+    Args:
+        told: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss tell no curvature.
+    """
+    tables = (objective.measured.pose, objective.measured.odometry)
+    piece = np.concatenate([np.repeat(np.arange(table.shape[1]) * PIECES // max(table.shape[1], 1), table.shape[2])
+                            for table in tables])
+    piece = np.pad(piece, (0, residual.shape[1] - len(piece)))  # errors of the start belong to the first piece
+    parts = [np.flatnonzero(piece == k) for k in range(PIECES)]
+    scores = [np.einsum("bkp,bk->bp", jacobian[:, part], residual[:, part]) for part in parts]
+    blocks = [told[:, part].swapaxes(1, 2) @ jacobian[:, part] for part in parts]
+    return np.stack(scores, axis=1), np.stack(blocks, axis=1)

@@ -84,4 +84,5 @@ def shared_folder(name: str) -> Path:
 
 
 def without_start_noise(trial):
-    return dataclasses.replace(trial, start=dataclasses.replace(trial.start, position_sigma=0.0, yaw_sigma=0.0))
+    none = dict.fromkeys(("position_sigma", "yaw_sigma", "odometry_position_sigma", "odometry_yaw_sigma"), 0.0)
+    return dataclasses.replace(trial, start=dataclasses.replace(trial.start, **none))

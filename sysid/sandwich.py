@@ -1,0 +1,52 @@
+"""Variances of least-squares estimates whose errors are correlated within blocks, and how well those are known.
+
+Contributions to the gradient are added within a block before they are squared, so that any correlation within it
+counts as often as it tells; blocks are taken as independent. The residual of a block is smaller than its errors,
+because the estimate follows them: each is divided by the root of what the fit leaves of independent errors, I - H_gg
+(CR2), which is unbiased for those. Few blocks, or few that matter to a parameter, know their own variance badly: its
+degrees of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+LEAST_LEFT = 1e-3
+"""Of a direction of which a block keeps less than this share of its errors, its residual tells nothing."""
+
+
+@dataclass(frozen=True)
+class Variance:
+    """Covariance of P estimates."""
+
+    covariance: np.ndarray  # (P, P)
+    freedom: np.ndarray  # (P,) degrees of freedom of its diagonal
+    told: np.ndarray  # (P,) expected diagonal for independent errors, over what it is then
+
+
+def sandwich(scores: np.ndarray, blocks: np.ndarray, inverse: np.ndarray) -> Variance:
+    """Variance of a minimum of squares.
+
+    Args:
+        scores: (G, P) J_g^T r_g of each block at the minimum.
+        blocks: (G, P, P) J_g^T J_g.
+        inverse: (P, P) of their sum, or of a larger matrix.
+    """
+    value, vector = np.linalg.eigh(inverse)
+    half = (vector * np.sqrt(np.maximum(value, 0.0))) @ vector.T
+    share, axes = np.linalg.eigh(half @ blocks @ half)  # (G, P), (G, P, P): of the errors that the estimates follow
+    left = 1.0 - np.clip(share, 0.0, 1.0)
+    gain = np.where(left > LEAST_LEFT, np.maximum(left, LEAST_LEFT) ** -0.5, 0.0)
+    local = axes.swapaxes(1, 2) @ half  # (G, P, P)
+    moved = np.einsum("gkp,gk,gkq,gq->gp", local, gain, local, scores, optimize=True)  # how each block moves them
+    # Of independent errors of variance 1, blocks g and h move p with the covariance lengths_gp (g = h) - z_gp^T z_hp.
+    lengths = np.einsum("gkp,gk->gp", local**2, share * gain**2)
+    z = axes @ ((share * gain)[..., None] * local)  # (G, P, P)
+    freedom, expected = np.empty(len(inverse)), np.empty(len(inverse))
+    for p in range(len(inverse)):
+        products = np.diag(lengths[:, p]) - z[:, :, p] @ z[:, :, p].T
+        expected[p] = np.trace(products)
+        freedom[p] = expected[p] ** 2 / max(float(np.square(products).sum()), 1e-300)
+    return Variance(moved.T @ moved, freedom, expected / np.maximum(np.diag(inverse), 1e-300))

@@ -1,0 +1,136 @@
+"""Intervals hold the truth as often as they say, whatever the errors within a drive; a drive's start counts once."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import unicycle_objective
+
+from sysid import gradient, uncertainty
+from sysid.objective import Noise
+from sysid.rollout import Measured
+from sysid.sandwich import sandwich
+from sysid.space import Space
+
+DRIVES, SAMPLES, PARAMETERS = 12, 80, 3
+
+
+class Linear:
+    """Residuals of y = X u + errors, as an objective shows them."""
+
+    def __init__(self, design: np.ndarray, errors: np.ndarray):
+        count = design.shape[-1]
+        self.space = Space(tuple("abcdefg"[:count]), np.zeros(count), np.ones(count), np.full(count, 0.5),
+                           np.zeros(count, bool))
+        self.trials, self.prior = [None] * len(design), None
+        mask = np.ones((*design.shape[:2], 1))
+        self.measured = Measured(0 * mask, mask, 0 * mask[..., :0], mask[..., :0])
+        self.noise = Noise(np.ones(3), np.ones(5), "residuals")
+        self._design, self._errors = design, errors
+        self.counted = errors.size
+
+    def residuals(self, u):
+        return np.einsum("bkp,np->nbk", self._design, u - 0.5) - self._errors
+
+    def jacobian(self, u):
+        return self.residuals(u), np.tile(self._design, (len(u), 1, 1, 1))
+
+
+def correlated(random: np.random.Generator, rho: float) -> np.ndarray:
+    """(DRIVES, SAMPLES) errors of variance 1 within drives that do not know of each other."""
+    errors = random.standard_normal((DRIVES, SAMPLES))
+    for k in range(1, SAMPLES):
+        errors[:, k] = rho * errors[:, k - 1] + np.sqrt(1 - rho**2) * errors[:, k]
+    return errors
+
+
+def designs(random: np.random.Generator) -> np.ndarray:
+    """(DRIVES, SAMPLES, PARAMETERS): slow and fast, and of one parameter in every third drive only."""
+    t = np.linspace(0, 1, SAMPLES)
+    size = random.uniform(0.5, 1.5, (DRIVES, 1))
+    third = np.where(np.arange(DRIVES)[:, None] % 3 == 0, size, 0.0)
+    return 30 * np.stack([size * t, size * np.sin(20 * t), third * np.ones_like(t)], axis=-1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_intervals_of_correlated_errors_cover_nine_in_ten(rho):
+    random = np.random.default_rng(1)
+    inside = []
+    for _ in range(400):
+        objective = Linear(designs(random), correlated(random, rho))
+        u = gradient.fit(objective, objective.space, iterations=4).u
+        known = uncertainty.estimate(objective, u)
+        inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
+    share = np.mean(inside, axis=0)
+    assert (share > 0.86).all() and (share < 0.94).all()
+
+
+@pytest.mark.quick
+def test_the_variance_of_few_blocks_is_unbiased_where_errors_are_independent():
+    """Without the correction, five drives of three parameters show far too little of it."""
+    random = np.random.default_rng(2)
+    design = designs(random)[:5]
+    blocks = np.einsum("bkp,bkq->bpq", design, design)
+    inverse = np.linalg.inv(blocks.sum(0))
+    found, plain = [], []
+    for _ in range(2000):
+        errors = random.standard_normal(design.shape[:2])
+        residual = errors - design @ (inverse @ np.einsum("bkp,bk->p", design, errors))
+        scores = np.einsum("bkp,bk->bp", design, residual)
+        one = sandwich(scores, blocks, inverse)
+        found.append(np.diag(one.covariance))
+        plain.append(np.square(scores @ inverse).sum(0))
+    told = np.diag(inverse)
+    np.testing.assert_allclose(np.mean(found, 0), told * one.told, rtol=0.1)
+    assert one.told[:2] == pytest.approx(1.0, rel=1e-6)
+    assert (np.mean(plain, 0) < 0.85 * told).all()
+    # Satterthwaite: the degrees of freedom say how much the variance itself varies.
+    np.testing.assert_allclose(2 * np.mean(found, 0) ** 2 / np.var(found, 0), one.freedom, rtol=0.25)
+
+
+@pytest.mark.quick
+def test_a_parameter_that_one_drive_tells_is_not_judged_between_drives():
+    random = np.random.default_rng(3)
+    design = designs(random)
+    design[1:, :, 2] = 0.0
+    objective = Linear(design, correlated(random, 0.0))
+    u = gradient.fit(objective, objective.space, iterations=4).u
+    known = uncertainty.estimate(objective, u)
+    independent = np.sqrt(np.linalg.inv(np.einsum("bkp,bkq->pq", design, design))[2, 2])
+    assert known.deviation[2] > 0.9 * independent
+
+
+@pytest.mark.quick
+def test_an_error_of_the_odometrys_start_is_absorbed_as_far_as_its_noise_allows(unicycle_log):
+    """The odometry counts from the mean of a noisy standstill: turned by that error, all of it is off."""
+    objective = unicycle_objective(unicycle_log.training)
+    u = gradient.fit(objective, objective.space, iterations=8).u
+    assert all(0 < trial.start.odometry_yaw_sigma < 1e-3 for trial in objective.trials)
+    off = 5e-4  # rad
+    odometry = objective.measured.odometry.copy()
+    x, y = odometry[..., 0].copy(), odometry[..., 1].copy()
+    odometry[..., 0], odometry[..., 1] = x - off * y, y + off * x
+    odometry[..., 2] += off * (odometry[..., 2] != 0)
+    turned = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, odometry=odometry))
+    exact = tuple(dataclasses.replace(trial, start=dataclasses.replace(
+        trial.start, odometry_position_sigma=0.0, odometry_yaw_sigma=0.0)) for trial in objective.trials)
+    rigid = dataclasses.replace(turned, trials=exact)
+    worse = [float(np.square(one.residuals(u[None])).sum()) - float(np.square(level.residuals(u[None])).sum())
+             for one, level in ((turned, objective), (rigid, dataclasses.replace(objective, trials=exact)))]
+    assert worse[0] < 0.5 * worse[1]
+
+
+@pytest.mark.quick
+def test_what_the_start_was_averaged_from_is_not_scored_again(unicycle_log):
+    objective = unicycle_objective(unicycle_log.training)
+    first = unicycle_log.training[0]
+    resting = int((first.ground_truth.t <= first.start.rest).sum())
+    columns = objective.channel_residuals(np.full(3, 0.5))
+    assert resting > 5 and first.start.rest > 0
+    for name in ("ground_truth.x", "odometry.yaw"):
+        assert np.isnan(columns[name][0, :resting]).all() and np.isfinite(columns[name][0, resting])
+    assert np.isfinite(columns["odometry.v"][0, 0])
+    assert objective.counted < objective.measured.pose_mask.sum() + objective.measured.odometry_mask.sum()
