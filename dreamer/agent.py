@@ -85,6 +85,7 @@ def act(
     is_first: jax.Array,
     key: jax.Array | None,
     mode: bool = False,
+    noise: jax.Array | None = None,
 ) -> tuple[Carry, jax.Array]:
     """Infer the state of N instances from their frames and choose actions.
 
@@ -96,6 +97,7 @@ def act(
         is_first: (N,) bool, resets the carry.
         key: consumed; may be None in mode.
         mode: take the most probable latent and action, as on the vehicle.
+        noise: (N, ...) random numbers that choose the actions (`spaces`); drawn here unless given.
 
     Returns:
         The carry, whose latent is the state after this frame, and actions (N, A), not clipped; one-hot classes.
@@ -113,7 +115,8 @@ def act(
     if mode:
         action = actions.mode(config, raw)
     else:
-        action = actions.sample(config, raw, actions.noise(action_key, raw.shape[:1]))
+        noise = actions.noise(action_key, raw.shape[:1]) if noise is None else noise
+        action = actions.sample(config, raw, noise)
     return {"deter": latent.deter, "stoch": latent.stoch, "action": action}, action
 
 

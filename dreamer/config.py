@@ -56,6 +56,9 @@ class DreamerConfig:
     """Smallest standard deviation of the policy."""
     max_std: float = 1.0
     """Largest standard deviation of the policy."""
+    noise_steps: float = 0.0
+    """Longest time constant [steps] of the noise with which training acts, at least 1 (`dreamer.exploration`); 0: the
+    noise of every step is independent. Continuous actions only."""
     policy_outscale: float = 0.01
     """Scale of the actor's output weights at the start."""
 
@@ -166,6 +169,7 @@ class DreamerConfig:
             (self.representation in ("reconstruct", "barlow"), "representation", "must be 'reconstruct' or 'barlow'"),
             (self.representation != "barlow" or not self.decode_only, "decode_only", "must be () without a decoder"),
             (self.replay_memory in ("auto", "device", "host"), "replay_memory", "must be 'auto', 'device' or 'host'"),
+            (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
             (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),

@@ -13,7 +13,7 @@ from flax import struct
 from jax.sharding import Mesh
 
 from dreamer import agent as agents
-from dreamer import parallel, replay, sensors, spaces
+from dreamer import exploration, parallel, replay, sensors, spaces
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch, Replay
@@ -55,6 +55,8 @@ class TrainState:
     """(N,) int32 steps of the running episodes."""
     pretrained: Pretrained | None = None
     """None where the configuration asks for no pretraining."""
+    noise: jax.Array | None = None
+    """(N, A) of the actions; None where it has no memory."""
 
 
 def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array) -> TrainState:
@@ -91,6 +93,7 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
         episode_return=jnp.zeros((env.num_envs,), jnp.float32),
         episode_length=jnp.zeros((env.num_envs,), jnp.int32),
         pretrained=Pretrained(jnp.copy(zero), jnp.copy(zero)) if config.pretrain_steps else None,
+        noise=exploration.init(config, env.num_envs, env.action_dim, jax.random.fold_in(key, 1)),
     )
 
 
@@ -130,9 +133,14 @@ def collect(
     """One step of every instance, written to the replay. Actions are random until learning has started, or always."""
     policy_key, random_key = jax.random.split(key)
     frame = with_mirrored(env, state.transition) if config.mirror else state.transition
-    carry, action = agents.act(config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key)
-    actions = spaces.actions(env.action_dim)
-    random_action = actions.random(random_key, action.shape[:1])
+    actions, noise, drawn = spaces.actions(env.action_dim), None, None
+    if state.noise is not None:
+        noise = exploration.advance(config, state.noise, random_key)
+        drawn = jnp.concatenate([noise] * (1 + config.mirror))  # the mirrored ones do not choose
+    carry, action = agents.act(
+        config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key, noise=drawn
+    )
+    random_action = actions.random(random_key, action.shape[:1]) if drawn is None else exploration.uniform(drawn)
     action = jnp.where(started(config, state) & (not always_random), action, random_action)
     real = action[: env.num_envs]
     if config.mirror:
@@ -154,6 +162,7 @@ def collect(
         transition=transition,
         carry={**carry, "action": action},
         replay=memory,
+        noise=noise,
         env_steps=state.env_steps + env.num_envs,
         episode_return=episode_return,
         episode_length=episode_length,

@@ -141,7 +141,7 @@ def state_shardings(mesh: Mesh, state: Any, instances: int) -> Any:
         field = getattr(path[0], "name", "")
         if field == "replay":
             return columns if len(leaf.shape) >= 2 else whole
-        mine = field in ("env_state", "transition", "carry", "episode_return", "episode_length")
+        mine = field in ("env_state", "transition", "carry", "episode_return", "episode_length", "noise")
         return rows if mine and leaf.shape[:1] == (instances,) else whole
 
     return jax.tree_util.tree_map_with_path(of, state)
