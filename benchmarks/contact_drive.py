@@ -52,7 +52,7 @@ def main() -> None:
     """Fit every chair, print and record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002], help="days of the plant")
-    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--iterations", type=int, default=60, help="of the fit: until nothing moves")
     options = parser.parse_args()
     found = {seed: largest_errors(seed, options.iterations) for seed in options.seeds}
     record("physics", CLAIM, figures_of(found))
