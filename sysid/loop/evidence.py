@@ -46,6 +46,8 @@ class Evidence:
     moments: np.ndarray  # (B, P + S)
     pool_moments: tuple[np.ndarray, ...]  # per trial (J, P + S) of white noise of J drives like it
     groups: tuple[tuple[int, ...], ...]  # trials of one manoeuvre
+    shared: float = 0.0
+    """Share of a drive's noise that the others of its manoeuvre have as well (`Reference.shared`)."""
 
 
 def base_columns(drives: Drives, reference: Reference, values: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -148,7 +150,8 @@ def gather(
     evidence = Evidence(
         residual, design, offset, placed, np.linalg.inv(reference.spread),
         np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
-        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives))
+        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives),
+        reference.shared)
     return evidence, slopes
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.log import Log, Trial
 from sysid.loop.base import fit_base
 from sysid.loop.drives import Drives, make_drives
-from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness, scatter
 from sysid.result import Progress
 from sysid.rollout import Plant
 from sysid.space import Space, make_space
@@ -56,6 +56,24 @@ class Reference:
     known: bool
     """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
     remark: str
+
+    @property
+    def shared(self) -> float:
+        """Share of the white noise of a drive that its replicates on the same day have as well: what the model lacks
+        that day, and the error of what the other days expect. 0 where no day has replicates."""
+        if not self.known:
+            return 0.0
+        apart = []
+        for number in {one.day for one in self.leftovers}:
+            mine = [one for one in self.leftovers if one.day == number]
+            series = np.stack([one.series - self.expected_on_others(one) for one in mine])
+            white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
+            courses = np.zeros(len(mine), int)
+            for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
+                courses[group] = course
+            apart.append(scatter(white, courses))
+        told = [one for one in apart if np.isfinite(one)]
+        return float(np.clip(-np.mean(told), 0.0, 1.0)) if told else 0.0
 
     def expected(self, trial: Trial, bins: int) -> np.ndarray:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""

@@ -150,12 +150,28 @@ def null_moments(
     for n in range(draws):
         moments[n] = products @ drawn_away(factor, rng)
         for group in evidence.groups:
-            sign = rng.choice((-1.0, 1.0))
-            order = rng.permutation(len(evidence.pool_moments[group[0]]))
-            for place, trial in enumerate(group):
-                pick = int(order[place % len(order)]) % len(evidence.pool_moments[trial])
-                moments[n] += sign * evidence.pool_moments[trial][pick]
+            moments[n] += drawn_noise([evidence.pool_moments[trial] for trial in group], evidence.shared, rng)
     return moments
+
+
+def drawn_noise(pools: Sequence[np.ndarray], shared: float, rng: np.random.Generator) -> np.ndarray:
+    """(P + S,) moments of noise in drives of one manoeuvre: each has a share of its own and one that all have.
+
+    Drives of one day have more in common than those of different days, from which they are drawn: what the model lacks
+    that day, and the error of what the reference days expect.
+
+    Args:
+        pools: (J, P + S) moments that the noise of J reference drives would have in each of the drives.
+        shared: part of the variance that all have.
+    """
+    sign = rng.choice((-1.0, 1.0))
+    order = rng.permutation(len(pools[0]))
+    own = sign * np.sum([pool[int(order[place % len(order)]) % len(pool)] for place, pool in enumerate(pools)], axis=0)
+    if shared == 0.0 or len(pools) == 1:
+        return own
+    pick, sign = int(rng.integers(len(pools[0]))), rng.choice((-1.0, 1.0))
+    common = sign * np.sum([pool[pick % len(pool)] for pool in pools], axis=0)
+    return np.sqrt(1.0 - shared) * own + np.sqrt(shared) * common
 
 
 def drawn_away(factor: np.ndarray, rng: np.random.Generator) -> np.ndarray:
