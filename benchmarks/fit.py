@@ -2,9 +2,14 @@
 
     python -m benchmarks.fit --shared ../shared --parts planted plant chair contact speed drive mrclam
 
-    python -m benchmarks.fit --parts coverage starts tpe searches --part 3/16 --work runs/fit  # one of 16 processes
-    python -m benchmarks.fit --parts coverage starts tpe searches --collect --work runs/fit    # figures of what is done
+    python -m benchmarks.fit --parts coverage --part 3/32 --work runs/fit       # one of 32 processes; the same with
+    python -m benchmarks.fit --parts starts tpe searches --part 3/40 --work runs/fit          # these parts; restart
+    python -m benchmarks.fit --parts many_starts --work runs/fit                # any that was stopped. On a GPU
+    python -m benchmarks.fit --parts coverage starts tpe searches many_starts --collect --work runs/fit  # the figures
 
+On one core a synthetic log takes 25 s, one of the plant 55 s, a start 4 min, a search by features 5 min and by TPE or
+CMA-ES 1 min, the 500 trials of TPE half a minute and four such searches one by one 75 s; the first process compiles
+for all, 70 s and 3 GB for each kind of log.
 Writes benchmarks/results/fit.json and, for drive and mrclam, measured.json. A "gain" is the share of
 the held-out mean position RMSE (or yaw RMSE) of the ideal kinematic replay that the fitted vehicle removes; every
 window restarts from the measured pose and wheel speeds and counts only where the measurement changed.
@@ -23,7 +28,15 @@ import jax
 import numpy as np
 
 from benchmarks import fit_coverage, fit_searches
-from benchmarks.fit_jobs import labels_of, read_results, run_jobs, share_compilations, write_result
+from benchmarks.fit_jobs import (
+    compile_once,
+    labels_of,
+    on_device,
+    read_results,
+    run_jobs,
+    share_compilations,
+    write_result,
+)
 from benchmarks.harness import device_name, figure, record
 from sysid.fit import Fit, FitConfig, fit_log, make_objective, make_problem, predict
 from sysid.log import Log, Trial, load_log
@@ -47,7 +60,7 @@ class Benchmark:
                          "searches", "drive", "mrclam"], ...] = (
         "planted", "plant", "chair", "contact", "drive", "mrclam")
     part: str = "1/1"
-    """I/N: of starts, coverage, tpe and searches, every N-th job, where several processes share them."""
+    """I/N: of coverage, starts, tpe and searches, every N-th job, where several processes share them."""
     work: Path = Path("runs/fit")
     """Folder for the results of those jobs; what is there is not done again."""
     collect: bool = False
@@ -66,6 +79,10 @@ class Benchmark:
     """Parameter sets of a search with TPE."""
     methods: tuple[str, ...] = ("features", "both", "tpe", "cmaes")
     """Searches that are compared."""
+    search_starts: int = 2
+    """Starts of the gradient searches among them."""
+    many: int = fit_searches.STARTS
+    """Starts at once of many_starts."""
     terrains: tuple[Literal["asphalt", "sand", "pooled"], ...] = ("asphalt", "sand", "pooled")
     """Fits of the DRIVE runs."""
     windows: int = 100
@@ -277,10 +294,26 @@ def compile_seconds(fit: Fit, log: Log) -> float:
 
 def many_starts(settings: Benchmark) -> None:
     """Seconds of 32 starts at once, compilation apart: gpu_seconds on a GPU."""
+    stem = f"many_starts_{Path(settings.search_log).name}"
+    if settings.collect:
+        for platform in ("cpu", "gpu"):
+            results = read_results(settings.work / f"{stem}_{platform}")
+            if results:
+                figures = on_device(fit_searches.summarise_many(results, platform), results)
+                record("fit", CLAIM, figures)
+                show(figures)
+        return
     log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
-    figures = fit_searches.many_starts(log, fit_searches.STARTS, settings.iterations, settings.repeats)
-    record("fit", CLAIM, figures)
-    show(figures)
+    problem = make_problem(log, FitConfig())
+
+    def search() -> dict[str, Any]:
+        return fit_searches.many_starts(problem, log.spec.track, settings.many, settings.iterations)
+
+    first = search()["seconds"]
+    print(f"first of {settings.repeats + 1} searches: {first:.1f} s", flush=True)
+    platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    run_jobs(settings.work / f"{stem}_{platform}", [f"repeat_{n}" for n in range(settings.repeats)],
+             lambda label: {**search(), "first": first})
 
 
 def coverage(settings: Benchmark) -> None:
@@ -290,12 +323,13 @@ def coverage(settings: Benchmark) -> None:
               for n in range(count)]
     if not settings.collect:
         share_compilations(settings.work / "compiled")
-        run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(label, settings.iterations))
+        run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(
+            label, settings.iterations, settings.work / "compiled"))
         return
     for kind, prefix in (("synthetic", ""), ("plant", "plant_")):
         results = read_results(folder, f"{kind}_*")
         if results:
-            figures = fit_coverage.summarise(results, prefix)
+            figures = on_device(fit_coverage.summarise(results, prefix), results)
             record("fit", CLAIM, figures)
             show(figures)
 
@@ -307,16 +341,17 @@ def starts(settings: Benchmark) -> None:
     if settings.collect:
         results = read_results(folder)
         if results:
-            figures = fit_searches.summarise_starts(results, "" if name == "plant" else f"{name}_")
+            figures = on_device(fit_searches.summarise_starts(results, "" if name == "plant" else f"{name}_"), results)
             record("fit", CLAIM, figures)
             show(figures)
         return
     share_compilations(settings.work / "compiled")
     log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
     problem = make_problem(log, FitConfig())
+    compile_once(settings.work / "compiled", log.name, lambda: fit_searches.compile_replay(problem.objective))
     labels = [f"start_{n:02d}" for n in range(fit_searches.STARTS)]
     run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_searches.start_job(
-        problem, log.spec.track, int(label[-2:]), settings.iterations))
+        problem, log.spec.track, int(label[-2:]), settings.iterations, folder / "stages"))
 
 
 def tpe500(settings: Benchmark) -> None:
@@ -329,14 +364,14 @@ def tpe500(settings: Benchmark) -> None:
             batched = read_results(folder, f"{platform}_*")
             if not batched:
                 continue
-            figures = fit_searches.summarise_tpe(batched, sequential, platform)
-            for one in figures.values():
-                one["device"] = batched[0]["device"]
+            figures = on_device(fit_searches.summarise_tpe(batched, sequential, platform), batched)
             record("fit", CLAIM, figures)
             show(figures)
         return
+    share_compilations(settings.work / "compiled")
     log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
     problem = make_problem(log, FitConfig())
+    compile_once(settings.work / "compiled", log.name, lambda: fit_searches.compile_replay(problem.objective))
     seeds = range(settings.search_seeds)
     groups = [list(seeds)[i : i + fit_searches.LOCKSTEP] for i in range(0, len(seeds), fit_searches.LOCKSTEP)]
     labels = [f"{platform}_{seed:02d}" for seed in seeds]
@@ -345,11 +380,12 @@ def tpe500(settings: Benchmark) -> None:
 
     def job(label: str) -> dict[str, Any]:
         if label.startswith(platform):
-            found = fit_searches.tpe_batched(problem, settings.tpe_trials, int(label[-2:]))
-            return {**found, "device": device_name()}
+            return fit_searches.tpe_batched(problem, settings.tpe_trials, int(label[-2:]),
+                                            folder / "costs" / f"{label}.jsonl")
         group = groups[int(label.removeprefix("group_"))]
-        for seed, one in zip(group, fit_searches.tpe_sequential(problem, settings.tpe_trials, group), strict=True):
-            write_result(folder / f"sequential_{seed:02d}.json", one)
+        found = fit_searches.tpe_sequential(problem, settings.tpe_trials, group, folder / "costs" / f"{label}.jsonl")
+        for seed, one in zip(group, found, strict=True):
+            write_result(folder / f"sequential_{seed:02d}.json", {**one, "device": device_name()})
         return {"seeds": group}
 
     run_jobs(folder, labels_of(settings.part, labels), job)
@@ -362,7 +398,7 @@ def searches(settings: Benchmark) -> None:
     if settings.collect:
         results = read_results(folder / "jobs")
         if results:
-            figures = fit_searches.write_curves(folder, log, results)
+            figures = on_device(fit_searches.write_curves(folder, log, results), results)
             record("fit", CLAIM, figures)
             show(figures)
             print(f"wrote {folder / 'searches.png'}")
@@ -370,12 +406,13 @@ def searches(settings: Benchmark) -> None:
     share_compilations(settings.work / "compiled")
     problem = make_problem(log, FitConfig())
     judge = Judge(problem, log)
+    compile_once(settings.work / "compiled", log.name, lambda: fit_searches.compile_replay(problem.objective))
     labels = [f"{method}_{seed:02d}" for seed in range(settings.search_seeds) for method in settings.methods]
 
     def job(label: str) -> dict[str, Any]:
         method, _, seed = label.partition("_")
         return fit_searches.curve_job(problem, judge, log.spec.track, method, int(seed), settings.tpe_trials,
-                                      settings.iterations)
+                                      settings.iterations, settings.search_starts)
 
     run_jobs(folder / "jobs", labels_of(settings.part, labels), job)
 

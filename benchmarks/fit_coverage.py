@@ -17,8 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from benchmarks.fit_jobs import compile_once, reporter
+from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
-from sysid.fit import FitConfig, fit_log
+from sysid.fit import FitConfig, fit_log, make_problem
 from sysid.log import Log, load_log
 from sysid.space import Space, make_space
 from sysid.synthetic import write_dataset
@@ -99,12 +101,18 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
             "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 
 
-def job(label: str, iterations: int) -> dict[str, Any]:
-    """Fit one log, `synthetic_NNN` or `plant_NNN`, and note each known value with its estimate."""
+def job(label: str, iterations: int, compiled: Path) -> dict[str, Any]:
+    """Fit one log, `synthetic_NNN` or `plant_NNN`, and note each known value with its estimate.
+
+    Args:
+        compiled: folder of what the processes share.
+    """
     kind, _, number = label.partition("_")
     with tempfile.TemporaryDirectory() as folder:
         log, truth = (plant_log if kind == "plant" else synthetic_log)(Path(folder), 50000 + int(number))
-    fit = fit_log(log, FitConfig(iterations=iterations))
+    problem = make_problem(log, FitConfig())
+    compile_once(compiled, f"coverage_{kind}", lambda: compile_replay(problem.objective))
+    fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))
     rows = {one.name: {"truth": truth[one.name], "value": one.value, "low": one.low, "high": one.high,
                        "identifiable": one.identifiable} for one in fit.uncertainty.estimates if one.name in truth}
     return {"parameters": rows, "cost": fit.cost, "seconds": fit.seconds}

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
+from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import starts, tpe
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, gradient_search, make_problem
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, gradient_search
 from sysid.log import Log, load_log
-from sysid.objective import HUGE
+from sysid.objective import HUGE, Objective
 from sysid.searches import Judge, Trace, arrivals, trace, write
 from sysid.studies import BATCH
 
@@ -49,18 +49,48 @@ def find_log(name: str, shared: Path, trials: int = 18) -> Log:
         return load_log(write_dataset(Path(folder) / "planted", WHILL_CR, preset_params(WHILL_CR, "physical")))
 
 
-def start_job(problem: Problem, track: float, index: int, iterations: int, seed: int = 0) -> dict[str, Any]:
+def compile_replay(objective: Objective) -> None:
+    """Compile what the searches replay: sets at once, and one derivative."""
+    point = objective.space.to_unit(objective.space.initial)[None]
+    objective.residuals(np.tile(point, (LOCKSTEP, 1)))
+    objective.jacobian(point)
+
+
+def start_job(
+    problem: Problem, track: float, index: int, iterations: int, folder: Path, seed: int = 0
+) -> dict[str, Any]:
     """The default search from one of STARTS starts: features, then poses with the delays profiled.
 
     Start 0 has the initial values; the others are drawn over the whole range of every parameter (`sysid.starts.draw`).
+
+    Args:
+        folder: for what each of its three stages gave.
     """
-    began = time.perf_counter()
-    point = starts.draw(problem.objective, [index], seed)
-    coarse = starts.fit(problem.objective, point, track, FEATURE_ITERATIONS)
-    search, _, _ = gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
-    return {"cost": search.cost, "coarse_cost": coarse.cost, "u": search.u.tolist(), "start": point[0].tolist(),
-            "names": list(problem.space.names), "evaluations": coarse.evaluations + search.evaluations,
-            "seconds": time.perf_counter() - began}
+    label = f"start_{index:02d}"
+    report = reporter(label)
+
+    def timed(stage: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        began = time.perf_counter()
+        return {**stage(), "seconds": time.perf_counter() - began}
+
+    def draw() -> dict[str, Any]:
+        return {"u": starts.draw(problem.objective, [index], seed, progress=report)[0].tolist()}
+
+    def features() -> dict[str, Any]:
+        found = starts.fit(problem.objective, np.array([drawn["u"]]), track, FEATURE_ITERATIONS, report)
+        return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
+
+    def poses() -> dict[str, Any]:
+        found, _, _ = gradient_search(problem.objective, problem.space, np.array([coarse["u"]]), iterations,
+                                      FitConfig(), report)
+        return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
+
+    drawn = staged(folder / f"{label}_drawn.json", lambda: timed(draw))
+    coarse = staged(folder / f"{label}_features.json", lambda: timed(features))
+    fine = timed(poses)
+    return {"cost": fine["cost"], "coarse_cost": coarse["cost"], "u": fine["u"], "start": drawn["u"],
+            "names": list(problem.space.names), "evaluations": coarse["evaluations"] + fine["evaluations"],
+            "seconds": sum(one["seconds"] for one in (drawn, coarse, fine))}
 
 
 def summarise_starts(results: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, dict[str, Any]]:
@@ -74,21 +104,30 @@ def summarise_starts(results: Sequence[Mapping[str, Any]], prefix: str) -> dict[
             f"{prefix}seconds_of_a_start": figure([float(one["seconds"]) for one in results], "s")}
 
 
-def tpe_batched(problem: Problem, evaluations: int, seed: int) -> dict[str, Any]:
-    """J and seconds of TPE in batches; the replay is compiled before the clock starts."""
+def tpe_batched(problem: Problem, evaluations: int, seed: int, kept: Path) -> dict[str, Any]:
+    """J and seconds of TPE in batches; the replay is compiled before the clock starts.
+
+    Args:
+        kept: file for the costs so far.
+    """
     objective, space = problem.objective, problem.space
     objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH, 1)))
-    began = time.perf_counter()
-    found = tpe.fit(objective, space, evaluations=evaluations, seed=seed, cost="paper")
-    return {"cost": found.cost, "seconds": time.perf_counter() - began}
+    costs: Any = RememberedCosts(objective, kept)
+    found = tpe.fit(costs, space, evaluations=evaluations, seed=seed, cost="paper", progress=reporter(kept.stem))
+    return {"cost": found.cost, "seconds": costs.seconds}
 
 
-def tpe_sequential(problem: Problem, evaluations: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """J of Optuna's TPE asked one candidate at a time, as the paper's search was; all seeds advance together."""
+def tpe_sequential(problem: Problem, evaluations: int, seeds: Sequence[int], kept: Path) -> list[dict[str, Any]]:
+    """J of Optuna's TPE asked one candidate at a time, as the paper's search was; all seeds advance together.
+
+    Args:
+        kept: file for the costs so far.
+    """
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    objective, space = problem.objective, problem.space
+    space, report = problem.space, reporter(kept.stem)
+    costs = RememberedCosts(problem.objective, kept)
     distributions: Any = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in space.names}
     studies = [optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed)) for seed in seeds]
     initial = dict(zip(space.names, space.to_unit(space.initial).tolist(), strict=True))
@@ -97,8 +136,9 @@ def tpe_sequential(problem: Problem, evaluations: int, seeds: Sequence[int]) -> 
     for _ in range(evaluations):
         asked = [study.ask(distributions) for study in studies]
         u = np.array([[trial.params[name] for name in space.names] for trial in asked])
-        for study, trial, cost in zip(studies, asked, objective.paper_cost(u), strict=True):
+        for study, trial, cost in zip(studies, asked, costs.paper_cost(u), strict=True):
             study.tell(trial, float(min(cost, HUGE)))
+        report(1, f"best J {min(study.best_value for study in studies):.4g}")
     return [{"cost": float(study.best_value)} for study in studies]
 
 
@@ -119,29 +159,30 @@ def summarise_tpe(
     return figures
 
 
-def many_starts(log: Log, count: int, iterations: int, repeats: int) -> dict[str, dict[str, Any]]:
-    """Seconds of the default search from `count` starts at once, the compilation apart."""
-    problem = make_problem(log, FitConfig())
+def many_starts(problem: Problem, track: float, count: int, iterations: int) -> dict[str, Any]:
+    """Cost and seconds of the default search from `count` starts at once."""
+    report, began = reporter(f"{count} starts"), time.perf_counter()
+    points = starts.draw(problem.objective, range(count), 0, progress=report)
+    coarse = starts.fit(problem.objective, points, track, FEATURE_ITERATIONS, report)
+    found, _, _ = gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), report)
+    return {"cost": found.cost, "seconds": time.perf_counter() - began}
 
-    def search() -> float:
-        began = time.perf_counter()
-        points = starts.draw(problem.objective, range(count), 0)
-        coarse = starts.fit(problem.objective, points, log.spec.track, FEATURE_ITERATIONS)
-        gradient_search(problem.objective, problem.space, coarse.u[None], iterations, FitConfig(), None)
-        return time.perf_counter() - began
 
-    first = search()
-    seconds = [search() for _ in range(repeats)]
-    platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
+def summarise_many(results: Sequence[Mapping[str, Any]], platform: str) -> dict[str, dict[str, Any]]:
+    """Seconds of the timed searches, and by how much more the first one of the process took: its compilation."""
     stem = "gpu_seconds" if platform == "gpu" else "cpu_seconds_32_starts"
-    return {stem: figure(seconds, "s"), f"{stem}_compile": figure([first - float(np.median(seconds))], "s")}
+    seconds = [float(one["seconds"]) for one in results]
+    compiling = [float(one["first"]) - float(np.median(seconds)) for one in results]
+    return {stem: figure(seconds, "s"), f"{stem}_compile": figure(compiling, "s")}
 
 
 def curve_job(
-    problem: Problem, judge: Judge, track: float, method: str, seed: int, evaluations: int, iterations: int
+    problem: Problem, judge: Judge, track: float, method: str, seed: int, evaluations: int, iterations: int,
+    start_count: int,
 ) -> dict[str, Any]:
     """One search of `sysid.searches` and its best point so far."""
-    one = trace(problem, judge, track, method, seed, evaluations=evaluations, iterations=iterations)
+    one = trace(problem, judge, track, method, seed, evaluations=evaluations, iterations=iterations,
+                start_count=start_count, progress=reporter(f"{method}_{seed:02d}"))
     return {"trace": {name: value.tolist() if isinstance(value, np.ndarray) else value
                       for name, value in asdict(one).items()}, "names": list(problem.space.names)}
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from benchmarks import fit_coverage, fit_searches
-from benchmarks.fit_jobs import labels_of, read_results, run_jobs
+from benchmarks.fit_jobs import (
+    RememberedCosts,
+    compile_once,
+    labels_of,
+    on_device,
+    read_results,
+    run_jobs,
+    staged,
+)
 from benchmarks.plant.chair import Chair
 from sysid.space import make_space
 from whill_mjx.presets import preset_params
@@ -98,3 +106,49 @@ def test_batches_are_judged_by_the_median_of_searches_one_by_one():
     assert found["tpe500_j_over_sequential"]["value"] == pytest.approx(1.04)
     assert found["tpe500_within_5_percent"]["value"] == 1.0
     assert "tpe500_j_over_sequential" not in fit_searches.summarise_tpe(batched, [], "cpu")
+
+
+@pytest.mark.quick
+def test_a_search_that_was_stopped_asks_for_nothing_again(tmp_path):
+    """Its costs are kept with the time that they took; a torn last line is what the stop cut off."""
+    calls = []
+
+    class Objective:
+        def paper_cost(self, u):
+            calls.append(u)
+            return u.sum(-1)
+
+    points = np.random.default_rng(0).uniform(size=(4, 2, 3))
+    first = RememberedCosts(Objective(), tmp_path / "kept.jsonl")
+    for u in points[:3]:
+        first.paper_cost(u)
+    with open(tmp_path / "kept.jsonl", "a") as file:
+        file.write('{"u": [[0.1')
+    again = RememberedCosts(Objective(), tmp_path / "kept.jsonl")
+    np.testing.assert_allclose([again.paper_cost(u) for u in points], points.sum(-1))
+    assert len(calls) == 4
+    assert again.seconds > json.loads((tmp_path / "kept.jsonl").read_text().splitlines()[2])["seconds"] > 0
+    with pytest.raises(ValueError, match="other points"):
+        RememberedCosts(Objective(), tmp_path / "kept.jsonl").paper_cost(points[1])
+
+
+@pytest.mark.quick
+def test_a_stage_of_a_job_is_not_done_again(tmp_path):
+    assert staged(tmp_path / "a.json", lambda: {"u": [1.0]}) == {"u": [1.0]}
+    assert staged(tmp_path / "a.json", lambda: pytest.fail("done again")) == {"u": [1.0]}
+
+
+@pytest.mark.quick
+def test_one_process_compiles_for_all(tmp_path):
+    calls = []
+    for _ in range(2):
+        compile_once(tmp_path, "replay", lambda: calls.append(1))
+    compile_once(tmp_path, "other", lambda: calls.append(2))
+    assert calls == [1, 2]
+
+
+@pytest.mark.quick
+def test_figures_are_said_to_be_of_the_device_that_did_the_jobs():
+    figures = {"a": {"value": 1.0, "device": "here"}}
+    assert on_device(figures, [{"device": "there"}])["a"]["device"] == "there"
+    assert on_device(figures, [{}])["a"]["device"] == "here"
