@@ -298,7 +298,7 @@ def brief(result: Result) -> dict[str, Any]:
     found, alpha = result.search, result.config.thresholds.alpha
     wander = result.prepared.wander
     return {"verdict": found.verdict, "share": found.share, "excess": list(found.excess), "p_value": found.p_value,
-            "worth": float(found.scan.worth.max()),
+            "scan_p": found.scan.p_family, "worth": float(found.scan.worth.max()),
             "worth_limit": float(np.quantile(found.scan.null.max(1), 1 - alpha)),
             "excess_limit": wander.excess_limit(alpha),
             "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
