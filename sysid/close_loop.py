@@ -33,6 +33,8 @@ from sysid.loop.alone import judged, stands_alone
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.drives import CHUNK, Drives, make_drives
 from sysid.loop.evidence import PARTS, Evidence, column_layout, gather
+from sysid.loop.falsifiers import FALSIFIERS
+from sysid.loop.guards import Stood, guarded, stand
 from sysid.loop.late_pose import PARAMETER, told_late
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
@@ -121,6 +123,8 @@ class Result:
     evidence: Evidence
     seconds: dict[str, float]
     null_refits: NullRefits | None = None
+    stood: tuple[Stood, ...] = ()
+    """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
 
     @property
     def reference(self) -> Reference:
@@ -211,9 +215,13 @@ def close_loop(
     alone = stands_alone(log.training, reference.known)
     if alone:
         outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds)
+    stood: tuple[Stood, ...] = ()
+    if outcome.verdict == "named":
+        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, ready.wander.p_excess))
+        outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
@@ -325,7 +333,7 @@ def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     base = 0 if fitted else iterations + max(iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 2 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
+    return base + 6 * days + 2 * PARTS + 4 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -395,7 +403,9 @@ def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Referen
         "settings": {key: value for key, value in asdict(config).items() if key != "thresholds"},
         "thresholds": asdict(config.thresholds),
         "catalogue": [{"effect": one.effect, "variant": one.variant, "kind": one.kind,
-                       "axes": [asdict(axis) for axis in one.axes]} for one in found],
+                       "axes": [asdict(axis) for axis in one.axes], "constants": dict(one.constants)}
+                      for one in found],
+        "falsifiers": {name: [asdict(one) for one in each] for name, each in FALSIFIERS.items()},
         "bounds": {name: [float(space.low[i]), float(space.high[i])] for i, name in enumerate(space.names)},
     }
 

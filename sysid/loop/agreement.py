@@ -3,10 +3,74 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from sysid.loop.refit import Refit
+
+ALPHA = 0.05
+"""Of the test whether manoeuvres differ on a size."""
+POWER = 0.8
+"""Least power of a manoeuvre to tell an effect from none, for it to be asked; and of that test, to be believed."""
+SCATTER = 0.5
+"""Standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see."""
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Heterogeneity:
+    """Cochran's test that an effect has one size in all manoeuvres that excite it."""
+
+    asked: np.ndarray  # (G,) bool, manoeuvres that by themselves would tell the effect from none
+    q: float
+    """Squared differences from the mean over their variances, about chi-squared with one less than asked where the size
+    is one."""
+    p: float
+    scatter: float
+    """Standard deviation of the sizes beyond the noise, as a share of the mean."""
+    least: float
+    """Lower 95 % end of it, or less: the mean is not known exactly either."""
+    power: float
+    """To see a scatter of `SCATTER`."""
+
+    @property
+    def outcome(self) -> str:
+        """agree, differ, or untold where a scatter would not have been seen."""
+        return "differ" if self.p < ALPHA else "agree" if self.power >= POWER else "untold"
+
+
+def heterogeneity(factor: np.ndarray, error: np.ndarray) -> Heterogeneity:
+    """Whether sizes (G,) with standard errors (G,), as shares of the fitted size, are one.
+
+    A manoeuvre that cannot see the effect has no say. For sizes that scatter by s beside noise of variances e^2,
+    q (k - 1) / (k - 1 + c s^2) is about chi-squared, with c = sum w - sum w^2 / sum w and w = 1 / e^2 (DerSimonian and
+    Laird 1986).
+    """
+    told = special.ndtri(1 - ALPHA / 2) + special.ndtri(POWER)
+    asked = error < 1 / told
+    freedom = int(asked.sum()) - 1
+    if freedom < 1:
+        return Heterogeneity(asked, 0.0, 1.0, 0.0, 0.0, 0.0)
+    weight, sizes = error[asked] ** -2.0, factor[asked]
+    mean = float((weight * sizes).sum() / weight.sum())
+    q = float((weight * (sizes - mean) ** 2).sum())
+    spread = float(weight.sum() - np.square(weight).sum() / weight.sum()) / freedom
+    limit, unit = float(special.chdtri(freedom, ALPHA)), max(abs(mean), 1e-9)
+    scatter = float(np.sqrt(max(q / freedom - 1, 0.0) / spread))
+    largest = unit + special.ndtri(1 - ALPHA) * np.sqrt(scatter**2 / (freedom + 1) + 1 / weight.sum())
+    least = float(np.sqrt(max(q / limit - 1, 0.0) / spread)) / largest
+    power = float(special.chdtrc(freedom, limit / (1 + spread * (SCATTER * unit) ** 2)))
+    return Heterogeneity(asked, q, float(special.chdtrc(freedom, q)), scatter / unit, least, power)
+
+
+def interval_of_sum(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of the sum of values (G,), with the values drawn anew."""
+    rng = np.random.default_rng(seed)
+    sums = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].sum(1)
+    low, high = np.quantile(sums, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def with_prior(fit: Refit, precision: np.ndarray) -> np.ndarray:

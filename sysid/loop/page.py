@@ -21,7 +21,10 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections = [Section("Verdict", verdict(report))]
     if report["next_manoeuvre"] is not None:
         sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
-    sections += [Section("Error before and after", errors(report)), Section("What was tried", candidates(report))]
+    sections += [Section("Error before and after", errors(report)),
+                 Section("Error of each manoeuvre", by_manoeuvre(report)),
+                 Section("What was tried", candidates(report) + pairs(report)),
+                 Section("What these drives can show", operating(report))]
     if report["lives_in"]:
         sections.append(Section("Where the unexplained residual lives", lives(report)))
     if report["unnamed"] is not None:
@@ -44,6 +47,8 @@ def verdict(report: dict[str, Any]) -> str:
                        f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
                        f"{missing['p_value']:.2g}.")]
     parts += [paragraph(f"Warning: {one}.") for one in report["warnings"]]
+    if report["contradicted"]:
+        parts += [paragraph("Contradicted, and so not named:"), bullets(report["contradicted"])]
     if nulls := missing["null_refits"]:
         parts.append(paragraph(f"Of {nulls['count']} simulated days with nothing missing, fitted in the same way, "
                                f"{nulls['false_alarms']} raise a false alarm (at most {nulls['upper']:.1%} of all, "
@@ -65,7 +70,27 @@ def verdict(report: dict[str, Any]) -> str:
                   one["evidence"]["left_out_gain"].get(each["manoeuvre"])] for each in evidence],
                 f"{one['name']}: what each manoeuvre says by itself (1 agrees with the joint fit), and by how much the "
                 "effect fitted to the others lowers the squared residual there"))
+            parts += [paragraph(agreement(one)), predictions(one)]
     return "".join(parts)
+
+
+def agreement(effect: dict[str, Any]) -> str:
+    """What manoeuvres say together, in words."""
+    evidence = effect["evidence"]
+    test, (low, high) = evidence["heterogeneity"], evidence["left_out_interval"]
+    said = {"agree": "agree on its size", "differ": f"differ on its size by {test['scatter']:.0%} of it",
+            "untold": "are too few, or see too little of it, to differ on its size"}[test["outcome"]]
+    return (f"{test['manoeuvres']} manoeuvres excite {effect['name']}. They {said} (p = {test['p_value']:.2g}, power "
+            f"{test['power']:.0%}). Left out, manoeuvres gain {evidence['left_out_total']:.0f} of squared residual "
+            f"together (95 % interval {low:.0f} to {high:.0f}).")
+
+
+def predictions(effect: dict[str, Any]) -> str:
+    """What would have contradicted an effect."""
+    rows = [[f"it {one['says']}", one["by"], ", ".join(f"{size:.2f}" for size in one["sizes"]), one["p_value"],
+             f"{one['power']:.0%}", one["outcome"]] for one in effect["evidence"]["falsifiers"]]
+    return table(["prediction", "tested by", "sizes, or share left", "p", "power", "outcome"], rows,
+                 f"{effect['name']}: what would contradict it") if rows else ""
 
 
 def next_drive(proposal: dict[str, Any]) -> str:
@@ -103,6 +128,41 @@ def errors(report: dict[str, Any]) -> str:
             parts.append(table(["RMSE", "before", "after", "replicates", "change from", "to", "worse in"], rows,
                                f"{part.replace('_', '-')} trials; the change with its 95 % interval over trials"))
     return "".join(parts)
+
+
+def by_manoeuvre(report: dict[str, Any]) -> str:
+    """Errors of each manoeuvre, and which of them surely grew."""
+    grown = [f"{row['part']} {row['manoeuvre']}, {row['channel']} {row['metric']}: ".replace("_", " ")
+             + f"{row['before']:.4g} to {row['after']:.4g} {row['unit']}" for row in report["worse"]]
+    parts = [paragraph("What got worse:"), bullets(grown)] if grown else [paragraph("Nothing surely got worse.")]
+    for part in ("held_out", "training"):
+        rows = [[f"{row['manoeuvre']}, {row['channel']} {row['metric']} [{row['unit']}]".replace("_", " "),
+                 row["before"], row["after"], *row["interval"], row["trials"]]
+                for row in report["by_manoeuvre"] if row["part"] == part]
+        if rows:
+            parts.append(table(["RMSE", "before", "after", "change from", "to", "trials"], rows,
+                               f"{part.replace('_', '-')} trials; 95 % intervals of trials and blocks drawn in pairs"))
+    return "".join(parts)
+
+
+def operating(report: dict[str, Any]) -> str:
+    """False alarms and power of these very drives."""
+    one = report["operating"]
+    alarms = one["false_alarms"]
+    parts = [paragraph(f"Of {alarms['count']} simulated days with nothing missing the scan takes {alarms['alarms']} "
+                       f"for more (at most {alarms['upper']:.1%} of all, with 95 % confidence); each of up to "
+                       f"{one['decisions']} decisions may err in {one['alpha']:.1%}.")]
+    rows = [[each["effect"], f"{size['factor']:g}", f"{size['noticed']:.0%}"]
+            for each in one["power"] for size in each["sizes"]]
+    if rows:
+        parts.append(table(["effect", "factor on its size", "days on which it is noticed"], rows))
+    return "".join(parts)
+
+
+def pairs(report: dict[str, Any]) -> str:
+    """The pairs of effects that explain most in the scan."""
+    rows = [[" and ".join(one["effects"]), one["gain"], one["p_value"]] for one in report["pairs"]]
+    return table(["two effects", "gain", "p"], rows, "pairs in the scan") if rows else ""
 
 
 def candidates(report: dict[str, Any]) -> str:
@@ -150,9 +210,9 @@ def wrench(one: dict[str, Any]) -> str:
 
 def detectable(report: dict[str, Any]) -> str:
     """Smallest sizes."""
-    return table(["effect", "parameter", "smallest size with 80 % power", "unit"],
+    return table(["effect", "parameter", "smallest size with 80 % power", "unit", "noticed on simulated days"],
                  [[one["effect"], one["parameter"], one["value"] if one["value"] is not None else "not visible",
-                   one["unit"]] for one in report["detectable"]])
+                   one["unit"], "" if one["power"] is None else f"{one['power']:.0%}"] for one in report["detectable"]])
 
 
 def base(report: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,16 @@ class Refit:
         return list(np.split(self.q, np.cumsum([len(one.axes) for one in self.hypotheses])[:-1]))
 
 
+def moved_last(fit: Refit, number: int) -> Refit:
+    """The same joint fit with one of its hypotheses last."""
+    ends, size = np.cumsum([0, *(len(one.axes) for one in fit.hypotheses)]), len(fit.u)
+    mine = list(range(ends[number], ends[number + 1]))
+    order = [*(i for i in range(len(fit.q)) if i not in mine), *mine]
+    kept = (*fit.hypotheses[:number], *fit.hypotheses[number + 1 :], fit.hypotheses[number])
+    columns = [*range(size), *(size + i for i in order)]
+    return replace(fit, hypotheses=kept, q=fit.q[order], jacobian=fit.jacobian[..., columns])
+
+
 @dataclass(frozen=True)
 class Start:
     """Where a fit begins."""
@@ -72,8 +82,8 @@ class Refitter:
         """`values` (all parameters) at the reference; `slopes` (B, K, C, P) there."""
         self.drives, self.reference, self.values = drives, reference, values
         self.names = list(drives.names)
-        self.target = self._white(reference.target_of(drives))
-        self.white_slopes = self._white(slopes)
+        self.target = self.white(reference.target_of(drives))
+        self.white_slopes = self.white(slopes)
         self.precision = np.linalg.inv(reference.spread)
         away = REACH * np.sqrt(np.diag(reference.spread))
         self.low, self.high = np.maximum(reference.u - away, 0.0), np.minimum(reference.u + away, 1.0)
@@ -87,7 +97,7 @@ class Refitter:
 
     def white_of(self, u: np.ndarray) -> np.ndarray:
         """(B, n) white features of the base model with parameters u (P,)."""
-        return self._white(self.drives.simulate(self._set((), u, np.zeros(0))[None]))[0]
+        return self.white(self.drives.simulate(self.values_at((), u, np.zeros(0))[None]))[0]
 
     def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = 12) -> Refit:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
@@ -99,7 +109,7 @@ class Refitter:
         asked = {number: next(run) for number, run in enumerate(runs)}
         done: dict[int, Refit] = {}
         while asked:
-            white = self._white(self.drives.simulate(np.concatenate(list(asked.values()))))
+            white = self.white(self.drives.simulate(np.concatenate(list(asked.values()))))
             place, following = 0, {}
             for number, sets in asked.items():
                 try:
@@ -121,12 +131,12 @@ class Refitter:
         slopes = self.white_slopes if start.slopes is None else start.slopes
         fresh = start.slopes is not None or bool(np.allclose(u, self.reference.u))
         damping, calm, stale = 1e-3, 0, False
-        white = yield self._set(found, u, q)[None]
+        white = yield self.values_at(found, u, q)[None]
         residual, cost = self._left(white[0], u)
         for iteration in range(iterations + 1):
             sets, steps = self._differences(found, u, q)
             points, spans = quotients(u, difference_sizes(self.reference.spread)) if stale else ([], [])
-            sets += [self._set(found, point, q) for point in points]
+            sets += [self.values_at(found, point, q) for point in points]
             columns = np.zeros((*residual.shape, 0))
             if sets:
                 white = yield np.stack(sets)
@@ -145,7 +155,7 @@ class Refitter:
                 tried.append((np.clip(u + share * step[: len(u)], self.low, self.high),
                               self._within(found, q + share * step[len(u) :])))
                 promised.append(promise * share * (2 - share))
-            white = yield np.stack([self._set(found, *each) for each in tried])
+            white = yield np.stack([self.values_at(found, *each) for each in tried])
             left = [self._left(one, tried[i][0]) for i, one in enumerate(white)]
             best = int(np.nanargmin([each[1] for each in left]))
             gained = cost - left[best][1]
@@ -163,7 +173,7 @@ class Refitter:
                 fresh = False
             elif iteration < iterations - 1:
                 stale = True
-        return Refit(found, u, q, cost, residual, jacobian, self._set(found, u, q))
+        return Refit(found, u, q, cost, residual, jacobian, self.values_at(found, u, q))
 
     def _left(self, white: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
         """White residual (B, n) and cost."""
@@ -173,7 +183,7 @@ class Refitter:
     def _floor(self) -> float:
         return 0.5 * float((self.drives.mask > 0).sum())
 
-    def _white(self, series: np.ndarray) -> np.ndarray:
+    def white(self, series: np.ndarray) -> np.ndarray:
         """White and flat: (B, K, C, ...) -> (B, n, ...); or (N, B, K, C) -> (N, B, n)."""
         mask, filt = self.drives.mask, self.reference.whitener
         if series.shape[:3] == mask.shape:
@@ -186,7 +196,8 @@ class Refitter:
         difference = u - self.reference.u
         return float(difference @ self.precision @ difference)
 
-    def _set(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
+    def values_at(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
         values = self.values.copy()
         values[self.base_index] = self.reference.space.to_values(u)
         start = 0
@@ -205,7 +216,7 @@ class Refitter:
             step = STEP_Q * max(abs(q[i]), 1.0)
             moved = q.copy()
             moved[i] += step
-            sets.append(self._set(hypotheses, u, moved))
+            sets.append(self.values_at(hypotheses, u, moved))
             steps.append(step)
         return sets, steps
 

@@ -10,11 +10,21 @@
                       noise_floor of the same where there are replicates
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
-    missing           p-value of "nothing is missing"; squared residual in excess of the noise, as a share of it, before
-                      and after; share of it explained; of simulated days that were refitted (`--refit-nulls`, else
-                      null) count, calibrated p-value, false alarms and the upper 95 % bound of their rate
+    by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
+                      (`sysid.loop.changes`)
+    worse             those of these rows whose error surely grew
+    missing           p-value of "nothing is missing"; that of the scan of pairs; squared residual in excess of the
+                      noise, as a share of it, before and after; share of it explained; of simulated days that were
+                      refitted (`--refit-nulls`, else null) count, calibrated p-value, false alarms and the upper 95 %
+                      bound of their rate
+    operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
+                      of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
+                      the share of simulated days on which it would be noticed, at factors on its size
+    contradicted      what speaks against an effect that would else have been named, in sentences
+    pairs             of the scan: the pairs of effects that explain most together
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
-    detectable        per effect the smallest size that these drives would show with 80 % power
+    detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
+                      noticed on simulated days (`power`)
     lives_in          where the unexplained residual lives
     unnamed           the wrench over one quantity that best predicts it (keys: `sysid.loop.unnamed.as_report`); where
                       it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
@@ -34,9 +44,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.log import Trial
-from sysid.loop.agreement import sizes_apart, with_prior
+from sysid.loop.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart, with_prior
 from sysid.loop.catalogue import Hypothesis, base_values
+from sysid.loop.changes import by_manoeuvre, worse
+from sysid.loop.evidence import Evidence, at_fit
+from sysid.loop.falsifiers import as_report as predictions_of
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
+from sysid.loop.power import Days, false_alarms, power_curve, simulated_days
 from sysid.loop.refit import Refit
 from sysid.loop.solver import Solver
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
@@ -69,6 +83,9 @@ def make_report(result: Result) -> dict[str, Any]:
     after = replay(result, result.after, trials) if wrench is None or not wrench.kept else replay_unnamed(
         result, wrench, trials)
     rows = error_rows(trials, before, after)
+    moved = by_manoeuvre(trials, before, after)
+    days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
+                          found.scan, seed=result.config.seed)
     about = [one.name for one in result.references]
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
              if result.reference.known else "what the model family lacks")
@@ -82,7 +99,10 @@ def make_report(result: Result) -> dict[str, Any]:
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
-        "missing": {"p_value": found.p_value, "excess_before": found.excess[0],
+        "by_manoeuvre": moved, "worse": worse(moved), "operating": operating(result, days),
+        "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "missing": {"p_value": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
+                    "excess_before": found.excess[0],
                     "excess_after": found.excess[1], "explained": found.share,
                     "null_refits": None if nulls is None else {
                         "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
@@ -91,7 +111,7 @@ def make_report(result: Result) -> dict[str, Any]:
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
                        for each in found.rounds],
-        "detectable": detectable(result), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "detectable": detectable(result, days), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
@@ -144,6 +164,47 @@ def change(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return out
 
 
+def scanned(result: Result) -> Evidence:
+    """The evidence that the scan was run on: around the base model refitted to these drives."""
+    base = result.search.base
+    return at_fit(result.evidence, base.residual, base.jacobian[..., : len(base.u)], base.u - result.reference.u)
+
+
+def operating(result: Result, days: Days) -> dict[str, Any]:
+    """False alarms and power of these very drives, on simulated days."""
+    found, alpha = result.search, result.config.thresholds.alpha
+    power = []
+    if found.verdict == "named":
+        kept = {one.hypothesis.key for one in found.accepted}
+        for one, q in zip(found.final.hypotheses, found.final.split, strict=True):
+            if one.key in kept:
+                number = result.hypotheses.index(one)
+                power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
+    return {"alpha": alpha, "decisions": result.config.thresholds.rounds + 2, "days": "simulated, linear",
+            "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def contradicted(result: Result) -> list[str]:
+    """What speaks against effects that would else have been named."""
+    if result.search.verdict == "named":
+        return []
+    return [each for one in result.stood for each in one.against(result.config.thresholds)]
+
+
+def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
+    """The pairs of effects with the largest gain in the scan."""
+    pairs = result.search.pairs
+    if pairs is None:
+        return []
+    out: dict[frozenset[str], dict[str, Any]] = {}
+    for m in np.argsort(-pairs.gain):
+        names = [result.hypotheses[h].effect for h in pairs.members[m]]
+        out.setdefault(frozenset(names), {"effects": names, "gain": float(pairs.gain[m]), "p_value": float(pairs.p[m])})
+        if len(out) == most:
+            break
+    return list(out.values())
+
+
 def warnings(result: Result) -> list[str]:
     """What speaks against taking the names as certain."""
     found, alpha = result.search, result.config.thresholds.alpha
@@ -180,7 +241,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
                     "interval": sorted(end[axis.parameter] for end in ends),
                     "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
                 "p_value": found.accepted[index].p, "equation": equation_of(one),
-                "evidence": evidence_for(result, slice(start, stop))})
+                "evidence": evidence_for(result, slice(start, stop), one.effect)})
         start = stop
     return out
 
@@ -214,42 +275,33 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     return final.q - quantile * deviation, final.q + quantile * deviation
 
 
-def evidence_for(result: Result, part: slice) -> dict[str, Any]:
-    """What each manoeuvre says of an effect by itself, and whether it predicts manoeuvres that were left out."""
-    final, base, groups = result.search.final, result.search.base, result.evidence.groups
-    gain = {}
-    for group in groups:
-        name = result.log.training[group[0]].manoeuvre
-        gain[name] = left_out(base, group, result) - left_out(final, group, result)
-    apart = zip(groups, *sizes_apart(final, part, groups, result.evidence.precision), strict=True)
-    scales: list[dict[str, Any]] = [
-        {"manoeuvre": result.log.training[group[0]].manoeuvre, "factor": float(factor), "standard_error": float(error)}
-        for group, factor, error in apart]
-    seen = [one for one in scales if one["standard_error"] < 0.5]
-    weight = np.array([one["standard_error"] ** -2.0 for one in seen])
-    factor = np.array([one["factor"] for one in seen])
-    mean = float((weight * factor).sum() / max(weight.sum(), 1e-9)) if len(seen) else 1.0
-    return {"left_out_gain": gain, "left_out_total": float(sum(gain.values())), "by_manoeuvre": scales,
-            "heterogeneity": {"q": float((weight * (factor - mean) ** 2).sum()), "manoeuvres": len(seen)}}
+def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
+    """What each manoeuvre says of an effect by itself, whether it predicts manoeuvres that were left out, and its
+    falsifiers."""
+    one = next((one for one in result.stood if one.effect == effect), None)
+    final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
+    sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
+    told = one.foretold if one else foretold(final, part, groups, precision)
+    agreement = heterogeneity(sizes, errors)
+    names = [result.log.training[group[0]].manoeuvre for group in groups]
+    return {"left_out_gain": dict(zip(names, told.tolist(), strict=True)), "left_out_total": float(told.sum()),
+            "left_out_interval": list(interval_of_sum(told)),
+            "by_manoeuvre": [{"manoeuvre": name, "factor": float(size), "standard_error": float(error),
+                              "asked": bool(asked)}
+                             for name, size, error, asked in zip(names, sizes, errors, agreement.asked, strict=True)],
+            "heterogeneity": {"q": agreement.q, "manoeuvres": int(agreement.asked.sum()), "p_value": agreement.p,
+                              "scatter": agreement.scatter, "power": agreement.power, "outcome": agreement.outcome},
+            "falsifiers": predictions_of(one.falsifiers) if one else []}
 
 
-def left_out(fit: Refit, group: tuple[int, ...], result: Result) -> float:
-    """Squared white residual of a manoeuvre predicted by a fit to all others (one linear step from the joint fit)."""
-    chosen = list(group)
-    flat = fit.jacobian[chosen].reshape(-1, fit.jacobian.shape[-1])
-    residual = fit.residual[chosen].reshape(-1)
-    matrix = with_prior(fit, result.evidence.precision) - flat.T @ flat
-    step = np.linalg.solve(matrix + 1e-9 * np.diag(matrix).max() * np.eye(len(matrix)), -flat.T @ residual)
-    return float(np.square(residual - flat @ step).sum())
-
-
-def detectable(result: Result) -> list[dict[str, Any]]:
-    """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units."""
+def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
+    """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units, and the
+    share of simulated days on which it is noticed."""
     found = result.search
     limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
     solver = Solver(result.evidence)
     base = base_values(result.full)
-    out, done = [], set()
+    out, done, sizes = [], set(), []
     for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
         one = result.hypotheses[columns.hypothesis]
         for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
@@ -266,7 +318,12 @@ def detectable(result: Result) -> list[dict[str, Any]]:
             reach = bool(q <= axis.limit)
             out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
                         "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
-                        "unit": unit_of(axis.parameter)})
+                        "unit": unit_of(axis.parameter), "power": None})
+            if reach:
+                sizes.append((out[-1], (columns, at)))
+    noticed = days.noticed(result.config.thresholds.alpha, [effect for _, effect in sizes])
+    for (row, _), share in zip(sizes, noticed, strict=True):
+        row["power"] = share
     return out
 
 

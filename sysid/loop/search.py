@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sysid.loop.agreement import beside, disagreement, foretold
+from sysid.loop.agreement import beside, disagreement, foretold, interval_of_sum
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit
-from sysid.loop.refit import Refit, Refitter, Start
+from sysid.loop.pairs import PairScan, scan_pairs
+from sysid.loop.refit import Refit, Refitter, Start, moved_last
 from sysid.loop.scan import Scan, best, run
 from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
@@ -25,7 +26,9 @@ class Thresholds:
     """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
 
     alpha: float = 0.01
-    """Family-wise p-value below which something is missing, and below which an effect is it."""
+    """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
+    the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
+    alarms."""
     share: float = 0.6
     """Least share of the excess residual that named effects explain together."""
     most: float = 0.5
@@ -55,7 +58,12 @@ class Thresholds:
     """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
     loss: float = 0.1
     """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
+    scatter: float = 1.0
+    """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
+    more one in six would find the opposite."""
     rounds: int = 3
+    pairs: int = 3
+    """Pairs of effects that are refitted."""
     worthwhile: float = 0.15
     """Least scanned gain of an effect that is refitted, as a share of the best one's."""
     candidates: int = 4
@@ -100,10 +108,15 @@ class Search:
     excess: tuple[float, float] = (0.0, 0.0)
     """Squared white residual over its number, less 1: before and after."""
     reason: str = ""
+    pairs: PairScan | None = None
+    together: float | None = None
+    """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
 
     @property
     def p_value(self) -> float:
         """Of "nothing is missing": that of the scan and, where refits were tried, of the best of them."""
+        if self.together is not None:
+            return self.together
         refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
         return max(self.scan.p_family, refitted)
 
@@ -137,12 +150,15 @@ def search(
         """Share of the excess that a fit removes; where there is hardly any, of one that would be worth a word."""
         return float(np.clip((excess(base) - excess(fit)) / max(excess(base), thresholds.excess), 0.0, 1.0))
 
-    found = Search("none", base, base, first, excess=(excess(base), excess(base)))
-    if first.p_family >= thresholds.alpha and wander.p_excess(excess(base)) >= thresholds.alpha:
+    similar = imitation(evidence, hypotheses)
+    pairs = scan_pairs(evidence, hypotheses, refitter.reference.spread, wander, similar, thresholds.alike, seed=seed)
+    report("scan of pairs")
+    found = Search("none", base, base, first, excess=(excess(base), excess(base)), pairs=pairs)
+    if (first.p_family >= thresholds.alpha and wander.p_excess(excess(base)) >= thresholds.alpha
+            and pairs.p_family >= thresholds.alpha):
         found.reason = "nothing stands out of the noise and the day-to-day spread"
         return found
     current = base
-    similar = imitation(evidence, hypotheses)
     mended = False
     for number in range(thresholds.rounds + 1):
         if len(found.accepted) == thresholds.rounds:
@@ -172,9 +188,95 @@ def search(
         current = taken_on.refit
         if wander.p_excess(excess(current)) > thresholds.quiet:
             break
+    _drop_stand_ins(found, evidence, hypotheses, refitter, wander, thresholds, explained)
+    calm = bool(found.accepted) and wander.p_excess(excess(current)) > thresholds.quiet
+    if not calm or found.accepted[-1].share < thresholds.share:
+        tried = set() if calm else {one.hypothesis.effect for one in found.accepted}
+        _pair_round(found, evidence, hypotheses, refitter, wander, similar, thresholds, explained, tried)
+        report("refits of pairs")
     _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial,
             lambda fit: _most_apart(fit, evidence.groups, refitter.precision))
     return found
+
+
+def _drop_stand_ins(
+    found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
+    thresholds: Thresholds, explained: Callable[[Refit], float],
+) -> None:
+    """Drop what was accepted early because it resembles others together, and is worth nothing beside them.
+
+    Of three effects one may have been the first guess at the other two; the last one was accepted beside the others.
+    """
+    if len(found.accepted) < 3:
+        return
+    final = found.accepted[-1].refit
+    for one in list(found.accepted[:-1]):
+        place = final.hypotheses.index(one.hypothesis)
+        q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
+        kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
+        [without] = refitter.fit_all([Start(kept, final.u, q)], POLISH)
+        if explained(final) - explained(without) >= thresholds.step:
+            continue
+        worth = _candidate(hypotheses.index(one.hypothesis), moved_last(final, place), without, evidence, hypotheses,
+                           wander, found.scan, 0.0)
+        if worth.p >= thresholds.alpha:
+            number = found.accepted.index(one)
+            del found.accepted[number], found.classes[number]
+            found.accepted[-1] = replace(found.accepted[-1], refit=without, share=explained(without), own=True)
+            found.rounds.append([found.accepted[-1]])
+            return
+
+
+def _pair_round(
+    found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
+    similar: np.ndarray, thresholds: Thresholds, explained: Callable[[Refit], float], tried: set[str],
+) -> None:
+    """Two effects instead of what was accepted, where only together they explain the drives.
+
+    Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
+    another, and together they must explain more than what was accepted one by one.
+
+    Args:
+        tried: effects whose pairs had their chance, with the other one as a further effect.
+    """
+    pairs = found.pairs
+    assert pairs is not None
+    least = float(found.scan.gain.max()) if len(found.scan.gain) else 0.0
+    order, seen = [], set()
+    for m in np.argsort(-pairs.gain):
+        names = frozenset(hypotheses[h].effect for h in pairs.members[m])
+        if (names not in seen and not names & tried and pairs.gain[m] > least
+                and pairs.p_of(float(pairs.p[m])) < thresholds.alpha):
+            seen.add(names)
+            order.append(int(m))
+    starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
+              for m in order[: thresholds.pairs]]
+    if not starts:
+        return
+    fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
+    both = min(fits, key=lambda fit: fit.cost)
+    alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
+                             POLISH)
+    if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
+        both, alone = moved_last(both, 0), alone[::-1]
+    if explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
+        return
+    members = []
+    for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
+        h = hypotheses.index(fit.hypotheses[-1])
+        one = _candidate(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
+        part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
+        told = foretold(fit, part, evidence.groups, refitter.precision)
+        if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
+                or disagreement(fit, part, evidence.groups, refitter.precision) > thresholds.differ
+                or interval_of_sum(told)[0] <= 0):
+            return
+        members.append(replace(one, own=True))
+    members[0] = replace(members[0], refit=alone[0], share=explained(alone[0]))
+    found.accepted = members
+    found.classes = [_class_of(one, [one], hypotheses, similar, thresholds) for one in members]
+    found.rounds += [[one] for one in members]
+    found.together = max(pairs.p_family, *(one.p for one in members))
 
 
 def _own(

@@ -7,14 +7,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.close_loop import LoopConfig, close_loop, refit_poses, vehicle_after, vehicle_before
+from sysid.close_loop import (
+    Arguments,
+    LoopConfig,
+    close_loop,
+    main,
+    manifest,
+    refit_poses,
+    vehicle_after,
+    vehicle_before,
+)
 from sysid.log import load_log
 from sysid.loop.agreement import disagreement, foretold
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.loop.classes import imitation
 from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives, make_drives
 from sysid.loop.evidence import Columns, signature_columns
+from sysid.loop.falsifiers import course_of, put_to_test, without_each
 from sysid.loop.features import CHANNELS, make_features
+from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.refit import Refit, Refitter
@@ -130,6 +141,63 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
     assert provenance["verdict"] == "named"
     assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_the_report_says_what_a_named_effect_stood(sloping):
+    report = make_report(sloping)
+    evidence = report["effects"][0]["evidence"]
+    assert {"heading along x", "heading along y"} <= {one["by"] for one in evidence["falsifiers"]}
+    assert all(one["outcome"] != "falsified" for one in evidence["falsifiers"])
+    assert "holds" in {one["outcome"] for one in evidence["falsifiers"]}  # it changes sign with the heading
+    assert evidence["left_out_total"] > 0 and evidence["heterogeneity"]["manoeuvres"] >= 2
+    assert not report["contradicted"] and report["missing"]["p_pairs"] < 0.01
+    [power] = report["operating"]["power"]
+    assert power["sizes"][-1]["noticed"] > 0.9
+    assert report["operating"]["false_alarms"]["rate"] < 0.1
+    gone = {row["manoeuvre"] for row in report["by_manoeuvre"]
+            if (row["part"], row["channel"], row["metric"]) == ("held_out", "ground_truth", "trajectory")
+            and row["interval"][1] < 0}
+    assert gone == {"figure_eight"}
+    assert all(row["interval"][0] > 0 for row in report["worse"])
+
+
+def test_a_pull_that_does_not_turn_with_the_room_is_no_slope(sloping):
+    """The fit of a slope to drives that were given another one in each half of the headings is contradicted."""
+    search = sloping.search
+    assert not sloping.stood[0].against(CONFIG.thresholds)
+    refitter = refitter_of(sloping)
+    fit = search.final
+    half = without_each(fit, refitter)[0]
+    seen = refitter.drives.simulate(np.stack([fit.values, half]))
+    course = course_of(sloping.log.training, seen[0], sloping.reference.width, sloping.log.spec.track)
+    wrong = np.sign(np.cos(course.heading))[..., None] * (seen[0] - seen[1]) - (seen[0] - seen[1])
+    moved = replace(fit, residual=fit.residual + refitter.white(wrong))
+    [tested] = put_to_test(moved, refitter, sloping.log.training, sloping.evidence.groups, sloping.log.spec.track,
+                              sloping.prepared.wander.p_excess)
+    assert [one.outcome for one in tested if one.falsifier.by == "heading along x"] == ["falsified"]
+
+
+def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
+    written = manifest(CONFIG, sloping.hypotheses, sloping.reference)
+    assert {one["effect"] for one in written["catalogue"]} == {one.effect for one in sloping.hypotheses}
+    assert written["settings"]["seed"] == 0 and written["thresholds"]["alpha"] == 0.01
+    assert set(written["bounds"]) == set(sloping.reference.space.names)
+    assert set(written["falsifiers"]) >= {one.effect for one in sloping.hypotheses}
+    other = manifest(replace(CONFIG, seed=1), sloping.hypotheses, sloping.reference)
+    assert json.dumps(other, default=str) != json.dumps(written, default=str)
+
+
+def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr("sysid.close_loop.close_loop", lambda *given: asked.append(given) or sloping)
+    report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
+    [(log, references, config, vehicle, _)] = asked
+    assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
+    assert config.seed == 0
+    assert json.loads((tmp_path / "run/report.json").read_text())["verdict"] == report["verdict"] == "named"
+    assert "verdict: named" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="both given"):
+        main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "vehicle.toml"))
 
 
 def test_refit_to_poses_lowers_the_training_error(drives, sloping):
@@ -295,7 +363,7 @@ def test_two_effects_that_move_one_parameter_add_up():
     space = SimpleNamespace(to_values=lambda u: u)
     refitter = SimpleNamespace(values=np.array([1.0, 0.5]), base_index=[], names=["scrub.torque", "track.error"],
                                reference=SimpleNamespace(space=space))
-    both = Refitter._set(refitter, (track, scrub), np.zeros(0), np.array([1.0, 3.0, 2.0]))
+    both = Refitter.values_at(refitter, (track, scrub), np.zeros(0), np.array([1.0, 3.0, 2.0]))
     np.testing.assert_allclose(both, [1.0 + 2 * 3, 0.5 + 0.1 + 0.01 * 3 * 2])
 
 

@@ -1,0 +1,133 @@
+"""Two effects at once: how much each pair of hypotheses explains that neither explains alone.
+
+Effects may hide one another: where two change the same motion in opposite ways, neither stands out, or a third one that
+resembles their sum does. The scan therefore asks pairs as it asks single hypotheses: gain of both together beside the
+base model, worth with what each wanders from day to day, and p-values from the same simulated nulls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from sysid.loop.catalogue import Hypothesis
+from sysid.loop.evidence import Columns, Evidence
+from sysid.loop.scan import REACH, family, null_moments
+from sysid.loop.solver import RIDGE, Solver
+from sysid.loop.wander import Wander
+
+DRAWS = 300
+"""Simulated nulls for the p-values of pairs: each is asked of some ten thousand columns."""
+CHI_SQUARED = 2.0
+"""Size over which the tail of chi-squared falls by e."""
+
+
+@dataclass(frozen=True)
+class PairScan:
+    """M pairs of hypotheses, each at the levels of its highest worth."""
+
+    members: tuple[tuple[int, int], ...]
+    gain: np.ndarray  # (M,)
+    worth: np.ndarray  # (M,)
+    q: tuple[np.ndarray, ...]  # coordinates of the first member, then of the second
+    p: np.ndarray  # (M,) p-value of each pair by itself
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return self.p_of(float(self.p.min())) if len(self.p) else 1.0
+
+    def p_of(self, p: float) -> float:
+        """Family-wise p-value of a pair's own."""
+        return family(self.smallest, p)
+
+
+class Bench:
+    """Scores and information of all columns beside the base, of the drives (row 0) and of simulated nulls."""
+
+    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, moments: np.ndarray,
+                 share: np.ndarray):
+        """`moments` (N, P + S) of the nulls; `share` (N, D) of the reference days' apparent effects in each."""
+        solver, self.size = Solver(evidence), evidence.base_size
+        size = self.size
+        self.left = solver.products[size:, size:] - solver.products[:size, size:].T @ solver.project[:, size:]
+        self.left[np.diag_indices(len(self.left))] += RIDGE * np.maximum(np.diag(solver.products)[size:], 1e-12)
+        every = np.concatenate([solver.moments[None], moments])
+        self.score = every[:, size:] - every[:, :size] @ solver.project[:, size:]  # (1 + N, S)
+        self.columns, self.wander = evidence.columns, wander.covariance
+        self.away = [np.concatenate([np.zeros((1, shapes.shape[1])), share @ shapes * np.sqrt(np.diag(covariance))])
+                     for covariance, shapes in zip(wander.covariance, wander.shapes, strict=True)]
+        self.ends = [_ends(one, hypotheses[one.hypothesis]) for one in evidence.columns]
+
+    def look(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gain (1 + N,), worth (1 + N,) and coordinates (1 + N, k) of two columns' hypotheses together; 0 where one of
+        them would go where it cannot."""
+        pair = (first, second)
+        index = [i - self.size for one in pair for i in self.columns[one].index]
+        information = self.left[np.ix_(index, index)]
+        q = np.linalg.solve(information, self.score[:, index].T).T
+        q = q + np.concatenate([self.away[one] for one in pair], axis=1)
+        wide = np.zeros_like(information)
+        cut = len(self.columns[first].index)
+        wide[:cut, :cut], wide[cut:, cut:] = self.wander[first], self.wander[second]
+        low, upper = (np.concatenate([self.ends[one][end] for one in pair]) for end in (0, 1))
+        kept = ((q >= low) & (np.abs(q) <= upper)).all(1)
+        whole = np.linalg.inv(np.linalg.inv(information) + wide)
+        return ((q @ information * q).sum(1) * kept, (q @ whole * q).sum(1) * kept, q)
+
+
+def _ends(columns: Columns, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) least coordinates, and largest sizes at which columns found at their level are trusted."""
+    low = np.array([-axis.limit if axis.signed else 0.0 for axis in hypothesis.axes])
+    return low - 1e-9, np.array([axis.limit if axis.signed else REACH * columns.level for axis in hypothesis.axes])
+
+
+def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray:
+    """P(null >= value); beyond the upper tenth of the draws (N,) at most as steep as that of chi-squared, because the
+    worth of many pairs is 0 on nearly all of them."""
+    value, ordered = np.asarray(value, float), np.sort(null)
+    count = len(ordered)
+    p = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
+    top = ordered[int(0.9 * count) :]
+    far = 0.1 * np.exp(-(value - top[0]) / max(float(top.mean() - top[0]), CHI_SQUARED))
+    return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), p))
+
+
+def scan_pairs(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, similar: np.ndarray,
+    alike: float, draws: int = DRAWS, seed: int = 0,
+) -> PairScan:
+    """Scan all pairs of different effects that these drives tell apart, and calibrate on simulated nulls.
+
+    Args:
+        spread: (P, P) day-to-day covariance of the base parameters.
+        similar: (H, H) |cos| of signatures; pairs above `alike` are one class, not two effects.
+    """
+    rng = np.random.default_rng((seed, 2))
+    moments = null_moments(evidence, spread, draws, rng)
+    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
+    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    bench = Bench(evidence, hypotheses, wander, moments, share)
+    placed: list[list[int]] = [[] for _ in hypotheses]
+    for number, one in enumerate(evidence.columns):
+        placed[one.hypothesis].append(number)
+    members = [(i, j) for i, j in combinations(range(len(hypotheses)), 2)
+               if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike]
+    gain, worth, found, p = np.zeros(len(members)), np.zeros(len(members)), [], np.ones(len(members))
+    smallest = np.ones(draws)
+    for number, (i, j) in enumerate(members):
+        most, best = np.zeros(draws), np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes))
+        for a in placed[i]:
+            for b in placed[j]:
+                gains, worths, q = bench.look(a, b)
+                most = np.maximum(most, worths[1:])
+                if worths[0] > worth[number]:
+                    gain[number], worth[number], best = gains[0], worths[0], q[0]
+        found.append(best)
+        p[number] = float(tail(most, worth[number]))
+        smallest = np.minimum(smallest, tail(most, most))
+    return PairScan(tuple(members), gain, worth, tuple(found), p, smallest)

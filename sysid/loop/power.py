@@ -1,0 +1,95 @@
+"""What these very drives can show: how often they raise a false alarm, and how surely an effect is noticed.
+
+Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
+Linear, like the scan: `--refit-nulls` tells the false alarms of the whole procedure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.loop.catalogue import Hypothesis
+from sysid.loop.evidence import Columns, Evidence
+from sysid.loop.scan import Scan, family, look, null_moments, tail
+from sysid.loop.solver import Solver
+from sysid.loop.wander import Wander
+from sysid.statistics import upper_rate
+
+DRAWS = 200
+SEED = 3  # beside that of the scan's nulls
+FACTORS = (0.25, 0.5, 1.0, 2.0)
+"""Sizes of a named effect, over the fitted one, whose power is told."""
+
+
+Effect = tuple[Columns, np.ndarray]
+"""Columns of a hypothesis and its coordinates (k,)."""
+
+
+@dataclass(frozen=True)
+class Days:
+    """Simulated days on which nothing is missing, seen through the columns of the scan."""
+
+    evidence: Evidence
+    hypotheses: Sequence[Hypothesis]
+    wander: Wander
+    scan: Scan
+    moments: np.ndarray  # (N, P + S)
+    share: np.ndarray  # (N, D) in which the reference days' apparent effects are in them
+
+    def p(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """(E, N) p-values of "nothing is missing", with one of the effects in every day; (1, N) of the days alone."""
+        products, draws = self.evidence.products.sum(0), len(self.moments)
+        added = np.stack([products[:, list(columns.index)] @ q for columns, q in effects]) if effects else np.zeros(
+            (1, len(products)))
+        moments = (added[:, None] + self.moments).reshape(-1, len(products))
+        solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
+        for one, covariance, shapes in zip(self.evidence.columns, self.wander.covariance, self.wander.shapes,
+                                           strict=True):
+            away = np.tile(self.share @ shapes * np.sqrt(np.diag(covariance)), (len(added), 1))
+            found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
+            worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
+        each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
+        return np.array([family(self.scan.smallest, float(one)) for one in each.min(1)]).reshape(-1, draws)
+
+    def noticed(self, alpha: float, effects: Sequence[Effect]) -> list[float]:
+        """Of each effect the share of days on which something counts as missing."""
+        return [float(np.mean(p < alpha)) for p in self.p(effects)] if effects else []
+
+    def nearest(self, hypothesis: int, size: float) -> Columns:
+        """The columns of a hypothesis that were simulated nearest to a size."""
+        mine = [one for one in self.evidence.columns if one.hypothesis == hypothesis]
+        return min(mine, key=lambda one: abs(one.level - size))
+
+
+def simulated_days(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, scan: Scan,
+    draws: int = DRAWS, seed: int = 0,
+) -> Days:
+    """Draw days anew.
+
+    Args:
+        evidence: that the scan was run on.
+        spread: (P, P) day-to-day covariance of the base parameters.
+    """
+    rng = np.random.default_rng((seed, SEED))
+    moments = null_moments(evidence, spread, draws, rng)
+    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
+    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    return Days(evidence, hypotheses, wander, scan, moments, share)
+
+
+def false_alarms(days: Days, alpha: float) -> dict[str, float]:
+    """`count` of days, `alarms` among them, their `rate` and its `upper` 95 % bound."""
+    [p] = days.p()
+    alarms = int((p < alpha).sum())
+    return {"count": len(p), "alarms": alarms, "rate": alarms / len(p), "upper": upper_rate(alarms, len(p))}
+
+
+def power_curve(days: Days, hypothesis: int, q: np.ndarray, alpha: float) -> list[dict[str, float]]:
+    """`noticed`: share of days on which an effect would be missed from the model, at each `factor` on its size."""
+    columns = days.nearest(hypothesis, float(np.abs(q).max()))
+    noticed = days.noticed(alpha, [(columns, factor * q) for factor in FACTORS])
+    return [{"factor": factor, "noticed": share} for factor, share in zip(FACTORS, noticed, strict=True)]

@@ -1,0 +1,166 @@
+"""Two effects that hide one another, and what a set of drives can show, on evidence that is linear by construction."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.loop.catalogue import Axis, Hypothesis
+from sysid.loop.evidence import Evidence, column_layout
+from sysid.loop.pairs import scan_pairs, tail
+from sysid.loop.power import false_alarms, power_curve, simulated_days
+from sysid.loop.refit import Refit, moved_last
+from sysid.loop.report import detectable
+from sysid.loop.scan import run
+from sysid.loop.search import Thresholds, search
+from sysid.loop.wander import no_wander
+
+pytestmark = pytest.mark.quick
+EFFECTS = tuple(Hypothesis(name, (Axis(parameter, 0.01, signed=True, limit=50.0),)) for name, parameter in (
+    ("slope", "slope.along_x"), ("track_width", "track_width.error"), ("side_force", "side_force.sideways"),
+    ("command_scale", "command_scale.linear")))
+SPREAD = 0.01 * np.eye(1)
+POOL = 60
+
+
+def drives(sizes, close=0.8, seed=0, trials=6, samples=120):
+    """Evidence of drives with these sizes of the four effects; the first two change the motion nearly alike."""
+    rng = np.random.default_rng(seed)
+    free = rng.standard_normal((trials, samples, 5))
+    shared = free[..., 1]
+    free[..., 2] = close * shared + np.sqrt(1 - close**2) * free[..., 2]
+    noise = rng.standard_normal((trials, samples))
+    residual = free[..., 1:] @ np.asarray(sizes) + noise
+    pool = tuple(rng.standard_normal((POOL, samples)) @ one for one in free)
+    return Evidence(residual, free, 1, column_layout(EFFECTS, 1), np.linalg.inv(SPREAD),
+                    np.einsum("bni,bnj->bij", free, free), np.einsum("bni,bn->bi", free, residual), pool,
+                    tuple((k,) for k in range(trials)))
+
+
+def pairs_of(evidence, wander):
+    return scan_pairs(evidence, EFFECTS, SPREAD, wander, np.eye(4), 0.9, draws=200)
+
+
+@pytest.fixture(scope="module")
+def wander():
+    return no_wander(column_layout(EFFECTS, 1))
+
+
+def test_two_effects_that_hide_one_another_are_found_together(wander):
+    evidence = drives((1.0, -1.0, 0.0, 0.0), close=0.97)
+    alone, pairs = run(evidence, EFFECTS, SPREAD, wander, 200), pairs_of(evidence, wander)
+    best = int(np.argmax(pairs.gain))
+    assert pairs.members[best] == (0, 1)
+    assert pairs.gain[best] > 2 * alone.gain.max()
+    assert pairs.p_family < 0.01 and pairs.p_family < alone.p_family
+    assert pairs.q[best] == pytest.approx([1.0, -1.0], abs=0.4)
+
+
+def test_pairs_of_nothing_have_no_small_p_values(wander):
+    p = [pairs_of(drives(np.zeros(4), seed=seed), wander).p_family for seed in range(10)]
+    assert min(p) > 0.005 and np.mean(np.array(p) < 0.2) < 0.5
+
+
+class Linear:
+    """Refits of drives whose motion is linear in everything, in the place of `sysid.loop.refit.Refitter`."""
+
+    def __init__(self, evidence):
+        self.evidence, self.precision = evidence, evidence.precision
+        self.reference = SimpleNamespace(u=np.zeros(1), spread=SPREAD)
+        self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), courses=SimpleNamespace(
+            of_trial=np.arange(len(evidence.residual))))
+
+    def fit(self, chosen, _):
+        columns = self.evidence.design[..., [0, *(1 + EFFECTS.index(one) for one in chosen)]]
+        flat = columns.reshape(-1, columns.shape[-1])
+        matrix = flat.T @ flat
+        matrix[:1, :1] += self.precision
+        solution = np.linalg.solve(matrix, flat.T @ self.evidence.residual.reshape(-1))
+        residual = self.evidence.residual - columns @ solution
+        cost = float(np.square(residual).sum() + solution[:1] @ self.precision @ solution[:1])
+        return Refit(tuple(chosen), solution[:1], solution[1:], cost, residual, columns, solution)
+
+    def fit_all(self, starts, _):
+        return [self.fit(start.hypotheses, None) for start in starts]
+
+
+def verdict(evidence, wander):
+    return search(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), lambda _: 0.0, 300)
+
+
+def named(found):
+    return found.verdict, {one.hypothesis.effect for one in found.accepted}
+
+
+def test_a_hidden_pair_is_named_and_a_single_effect_stays_one(wander):
+    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.88), wander)
+    assert named(pair) == ("named", {"slope", "track_width"})
+    assert pair.scan.p_family > 0.01 > pair.p_value and pair.share > 0.7
+    assert named(verdict(drives((0.0, 0.0, 1.0, 0.0)), wander)) == ("named", {"side_force"})
+    assert named(verdict(drives(np.zeros(4)), wander)) == ("none", set())
+
+
+def test_what_resembles_two_effects_together_gives_way_to_them(wander):
+    """`command_scale` here changes the motion nearly as slope and track width together do."""
+    evidence, sizes = drives(np.zeros(4), close=0.0), np.array([0.0, 1.0, 1.0, 0.0, 0.0])
+    design = evidence.design.copy()
+    design[..., 4] = 0.9 * (design[..., 1] + design[..., 2]) / np.sqrt(2) + 0.43 * design[..., 4]
+    evidence = replace(evidence, residual=evidence.residual + design @ sizes, design=design,
+                       products=np.einsum("bni,bnj->bij", design, design),
+                       moments=np.einsum("bni,bn->bi", design, evidence.residual + design @ sizes))
+    found = verdict(evidence, wander)
+    assert found.rounds[0][0].hypothesis.effect == "command_scale"
+    assert named(found) == ("named", {"slope", "track_width"})
+
+
+def test_one_class_is_no_pair(wander):
+    alike = np.eye(4)
+    alike[1, 0] = 0.95
+    found = scan_pairs(drives(np.zeros(4)), EFFECTS, SPREAD, wander, alike, 0.9, draws=50)
+    assert (0, 1) not in found.members and len(found.members) == 5
+
+
+def test_effects_that_wander_from_day_to_day_are_worth_less_together():
+    evidence, layout = drives((1.0, -1.0, 0.0, 0.0), close=0.97), column_layout(EFFECTS, 1)
+    still, moving = (pairs_of(evidence, no_wander(layout, size)) for size in (0.0, 0.5))
+    assert moving.worth.max() < 0.5 * still.worth.max()
+
+
+def test_a_tail_of_zeros_is_no_steeper_than_that_of_chi_squared():
+    null = np.concatenate([np.zeros(195), [1.0, 2.0, 3.0, 1.0, 2.0]])
+    assert tail(null, 4.0) > 0.01
+    assert tail(null, 0.0) == 1.0
+
+
+def test_the_other_effect_of_a_pair_may_come_last():
+    rng, (first, second) = np.random.default_rng(0), EFFECTS[:2]
+    columns = rng.standard_normal((2, 5, 3))
+    fit = Refit((first, second), np.zeros(1), np.array([1.0, 2.0]), 1.0, np.zeros((2, 5)), columns, np.zeros(3))
+    turned = moved_last(fit, 0)
+    assert turned.hypotheses == (second, first) and turned.q.tolist() == [2.0, 1.0]
+    assert np.array_equal(turned.jacobian[..., 1:] @ turned.q, columns[..., 1:] @ fit.q)
+
+
+def test_simulated_days_raise_few_alarms_and_show_what_should_be_noticed(wander):
+    evidence = drives(np.zeros(4))
+    scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
+    days = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400)
+    alarms = false_alarms(days, 0.01)
+    assert alarms["alarms"] <= 12 and alarms["upper"] >= alarms["rate"]
+    curve = [one["noticed"] for one in power_curve(days, 2, np.array([0.3]), 0.01)]
+    assert curve == sorted(curve) and curve[0] < 0.5 < curve[2]
+
+
+def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, monkeypatch):
+    evidence = drives(np.zeros(4))
+    scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
+    days = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400)
+    monkeypatch.setattr("sysid.loop.report.base_values", lambda _: dict.fromkeys(
+        (one.axes[0].parameter for one in EFFECTS), 0.0))
+    result = SimpleNamespace(search=SimpleNamespace(scan=scan), evidence=evidence, hypotheses=EFFECTS, full=None,
+                             prepared=SimpleNamespace(wander=wander),
+                             config=SimpleNamespace(thresholds=SimpleNamespace(alpha=0.01)))
+    rows = detectable(result, days)
+    assert [row["effect"] for row in rows] == [one.effect for one in EFFECTS]
+    assert all(row["power"] == pytest.approx(0.8, abs=0.12) for row in rows)
