@@ -1,9 +1,10 @@
 """Confidence intervals of fitted parameters, and which of them the log cannot tell.
 
 Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. Trials are
-independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive.
-Where too few trials tell a parameter for that, blocks are pieces of trials, and errors are taken to be no less than
-those of independent samples.
+independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive. What
+replicates share is no noise but what the model gets wrong about a manoeuvre; where they share more than chance would
+have it, manoeuvres are the independent blocks. Where too few trials tell a parameter, blocks are pieces of trials, and
+errors are taken to be no less than those of independent samples.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.gradient import HUBER, huber_weight
+from sysid.metrics import replicate_groups
 from sysid.objective import Objective
 from sysid.sandwich import Variance, sandwich
 
@@ -21,6 +23,9 @@ PIECES = 8
 """Blocks that each trial is cut into where trials are too few."""
 ENOUGH = 2.0
 """Degrees of freedom from which the variance between trials is taken: three or four drives that tell a parameter."""
+CHANCE = 0.05
+"""Probability below which what replicates share is taken for the model's error."""
+FLIPS = 999  # draws of the signs of trials
 PRIOR_SD = 0.29
 """Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
 UNIDENTIFIABLE = 0.5
@@ -94,11 +99,16 @@ def estimate(
     inverse = np.linalg.inv(hessian + weak)
     between = sandwich(scores.sum(1), blocks.sum(1), inverse)
     within = sandwich(scores.reshape(-1, space.size), blocks.reshape(-1, space.size, space.size), inverse)
+    groups = _manoeuvres(objective)
+    across = None
+    if shared_error(_own_frame(objective, residual), groups) < CHANCE:
+        sums = np.eye(groups.max() + 1)[groups].T  # (C, B)
+        across = sandwich(sums @ scores.sum(1), np.einsum("cb,bpq->cpq", sums, blocks.sum(1)), inverse)
     known = inverse @ weak @ inverse * share  # what the prior's own error adds
-    deviation, freedom = _choose(between, within, np.diag(inverse @ hessian @ inverse) * variance)
+    deviation, freedom = _choose(between, within, across, np.diag(inverse @ hessian @ inverse) * variance)
     deviation = np.sqrt(deviation**2 + np.diag(known))
     quantile = stats.t.ppf((1 + confidence) / 2, freedom)
-    covariance = max((one.covariance for one in (between, within)), key=np.trace) + known
+    covariance = max((one.covariance for one in (between, within, across) if one is not None), key=np.trace) + known
     information, directions = np.linalg.eigh(hessian / scale)
     estimates = []
     for index, name in enumerate(space.names):
@@ -124,16 +134,64 @@ def inflation(objective: Objective, u: np.ndarray) -> float:
     return max(float(np.median(np.square(pieces).sum(0)[told] / np.diag(hessian)[told])), 1.0)
 
 
-def _choose(between: Variance, within: Variance, independent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
+    """How probable it is that the residuals of independent trials of one group are so much alike.
+
+    Independent trials might as well have had the opposite errors, whatever the correlation within each: their products
+    with one another are compared with those for random signs of the trials. 1 without a group of several trials.
+
+    Args:
+        series: (B, K) residuals, each trial's in its own frame.
+        groups: (B,) number of the group that each is of.
+    """
+    alike = (groups[:, None] == groups) & ~np.eye(len(groups), dtype=bool)
+    if not alike.any():
+        return 1.0
+    pairs = (series @ series.T) * alike
+    signs = np.random.default_rng(0).choice((-1.0, 1.0), (FLIPS, len(groups)))
+    drawn = np.einsum("nb,bc,nc->n", signs, pairs, signs, optimize=True)
+    return float((1 + (drawn >= pairs.sum()).sum()) / (1 + FLIPS))
+
+
+def _own_frame(objective: Objective, residual: np.ndarray) -> np.ndarray:
+    """(B, K) residuals of pose and odometry; those of the outside position along and across the start's heading."""
+    tables = (objective.measured.pose, objective.measured.odometry)
+    sizes = [table[0].size for table in tables]
+    pose = residual[:, : sizes[0]].reshape(tables[0].shape)
+    yaw = np.array([trial.start.yaw for trial in objective.trials])[:, None]
+    x, y = pose[..., 0], pose[..., 1]
+    turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
+    return np.concatenate([*turned, residual[:, sizes[0] : sum(sizes)]], axis=1)
+
+
+def _manoeuvres(objective: Objective) -> np.ndarray:
+    """(B,) which trials are replicates of one another, as a number for each."""
+    numbers = np.arange(len(objective.trials))
+    place = {id(trial): i for i, trial in enumerate(objective.trials)}
+    for group in replicate_groups(objective.trials):
+        numbers[[place[id(trial)] for trial in group]] = place[id(group[0])]
+    return np.unique(numbers, return_inverse=True)[1]
+
+
+def _choose(
+    between: Variance, within: Variance, across: Variance | None, independent: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors (P,) and their degrees of freedom: between trials where they know it, or else within them.
 
     Args:
+        between, within: trials are the blocks, or pieces of them.
+        across: manoeuvres are the blocks, where the model is wrong about them; then no error is less than that.
         independent: (P,) variances if all samples were independent.
     """
     enough = (between.freedom >= ENOUGH) & (between.told > 0.5)
     pieces = np.maximum(np.diag(within.covariance), independent)
-    deviation = np.sqrt(np.where(enough, np.diag(between.covariance), pieces))
-    return deviation, np.maximum(np.where(enough, between.freedom, within.freedom), 1.0)
+    variance = np.where(enough, np.diag(between.covariance), pieces)
+    freedom = np.where(enough, between.freedom, within.freedom)
+    if across is not None:
+        wrong = (across.told > 0.5) & (np.diag(across.covariance) > variance)
+        variance = np.where(wrong, np.diag(across.covariance), variance)
+        freedom = np.where(wrong, across.freedom, freedom)
+    return np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
 def _pieces(

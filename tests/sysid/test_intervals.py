@@ -9,6 +9,7 @@ import pytest
 from conftest import unicycle_objective
 
 from sysid import gradient, uncertainty
+from sysid.log import Command, Start, Trial
 from sysid.objective import Noise
 from sysid.rollout import Measured
 from sysid.sandwich import sandwich
@@ -24,9 +25,12 @@ class Linear:
         count = design.shape[-1]
         self.space = Space(tuple("abcdefg"[:count]), np.zeros(count), np.ones(count), np.full(count, 0.5),
                            np.zeros(count, bool))
-        self.trials, self.prior = [None] * len(design), None
+        # Twos are replicates: 0_1, 0_2, 1_1, ...
+        self.trials = tuple(drive(i // 2, i % 2 + 1) for i in range(len(design)))
+        self.prior = None
         mask = np.ones((*design.shape[:2], 1))
-        self.measured = Measured(0 * mask, mask, 0 * mask[..., :0], mask[..., :0])
+        none = np.zeros((len(design), 0, 3))
+        self.measured = Measured(none, none, 0 * mask, mask)
         self.noise = Noise(np.ones(3), np.ones(5), "residuals")
         self._design, self._errors = design, errors
         self.counted = errors.size
@@ -36,6 +40,11 @@ class Linear:
 
     def jacobian(self, u):
         return self.residuals(u), np.tile(self._design, (len(u), 1, 1, 1))
+
+
+def drive(manoeuvre: int, replicate: int) -> Trial:
+    command = Command(np.zeros(1), np.full(1, float(manoeuvre)), np.zeros(1))
+    return Trial(f"m{manoeuvre}_{replicate}", f"m{manoeuvre}", command, None, None, Start())
 
 
 def correlated(random: np.random.Generator, rho: float) -> np.ndarray:
@@ -89,6 +98,42 @@ def test_the_variance_of_few_blocks_is_unbiased_where_errors_are_independent():
     assert (np.mean(plain, 0) < 0.85 * told).all()
     # Satterthwaite: the degrees of freedom say how much the variance itself varies.
     np.testing.assert_allclose(2 * np.mean(found, 0) ** 2 / np.var(found, 0), one.freedom, rtol=0.25)
+
+
+def misfit(random: np.random.Generator) -> np.ndarray:
+    """(DRIVES, SAMPLES): the same in both replicates of a manoeuvre, twice as large as the noise."""
+    return 2 * np.repeat(correlated(random, 0.9)[: DRIVES // 2], 2, axis=0)
+
+
+@pytest.mark.quick
+def test_what_replicates_share_widens_intervals_until_they_hold():
+    """A model that is wrong about each manoeuvre in its own way: replicates do not average that out."""
+    random = np.random.default_rng(4)
+    design = np.repeat(designs(random)[::2], 2, axis=0)
+    inside, narrow = [], []
+    for _ in range(300):
+        objective = Linear(design, correlated(random, 0.5) + misfit(random))
+        u = gradient.fit(objective, objective.space, iterations=4).u
+        known = uncertainty.estimate(objective, u)
+        inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
+        shared = uncertainty.shared_error(objective.residuals(u[None])[0], np.arange(DRIVES) // 2)
+        narrow.append(shared > uncertainty.CHANCE)
+    assert np.mean(narrow) < 0.05
+    assert (np.mean(inside, axis=0)[:2] > 0.83).all()
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_replicates_that_share_nothing_are_rarely_taken_to(rho):
+    random = np.random.default_rng(5)
+    found = []
+    for _ in range(300):
+        design, errors = designs(random), correlated(random, rho)
+        inverse = np.linalg.inv(np.einsum("bkp,bkq->pq", design, design))
+        residual = errors - design @ (inverse @ np.einsum("bkp,bk->p", design, errors))
+        found.append(uncertainty.shared_error(residual, np.arange(DRIVES) // 2))
+    assert np.mean(np.array(found) < uncertainty.CHANCE) < 0.08
+    assert uncertainty.shared_error(residual, np.arange(DRIVES)) == 1.0
 
 
 @pytest.mark.quick
