@@ -20,6 +20,8 @@ from sysid.statistics import upper_rate
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
+POWER = 0.8
+REACH, HALVINGS = 8.0, 7  # range of factors around a first guess, and how often it is halved
 FACTORS = (0.25, 0.5, 1.0, 2.0)
 """Sizes of a named effect, over the fitted one, whose power is told."""
 
@@ -93,3 +95,20 @@ def power_curve(days: Days, hypothesis: int, q: np.ndarray, alpha: float) -> lis
     columns = days.nearest(hypothesis, float(np.abs(q).max()))
     noticed = days.noticed(alpha, [(columns, factor * q) for factor in FACTORS])
     return [{"factor": factor, "noticed": share} for factor, share in zip(FACTORS, noticed, strict=True)]
+
+
+def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[float, float]]:
+    """Of each effect the factor on its size at which it is noticed with 80 % power, by bisection, and its power there.
+
+    Args:
+        effects: at sizes near which that is expected; factors from 1 / `REACH` to `REACH` are looked at.
+    """
+    low, high = np.full(len(effects), 1 / REACH), np.full(len(effects), REACH)
+    power = np.ones(len(effects))
+    for number in range(HALVINGS + 1):
+        factor = high if number == HALVINGS else np.sqrt(low * high)
+        sized = [(columns, k * q) for k, (columns, q) in zip(factor, effects, strict=True)]
+        power = np.array(days.noticed(alpha, sized))
+        if number < HALVINGS:
+            low, high = np.where(power < POWER, factor, low), np.where(power < POWER, high, factor)
+    return [(float(factor), float(share)) for factor, share in zip(high, power, strict=True)]

@@ -50,7 +50,7 @@ from sysid.loop.changes import by_manoeuvre, worse
 from sysid.loop.evidence import Evidence, at_fit
 from sysid.loop.falsifiers import as_report as predictions_of
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
-from sysid.loop.power import Days, false_alarms, power_curve, simulated_days
+from sysid.loop.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
 from sysid.loop.refit import Refit
 from sysid.loop.solver import Solver
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
@@ -208,11 +208,15 @@ def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
 def warnings(result: Result) -> list[str]:
     """What speaks against taking the names as certain."""
     found, alpha = result.search, result.config.thresholds.alpha
-    if found.verdict != "named" or found.excess[1] <= result.prepared.wander.excess_limit(alpha):
+    if found.verdict != "named":
         return []
+    crowd = [f"{', '.join(found.crowd)} cannot be told from it either: more than a class may have for a name to be "
+             "worth much"] if found.crowd else []
+    if found.excess[1] <= result.prepared.wander.excess_limit(alpha):
+        return crowd
     names = " and ".join(one.hypothesis.effect for one in found.accepted)
-    return [f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has another "
-            "form here than in the catalogue, or is imitated by an effect that the catalogue does not have"]
+    return [*crowd, f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has "
+            "another form here than in the catalogue, or is imitated by an effect that the catalogue does not have"]
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
@@ -296,12 +300,12 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
 
 def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
     """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units, and the
-    share of simulated days on which it is noticed."""
+    share of simulated days on which it is noticed there."""
     found = result.search
     limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
     solver = Solver(result.evidence)
     base = base_values(result.full)
-    out, done, sizes = [], set(), []
+    done, tried = set(), []
     for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
         one = result.hypotheses[columns.hypothesis]
         for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
@@ -313,17 +317,14 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
             done.add((one.key, axis.parameter))
             if axis.dependent:
                 continue
-            at = np.array([q if other is axis else 0.0 for other in one.axes])
-            value = one.values(at, base)[axis.parameter]
-            reach = bool(q <= axis.limit)
-            out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
-                        "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
-                        "unit": unit_of(axis.parameter), "power": None})
-            if reach:
-                sizes.append((out[-1], (columns, at)))
-    noticed = days.noticed(result.config.thresholds.alpha, [effect for _, effect in sizes])
-    for (row, _), share in zip(sizes, noticed, strict=True):
-        row["power"] = share
+            tried.append((one, axis, columns, np.array([q if other is axis else 0.0 for other in one.axes])))
+    shares = smallest(days, result.config.thresholds.alpha, [(columns, q) for _, _, columns, q in tried])
+    out = []
+    for (one, axis, _, q), (factor, power) in zip(tried, shares, strict=True):
+        value, reach = one.values(factor * q, base)[axis.parameter], factor * q.max() <= axis.limit and power >= POWER
+        out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
+                    "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
+                    "unit": unit_of(axis.parameter), "power": power})
     return out
 
 

@@ -18,6 +18,7 @@ from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress
 
+LARGEST = 4  # members of a class
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
 
 
@@ -104,6 +105,8 @@ class Search:
     rounds: list[list[Candidate]] = field(default_factory=list)
     accepted: list[Candidate] = field(default_factory=list)
     classes: list[list[str]] = field(default_factory=list)
+    crowd: list[str] = field(default_factory=list)
+    """Effects that look alike too, beyond the `LARGEST` nearest of a class."""
     share: float = 0.0
     excess: tuple[float, float] = (0.0, 0.0)
     """Squared white residual over its number, less 1: before and after."""
@@ -346,8 +349,10 @@ def _decide(
         keep.append(one)
     named = {one.hypothesis.effect for one in keep}
     found.accepted = keep  # what is named beside an effect is told apart from it
-    found.classes = [[name for name in members if name == members[0] or name not in named]
-                     for members in found.classes[: len(keep)]]
+    classes = [[name for name in members if name == members[0] or name not in named]
+               for members in found.classes[: len(keep)]]
+    found.classes = [members[:LARGEST] for members in classes]
+    found.crowd = [name for members in classes for name in members[LARGEST:]]
     if keep:
         found.final, found.share = keep[-1].refit, keep[-1].share
     before, after = excess(found.base), excess(found.final)
@@ -493,7 +498,7 @@ def _class_of(
     best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
     thresholds: Thresholds,
 ) -> list[str]:
-    """Effects that these drives do not tell from the best, at most four: nearly as good a fit, alike signatures, or a
+    """Effects that these drives do not tell from the best: nearly as good a fit, alike signatures, or a
     fit so much better than imitating the best would bring that the truth may lie between the two."""
     mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}
@@ -507,4 +512,4 @@ def _class_of(
         if similar[mine, j] > thresholds.alike:
             near[one.effect] = max(near.get(one.effect, 0.0), float(similar[mine, j]))
     near.pop(best.hypothesis.effect, None)
-    return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])][:4]
+    return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])]
