@@ -26,7 +26,7 @@ FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more
 class Thresholds:
     """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
 
-    alpha: float = 0.01
+    alpha: float = 0.005
     """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
     the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
     alarms."""

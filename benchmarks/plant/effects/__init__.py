@@ -66,7 +66,7 @@ EFFECTS: dict[str, Entry] = {
     "wheel_ripple": Entry(outside.WheelRipple, 1.0, "N m", known=False),
     "soft_patch": Entry(outside.SoftPatch, 12.0, "N", known=False),
     "warm_up": Entry(outside.WarmUp, 2.0, "N m", known=False),
-    "gain_fade": Entry(actuation.GainFade, 0.2, "-", known=False),
+    "gain_fade": Entry(actuation.GainFade, 0.2, "-", known=False, most=0.7),
     "rest_friction": Entry(outside.RestFriction, 1.5, "N m", known=False),
     "command_coupling": Entry(command.CommandCoupling, 0.04, "-", known=False),
     "command_dropouts": Entry(command.CommandDropouts, 0.08, "-", known=False),
