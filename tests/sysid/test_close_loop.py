@@ -11,12 +11,15 @@ from sysid.close_loop import (
     Arguments,
     LoopConfig,
     close_loop,
+    expected_steps,
     main,
     manifest,
     refit_poses,
     vehicle_after,
     vehicle_before,
 )
+from sysid.fit import Arguments as FitArguments
+from sysid.fit import main as fit_main
 from sysid.log import load_log
 from sysid.loop.agreement import disagreement, foretold
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
@@ -77,8 +80,15 @@ def drives(folder):
 
 
 @pytest.fixture(scope="module")
-def sloping(drives):
-    return close_loop(drives["sloping"], (drives["reference_1"], drives["reference_2"]), CONFIG)
+def stages():
+    """What the progress bar was told: steps and stage."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def sloping(drives, stages):
+    return close_loop(drives["sloping"], (drives["reference_1"], drives["reference_2"]), CONFIG,
+                      progress=lambda steps, stage: stages.append((steps, stage)))
 
 
 def test_names_the_slope_and_its_size(sloping):
@@ -86,6 +96,25 @@ def test_names_the_slope_and_its_size(sloping):
     one = sloping.search.accepted[0]
     assert one.hypothesis.effect in ("slope", "wind")  # a constant pull in the room: no drive on one floor splits them
     assert "slope" in sloping.search.classes[0]
+
+
+def test_the_progress_bar_tells_the_stage_and_does_not_run_over(sloping, stages):
+    seen = [stage.split(",")[0] for _, stage in stages]
+    order = ["base fit", "signatures", "base refit", "scan", "scan of pairs", "refits"]
+    assert [seen.index(one) for one in order] == sorted(seen.index(one) for one in order)
+    assert sum(steps for steps, _ in stages) <= expected_steps(CONFIG, 2)
+
+
+def test_a_fit_may_close_the_loop_with_the_same_references(folder, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {"prior": None})
+    monkeypatch.setattr("sysid.fit.parameter_table", lambda _: "")
+    monkeypatch.setattr("sysid.fit.table", lambda _: "")
+    monkeypatch.setattr("sysid.close_loop.run", lambda *given: asked.append(given))
+    fit_main(FitArguments(dataset=folder / "sloping", out=tmp_path, close_loop=True, reference=(folder / "plain",)))
+    [(log, references, out, config)] = asked
+    assert (log.name, [one.name for one in references], out) == ("sloping", ["plain"], tmp_path / "close_loop")
+    assert config.seed == 0
 
 
 def test_finds_nothing_where_nothing_is(drives, sloping):
@@ -182,7 +211,7 @@ def test_a_pull_that_does_not_turn_with_the_room_is_no_slope(sloping):
 def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
     written = manifest(CONFIG, sloping.hypotheses, sloping.reference)
     assert {one["effect"] for one in written["catalogue"]} == {one.effect for one in sloping.hypotheses}
-    assert written["settings"]["seed"] == 0 and written["thresholds"]["alpha"] == 0.01
+    assert written["settings"]["seed"] == 0 and written["thresholds"]["alpha"] == 0.005
     assert set(written["bounds"]) == set(sloping.reference.space.names)
     assert set(written["falsifiers"]) >= {one.effect for one in sloping.hypotheses}
     other = manifest(replace(CONFIG, seed=1), sloping.hypotheses, sloping.reference)
