@@ -59,8 +59,8 @@ class Bench:
         every = np.concatenate([solver.moments[None], moments])
         self.score = every[:, size:] - every[:, :size] @ solver.project[:, size:]  # (1 + N, S)
         self.columns, self.wander = evidence.columns, wander.covariance
-        self.away = [np.concatenate([np.zeros((1, shapes.shape[1])), share @ shapes * np.sqrt(np.diag(covariance))])
-                     for covariance, shapes in zip(wander.covariance, wander.shapes, strict=True)]
+        away = [wander.away(number, share) for number in range(len(wander.shapes))]
+        self.away = [np.concatenate([np.zeros((1, one.shape[1])), one]) for one in away]  # the drives' own is 0
         self.ends = [_ends(one, hypotheses[one.hypothesis]) for one in evidence.columns]
 
     def look(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,8 +109,7 @@ def scan_pairs(
     """
     rng = np.random.default_rng((seed, 2))
     moments = null_moments(evidence, spread, draws, rng)
-    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
-    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    share = wander.draw_shares(draws, rng)
     bench = Bench(evidence, hypotheses, wander, moments, share)
     placed: list[list[int]] = [[] for _ in hypotheses]
     for number, one in enumerate(evidence.columns):

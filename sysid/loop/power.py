@@ -48,9 +48,8 @@ class Days:
             (1, len(products)))
         moments = (added[:, None] + self.moments).reshape(-1, len(products))
         solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
-        for one, covariance, shapes in zip(self.evidence.columns, self.wander.covariance, self.wander.shapes,
-                                           strict=True):
-            away = np.tile(self.share @ shapes * np.sqrt(np.diag(covariance)), (len(added), 1))
+        for number, (one, covariance) in enumerate(zip(self.evidence.columns, self.wander.covariance, strict=True)):
+            away = np.tile(self.wander.away(number, self.share), (len(added), 1))
             found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
             worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
         each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
@@ -78,8 +77,7 @@ def simulated_days(
     """
     rng = np.random.default_rng((seed, SEED))
     moments = null_moments(evidence, spread, draws, rng)
-    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
-    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    share = wander.draw_shares(draws, rng)
     return Days(evidence, hypotheses, wander, scan, moments, share)
 
 

@@ -127,11 +127,10 @@ def run(
     solver = Solver(evidence)
     gain, worth, q = best(solver, hypotheses, wander)
     moments = null_moments(evidence, spread, draws, rng)
-    share = rng.standard_normal((draws, len(wander.shapes[0]))) / np.sqrt(len(wander.shapes[0]))
-    share *= np.sqrt(wander.freedom / rng.chisquare(wander.freedom, size=(draws, 1)))
+    share = wander.draw_shares(draws, rng)
     null = np.zeros((draws, len(hypotheses)))
-    for columns, covariance, shapes in zip(evidence.columns, wander.covariance, wander.shapes, strict=True):
-        away = share @ shapes * np.sqrt(np.diag(covariance))
+    for number, (columns, covariance) in enumerate(zip(evidence.columns, wander.covariance, strict=True)):
+        away = wander.away(number, share)
         found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, moments, away)
         null[:, columns.hypothesis] = np.maximum(null[:, columns.hypothesis], found.worth)
     p = np.array([tail(null[:, h], worth[h]) for h in range(len(hypotheses))])

@@ -56,6 +56,16 @@ class Wander:
         mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
         return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
 
+    def draw_shares(self, draws: int, rng: np.random.Generator) -> np.ndarray:
+        """(N, D) of each reference day's apparent effects in simulated days, heavy-tailed as few days ask for."""
+        days = len(self.shapes[0])
+        share = rng.standard_normal((draws, days)) / np.sqrt(days)
+        return share * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(draws, 1)))
+
+    def away(self, column: int, share: np.ndarray) -> np.ndarray:
+        """(N, k) apparent coordinates of one of the evidence's columns on days with these shares (N, D)."""
+        return share @ self.shapes[column] * np.sqrt(np.diag(self.covariance[column]))
+
     def of(self, kept: Sequence[bool]) -> Wander:
         """Of some of the evidence's columns only."""
         return replace(self, covariance=tuple(compress(self.covariance, kept)),
