@@ -92,6 +92,7 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
     Control periods, updates and the horizon in seconds stay what they are; what counts decisions is scaled. A batch has
     as many steps as before, in sequences of about the same time, so that learning begins as early.
     """
+    task = dataclasses.replace(preset.task, action_repeat=repeat)  # a number below 1 is refused here
     factor = repeat / preset.task.action_repeat
     learner = preset.learner
     length = max(8, round(learner.batch_length / factor))
@@ -105,7 +106,7 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
     )
     return dataclasses.replace(
         preset,
-        task=dataclasses.replace(preset.task, action_repeat=repeat),
+        task=task,
         learner=learner,
         total_steps=round(preset.total_steps / factor),
         eval_every=max(1, round(preset.eval_every / factor)),

@@ -17,7 +17,7 @@ from whill_mjx.intervals import wilson_interval
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.task import Corridor, ObstacleCourse
 from whill_mjx.train import Stopper, TrainOptions, choose_preset, keep_best, main, prepare_vehicle, read_best
-from whill_mjx.training import find_preset, functional_env
+from whill_mjx.training import find_preset, functional_env, with_repeat
 
 
 @pytest.fixture(scope="module")
@@ -233,3 +233,22 @@ def test_wilson_interval_known_values():
     np.testing.assert_allclose(wilson_interval(98, 100), (0.930, 0.9945), atol=5e-4)
     low, high = wilson_interval(0, 20)
     assert low == pytest.approx(0.0, abs=1e-12) and 0.15 < high < 0.17
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ["paper", "cpu"])
+@pytest.mark.parametrize("factor", [2, 4])
+def test_a_longer_hold_keeps_the_budget_in_control_periods(name, factor):
+    short = find_preset(name, "obstacle_course")
+    long = with_repeat(short, factor * short.task.action_repeat)
+    assert long.total_steps * long.task.action_repeat == short.total_steps * short.task.action_repeat
+    assert long.learner.horizon * factor == short.learner.horizon
+    updates = [one.total_steps * one.learner.train_ratio / one.learner.replayed_per_update for one in (short, long)]
+    assert updates[1] == pytest.approx(updates[0], rel=0.05)
+    assert long.learner.learning_starts * factor == pytest.approx(short.learner.learning_starts, abs=factor)
+
+
+@pytest.mark.quick
+def test_a_decision_must_hold():
+    with pytest.raises(ValueError, match="action_repeat 0"):
+        with_repeat(find_preset("paper", "obstacle_course"), 0)
