@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
         TrainOptions(
             out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
-            action_repeat=options.repeat,
+            action_repeat=options.repeat, export="best" if options.preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip

@@ -92,8 +92,9 @@ class TrainOptions:
     """none (the task's reward alone), smooth (gentle commands) or safe (gentle commands and a distance kept)."""
     stop_success: float | None = None
     """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
-    export: Literal["last", "best"] = "last"
-    """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run."""
+    export: Literal["last", "best"] = "best"
+    """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run. The others
+    become RUN/policy_best or RUN/policy_last, where they differ."""
     tensorboard: bool = False
     """Write the curves of the world model's training for TensorBoard too, to RUN/tensorboard (needs tensorboardX)."""
     devices: int | None = None
@@ -130,11 +131,13 @@ def main(options: TrainOptions) -> dict[str, Any]:
     if not parallel.is_first_process():
         return {}
     best = best_params(options, preset, result) if options.learner == "dreamer" else None
-    chosen = best if options.export == "best" and best is not None else result
+    chosen, other, name = result, best, "policy_best"
+    if options.export == "best" and best is not None:
+        chosen, other, name = best, result, "policy_last"
     evaluation = evaluate_policy(options, preset, vehicle, chosen)
     policy = export(options, preset, vehicle, chosen, options.out / "policy")
-    if best is not None and chosen is not best:
-        export(options, preset, vehicle, best, options.out / "policy_best")
+    if other is not None:
+        export(options, preset, vehicle, other, options.out / name)
     seconds = time.perf_counter() - started
     evaluation["seconds"] = {"this_command": seconds, "training": result.wall_s}
     write_json(options.out / "evaluation.json", evaluation)

@@ -41,6 +41,7 @@ def test_a_run_leaves_everything_a_user_needs(run):
         path.name for path in (options.out / "policy").iterdir()
     }
     assert json.loads((options.out / "evaluation.json").read_text())["policy"]["episodes"] == 8
+    assert evaluation["env_steps"] == json.loads((options.out / "best.json").read_text())["env_steps"]
     for driver in ("policy", "random"):
         figures = evaluation[driver]
         for name in ("return", "min_clearance_m", "path_length_m", "command_change_rad_s2", "near_misses"):
