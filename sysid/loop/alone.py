@@ -62,10 +62,8 @@ def doubts(
     found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds
 ) -> list[str]:
     """What speaks against each named effect, in words."""
-    fit, start, out = found.final, 0, []
-    for one in fit.hypotheses:
-        part = slice(start, start + len(one.axes))
-        start = part.stop
+    fit, out = found.final, []
+    for one, part in zip(fit.hypotheses, fit.parts, strict=True):
         differ = disagreement(fit, part, groups, precision)
         told = foretold(fit, part, groups, precision)
         lost = float(-told[told < 0].sum())

@@ -181,11 +181,9 @@ def put_to_test(
     """
     features = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
     course = course_of(trials, features[0], refitter.drives.features.width, track)
-    seen, start = refitter.drives.mask > 0, 0
+    seen = refitter.drives.mask > 0
     out: list[list[Tested]] = []
-    for number, one in enumerate(fit.hypotheses):
-        part = slice(start, start + len(one.axes))
-        start = part.stop
+    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
         change = features[0] - features[1 + number]  # (B, K, C)
         energy = np.square(refitter.white(change)).reshape(seen.shape).sum(-1)
         tested = FALSIFIERS.get(one.effect, ())
@@ -205,9 +203,8 @@ def put_to_test(
 
 def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:
     """All parameters of a joint fit without one effect, for each of them."""
-    ends = np.cumsum([0, *(len(one.axes) for one in fit.hypotheses)])
-    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u,
-                               np.delete(fit.q, np.arange(ends[i], ends[i + 1]))) for i in range(len(fit.hypotheses))]
+    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
+            for i, part in enumerate(fit.parts)]
 
 
 def sizes_in_parts(

@@ -44,11 +44,9 @@ def stand(
     p_excess: Callable[[float], float],
 ) -> list[Stood]:
     """The evidence for each effect of the final fit, in its order."""
-    fit, start, out = found.final, 0, []
+    fit, out = found.final, []
     tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
-    for number, one in enumerate(fit.hypotheses):
-        part = slice(start, start + len(one.axes))
-        start = part.stop
+    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
         sizes, errors = sizes_apart(fit, part, groups, refitter.precision)
         told = foretold(fit, part, groups, refitter.precision)
         out.append(Stood(one.effect, sizes, errors, heterogeneity(sizes, errors), told, interval_of_sum(told),

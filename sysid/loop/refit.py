@@ -49,11 +49,17 @@ class Refit:
         """Coordinates of each hypothesis."""
         return list(np.split(self.q, np.cumsum([len(one.axes) for one in self.hypotheses])[:-1]))
 
+    @property
+    def parts(self) -> list[slice]:
+        """Where the coordinates of each hypothesis lie within q."""
+        ends = np.cumsum([0, *(len(one.axes) for one in self.hypotheses)]).tolist()
+        return [slice(start, stop) for start, stop in zip(ends[:-1], ends[1:], strict=True)]
+
 
 def moved_last(fit: Refit, number: int) -> Refit:
     """The same joint fit with one of its hypotheses last."""
-    ends, size = np.cumsum([0, *(len(one.axes) for one in fit.hypotheses)]), len(fit.u)
-    mine = list(range(ends[number], ends[number + 1]))
+    part, size = fit.parts[number], len(fit.u)
+    mine = list(range(part.start, part.stop))
     order = [*(i for i in range(len(fit.q)) if i not in mine), *mine]
     kept = (*fit.hypotheses[:number], *fit.hypotheses[number + 1 :], fit.hypotheses[number])
     columns = [*range(size), *(size + i for i in order)]

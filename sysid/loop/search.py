@@ -316,9 +316,7 @@ def _own(
 
 def _most_apart(fit: Refit, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:
     """Largest disagreement of manoeuvres on the size of an effect in a fit."""
-    ends = np.cumsum([0, *(len(one.axes) for one in fit.hypotheses)])
-    return max((disagreement(fit, slice(start, stop), groups, precision)
-                for start, stop in zip(ends[:-1], ends[1:], strict=True)), default=0.0)
+    return max((disagreement(fit, part, groups, precision) for part in fit.parts), default=0.0)
 
 
 def _within(ratio: float, factor: float) -> bool:

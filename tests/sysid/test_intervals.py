@@ -63,16 +63,19 @@ def designs(random: np.random.Generator) -> np.ndarray:
     return 30 * np.stack([size * t, size * np.sin(20 * t), third * np.ones_like(t)], axis=-1)
 
 
+def covered(objective: Linear) -> tuple[list[bool], np.ndarray]:
+    """Whether the interval of each parameter holds the truth, 0.5, and the fit (P,)."""
+    u = gradient.fit(objective, objective.space, iterations=4).u
+    return [one.low <= 0.5 <= one.high for one in uncertainty.estimate(objective, u).estimates], u
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_intervals_of_correlated_errors_cover_nine_in_ten(rho):
     random = np.random.default_rng(1)
     inside = []
     for _ in range(400):
-        objective = Linear(designs(random), correlated(random, rho))
-        u = gradient.fit(objective, objective.space, iterations=4).u
-        known = uncertainty.estimate(objective, u)
-        inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
+        inside.append(covered(Linear(designs(random), correlated(random, rho)))[0])
     share = np.mean(inside, axis=0)
     assert (share > 0.86).all() and (share < 0.94).all()
 
@@ -113,9 +116,8 @@ def test_what_replicates_share_widens_intervals_until_they_hold():
     inside, narrow = [], []
     for _ in range(300):
         objective = Linear(design, correlated(random, 0.5) + misfit(random))
-        u = gradient.fit(objective, objective.space, iterations=4).u
-        known = uncertainty.estimate(objective, u)
-        inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
+        held, u = covered(objective)
+        inside.append(held)
         shared = uncertainty.shared_error(objective.residuals(u[None])[0], np.arange(DRIVES) // 2)
         narrow.append(shared > uncertainty.CHANCE)
     assert np.mean(narrow) < 0.05
