@@ -210,7 +210,7 @@ def close_loop(
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
         nulls = run_null_refits(evidence, found, refitter, ready.wander, outcome.scan, config.thresholds,
-                                config.refit_nulls, config.seed, progress)
+                                config.refit_nulls, config.seed, progress, outcome.pairs)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     alone = stands_alone(log.training, reference.known)
     if alone:

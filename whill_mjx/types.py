@@ -73,6 +73,7 @@ class Motion:
     contact_axes: jax.Array  # the same at each contact, (3, 3, 4); (3, 3) where the ground has no surfaces
     contact_points: tuple  # x (4,), y (4,), z (4,) or () of the contact patches, chassis frame [m]
     rotation: jax.Array  # (3, 3) chassis to world
+    position: jax.Array  # (2,) x and y of the chassis origin in the room [m]
     velocity: jax.Array  # (3,) of the chassis origin, chassis frame [m/s]
     angular_velocity: jax.Array  # (3,) chassis frame [rad/s]
     contact_vx: jax.Array  # (4,) forward speed of the chassis at the contact patches [m/s]

@@ -193,6 +193,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         contact_axes=under.contact_axes,
         contact_points=under.contact_points,
         rotation=rotation,
+        position=state.qpos[:2],
         velocity=velocity,
         angular_velocity=rate,
         contact_vx=along(forward),

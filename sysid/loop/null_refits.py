@@ -9,17 +9,19 @@ drives would raise a false alarm, and calibrate its p-value without the assumpti
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit, white_leftover
+from sysid.loop.pairs import PairScan, scan_again
 from sysid.loop.reference import alike
-from sysid.loop.refit import Refitter
+from sysid.loop.refit import Refit, Refitter
 from sysid.loop.scan import Scan, best, drawn_away, family, tail
-from sysid.loop.search import Search, Thresholds, refitted
+from sysid.loop.search import Search, Thresholds, pair_round, refitted
 from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress
@@ -47,12 +49,14 @@ class NullRefits:
 def run(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
     thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
+    pairs: PairScan | None = None,
 ) -> NullRefits:
     """Simulate and judge `count` days.
 
     Args:
         evidence: of the drives in question around the reference, as `gather` made it.
         scan: of the drives in question: its linear nulls are what the first look at each day is held against.
+        pairs: likewise of pairs of effects; None where pairs do not decide.
     """
     reference, measured = refitter.reference, float((refitter.drives.mask > 0).sum())
     rng = np.random.default_rng((seed, 1))
@@ -71,10 +75,26 @@ def run(
                                   lambda _: 0.0, lambda _: None)
             p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
         excess = float(np.square(base.residual).sum()) / measured - 1
-        alarms += bool(p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha)
+        alarm = p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha
+        if not alarm and pairs is not None:
+            again = scan_again(pairs, around, hypotheses, wander)
+            if again.p_family < thresholds.alpha:
+                day = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
+                             pairs=again)
+                pair_round(day, around, hypotheses, one, wander, similar, thresholds,
+                           partial(_explained, base, measured, thresholds), set())
+                alarm = bool(day.accepted)
+                p[n] = min(p[n], day.p_value) if alarm else p[n]
+        alarms += bool(alarm)
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")
     return NullRefits(p, alarms)
+
+
+def _explained(base: Refit, measured: float, thresholds: Thresholds, fit: Refit) -> float:
+    """Share of the excess of the base fit that another fit removes, as `sysid.loop.search.search` counts it."""
+    before, after = (float(np.square(one.residual).sum()) / measured - 1 for one in (base, fit))
+    return float(np.clip((before - after) / max(before, thresholds.excess), 0.0, 1.0))
 
 
 def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresholds) -> Search:

@@ -192,6 +192,12 @@ def wrench(one: dict[str, Any]) -> str:
     drawn = []
     for name, title in (("force", "force forward"), ("torque", "torque to the left")):
         values = np.asarray(one["values"][name])
+        if z.ndim == 2:  # a map: a line over x for every row
+            lines = [Line(z[z[:, 1] == y, 0], values[z[:, 1] == y], f"y = {y:.2f} m", markers=True)
+                     for y in np.unique(z[:, 1])]
+            drawn.append(line_chart(lines, "x in the room [m]", f"{name} [{units[name]}]",
+                                    f"{title}{', times the direction of motion' if one['kind'] == 'brake' else ''}"))
+            continue
         line = Line(z, np.append(values, values[0]) if one["periodic"] else values, markers=True)
         drawn.append(line_chart([line], f"{one['quantity']} [{units['quantity']}]", f"{name} [{units[name]}]",
                                 f"{title}{', times the direction of motion' if one['kind'] == 'brake' else ''}"))

@@ -8,7 +8,7 @@ base model, worth with what each wanders from day to day, and p-values from the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -35,6 +35,7 @@ class PairScan:
     q: tuple[np.ndarray, ...]  # coordinates of the first member, then of the second
     p: np.ndarray  # (M,) p-value of each pair by itself
     smallest: np.ndarray  # (N,) smallest p-value of each null
+    null: np.ndarray  # (N, M) worth on simulated nulls
 
     @property
     def p_family(self) -> float:
@@ -110,23 +111,40 @@ def scan_pairs(
     rng = np.random.default_rng((seed, 2))
     moments = null_moments(evidence, spread, draws, rng)
     share = wander.draw_shares(draws, rng)
-    bench = Bench(evidence, hypotheses, wander, moments, share)
+    members = tuple((i, j) for i, j in combinations(range(len(hypotheses)), 2)
+                    if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike)
+    gain, worth, found, null = _looked(Bench(evidence, hypotheses, wander, moments, share), hypotheses, members)
+    p, smallest = np.ones(len(members)), np.ones(draws)
+    for m in range(len(members)):
+        p[m] = float(tail(null[:, m], worth[m]))
+        smallest = np.minimum(smallest, tail(null[:, m], null[:, m]))
+    return PairScan(members, gain, worth, found, p, smallest, null)
+
+
+def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander) -> PairScan:
+    """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
+    nothing = np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0])))
+    gain, worth, found, _ = _looked(Bench(evidence, hypotheses, wander, *nothing), hypotheses, first.members)
+    p = np.array([float(tail(first.null[:, m], worth[m])) for m in range(len(first.members))])
+    return replace(first, gain=gain, worth=worth, q=found, p=p)
+
+
+def _looked(
+    bench: Bench, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
+    """Gain (M,), worth (M,) and coordinates of pairs at the levels of their highest worth; worth (N, M) on nulls."""
     placed: list[list[int]] = [[] for _ in hypotheses]
-    for number, one in enumerate(evidence.columns):
+    for number, one in enumerate(bench.columns):
         placed[one.hypothesis].append(number)
-    members = [(i, j) for i, j in combinations(range(len(hypotheses)), 2)
-               if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike]
-    gain, worth, found, p = np.zeros(len(members)), np.zeros(len(members)), [], np.ones(len(members))
-    smallest = np.ones(draws)
+    gain, worth, found = np.zeros(len(members)), np.zeros(len(members)), []
+    null = np.zeros((len(bench.score) - 1, len(members)))
     for number, (i, j) in enumerate(members):
-        most, best = np.zeros(draws), np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes))
+        best = np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes))
         for a in placed[i]:
             for b in placed[j]:
                 gains, worths, q = bench.look(a, b)
-                most = np.maximum(most, worths[1:])
+                null[:, number] = np.maximum(null[:, number], worths[1:])
                 if worths[0] > worth[number]:
                     gain[number], worth[number], best = gains[0], worths[0], q[0]
         found.append(best)
-        p[number] = float(tail(most, worth[number]))
-        smallest = np.minimum(smallest, tail(most, most))
-    return PairScan(tuple(members), gain, worth, tuple(found), p, smallest)
+    return gain, worth, tuple(found), null

@@ -7,7 +7,7 @@
     effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
                       p_value, equation, evidence
     before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
-                      noise_floor of the same where there are replicates
+                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
     by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
@@ -127,10 +127,10 @@ def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Pred
 
 
 def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> dict[str, Any]:
-    """part -> channel -> metric -> mean RMSE, with the noise floor."""
+    """part -> channel -> metric -> mean RMSE, with the noise floor of the same trials."""
     out: dict[str, Any] = {}
     for part, held in (("training", False), ("held_out", True)):
-        floor = noise_floor(tuple(t for t in trials if t.held_out is held))
+        floor = own_floor(trials, held)
         out[part] = {}
         for channel in dict.fromkeys(row["channel"] for row in rows):
             mine = [row for row in rows if row["channel"] == channel and row["held_out"] is held]
@@ -139,6 +139,23 @@ def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> 
             out[part][channel] = {metric: float(np.mean(values)) for metric, values in means.items() if values}
             if floor and mine:
                 out[part][channel]["noise_floor"] = floor.get(channel)
+    return out
+
+
+def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
+    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
+
+    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
+    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
+    """
+    floors = [floor for one in trials if one.held_out is held_out
+              if (floor := noise_floor(tuple(t for t in trials if t.manoeuvre == one.manoeuvre)))]
+    out: dict[str, dict[str, float | None]] = {}
+    for channel in floors[0] if floors else ():
+        out[channel] = {}
+        for metric in floors[0][channel]:
+            values = [value for each in floors if (value := each[channel][metric]) is not None]
+            out[channel][metric] = float(np.mean(values)) if values else None
     return out
 
 

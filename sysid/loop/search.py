@@ -195,7 +195,7 @@ def search(
     calm = bool(found.accepted) and wander.p_excess(excess(current)) > thresholds.quiet
     if not calm or found.accepted[-1].share < thresholds.share:
         tried = set() if calm else {one.hypothesis.effect for one in found.accepted}
-        _pair_round(found, evidence, hypotheses, refitter, wander, similar, thresholds, explained, tried)
+        pair_round(found, evidence, hypotheses, refitter, wander, similar, thresholds, explained, tried)
         report("refits of pairs")
     _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial,
             lambda fit: _most_apart(fit, evidence.groups, refitter.precision))
@@ -230,7 +230,7 @@ def _drop_stand_ins(
             return
 
 
-def _pair_round(
+def pair_round(
     found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
     similar: np.ndarray, thresholds: Thresholds, explained: Callable[[Refit], float], tried: set[str],
 ) -> None:

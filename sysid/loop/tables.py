@@ -14,13 +14,21 @@ import numpy as np
 
 from sysid.loop.terms import HARMONICS, Term, columns_of, forward_selection, library
 from sysid.loop.unexplained import PHASES, WHEELS, align, wave_turns
-from whill_mjx.effects.unnamed import KNOTS, PERIODIC, QUANTITIES
+from whill_mjx.effects.unnamed import ACROSS, KNOTS, MAP, PERIODIC, QUANTITIES
 
 SMOOTHING = (0.01, 0.1, 1.0, 10.0)
 """Weights of the tables' second differences that are tried, as shares of what the drives tell of a knot."""
 SHRINK = 0.01  # of that weight, on the tables themselves
 MOST_TERMS = 3
 WORTH = 0.05  # share of the held-back gain that a further term must add
+
+
+ROWS = KNOTS // ACROSS  # of a map
+
+
+def _bends(count: int) -> np.ndarray:
+    """(count - 2, count) second differences."""
+    return np.diff(np.eye(count), 2, axis=0)
 
 
 @dataclass(frozen=True)
@@ -31,20 +39,35 @@ class Table:
     kind: str
     low: float
     high: float
+    low_y: float = 0.0
+    high_y: float = 1.0
 
     @property
     def knots(self) -> np.ndarray:
-        """(KNOTS,) values of the quantity."""
+        """(KNOTS,) values of the quantity; of a map (KNOTS, 2) x and y."""
         if self.quantity in PERIODIC:
             return np.arange(KNOTS) * 2 * np.pi / KNOTS
+        if self.quantity == MAP:
+            across, rows = np.linspace(self.low, self.high, ACROSS), np.linspace(self.low_y, self.high_y, ROWS)
+            return np.stack([np.tile(across, ROWS), np.repeat(rows, ACROSS)], axis=-1)
         return np.linspace(self.low, self.high, KNOTS)
+
+    @property
+    def roughness(self) -> np.ndarray:
+        """(KNOTS, KNOTS) of a table: sum of squares of its second differences, of a map's along both ways, and a bit
+        of its own."""
+        if self.quantity == MAP:
+            bend = np.concatenate([np.kron(np.eye(ROWS), _bends(ACROSS)), np.kron(_bends(ROWS), np.eye(ACROSS))])
+        else:
+            bend = _bends(KNOTS)
+        return np.asarray(bend.T @ bend + SHRINK * np.eye(KNOTS))
 
     def parameters(self, wrench: np.ndarray, start: float = 0.0) -> dict[str, float]:
         """Parameters of the effect for a table (2 KNOTS,) of forces [N], then torques [N m], and a wheel's start
         angle [rad]."""
         number = list(QUANTITIES).index(self.quantity) + 1
-        found = {"quantity": float(number), "low": self.low, "high": self.high,
-                 "with_motion": float(self.kind == "brake"), "start_angle": start}
+        found = {"quantity": float(number), "low": self.low, "high": self.high, "low_y": self.low_y,
+                 "high_y": self.high_y, "with_motion": float(self.kind == "brake"), "start_angle": start}
         for k in range(KNOTS):
             found[f"force_{k + 1}"] = float(wrench[k])
             found[f"torque_{k + 1}"] = float(wrench[KNOTS + k])
@@ -94,26 +117,24 @@ def multiplied(
                     np.array([float(r @ r) for r in rest]))
 
 
-def penalties(products: Products, precision: np.ndarray, smoothing: float) -> np.ndarray:
+def penalties(products: Products, precision: np.ndarray, smoothing: float, table: Table) -> np.ndarray:
     """(P + S, P + S) prior: base parameters by their spread, tables by their second differences."""
     size = len(precision)
     out = np.zeros(products.matrix.shape[1:])
     out[:size, :size] = precision
-    bend = np.diff(np.eye(KNOTS), 2, axis=0)
-    rough = bend.T @ bend + SHRINK * np.eye(KNOTS)
     told = np.diag(products.matrix.sum(0))[size:]
     for half in range(2):
         part = slice(size + half * KNOTS, size + (half + 1) * KNOTS)
         weight = max(float(told[half * KNOTS : (half + 1) * KNOTS].mean()), 1e-9)
-        out[part, part] = smoothing * weight * rough
+        out[part, part] = smoothing * weight * table.roughness
     return out
 
 
-def held_back(products: Products, precision: np.ndarray) -> tuple[np.ndarray, float]:
+def held_back(products: Products, precision: np.ndarray, table: Table) -> tuple[np.ndarray, float]:
     """Gain (G,) of the tables on each group when fitted to the others, and the smoothing that does best."""
     best: tuple[np.ndarray, float] | None = None
     for smoothing in SMOOTHING:
-        gains = gains_without(products, penalties(products, precision, smoothing), len(precision))
+        gains = gains_without(products, penalties(products, precision, smoothing, table), len(precision))
         if best is None or gains.sum() > best[0].sum():
             best = gains, smoothing
     assert best is not None
@@ -133,7 +154,10 @@ def gains_without(products: Products, penalty: np.ndarray, size: int) -> np.ndar
 
 
 def few_terms(products: Products, precision: np.ndarray, table: Table) -> tuple[np.ndarray, tuple[Term, ...]]:
-    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the other groups."""
+    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the other groups; none for a map.
+    """
+    if table.quantity == MAP:
+        return np.full(len(products.square), -np.inf), ()
     terms = library(table.knots, table.quantity in PERIODIC)
     basis, parts = columns_of(terms, table.knots)
     mapped, size = products.mapped(basis), len(precision)

@@ -33,7 +33,7 @@ from sysid.loop.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.metrics import Prediction
 from sysid.rollout import Plant, Replay, make_batch, predictions
 from whill_mjx.effects import make_effect
-from whill_mjx.effects.unnamed import KNOTS, PERIODIC, QUANTITIES
+from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.types import VehicleParams
 
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 KINDS = ("push", "brake")
 """A wrench whatever the motion, or one that turns with its direction."""
+ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
+"""Quantities that only an outside pose tells; replicates, which start elsewhere, differ in them."""
 REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
 FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
 LEAST = 0.1
@@ -196,11 +198,11 @@ def fit_unnamed(bench: Bench) -> Unnamed:
     firsts = [group[0] for group in groups]
     screened = []
     for table in tables(result):
-        chosen = firsts if table.quantity != "heading in the room" else sum(groups, [])
+        chosen = firsts if table.quantity not in ROOM else sum(groups, [])
         split = [[i] for i in range(len(firsts))] if chosen is firsts else _positions(groups)
         columns, _ = turned(table, bench.columns(table, chosen), residual[chosen])
         products = multiplied(residual[chosen], jacobian[chosen], columns, split)
-        gains, _ = held_back(products, result.evidence.precision)
+        gains, _ = held_back(products, result.evidence.precision, table)
         gains = gains - price(table, split)
         screened.append((float(gains.sum()) * len(residual) / len(chosen), table))
     screened.sort(key=lambda one: -one[0])
@@ -208,7 +210,7 @@ def fit_unnamed(bench: Bench) -> Unnamed:
     for _, table in screened[:FINALISTS]:
         columns, phases = turned(table, bench.columns(table, range(len(residual))), residual)
         products = multiplied(residual, jacobian, columns, groups)
-        gains, smoothing = held_back(products, result.evidence.precision)
+        gains, smoothing = held_back(products, result.evidence.precision, table)
         gains = gains - price(table, groups)
         fitted.append(Fit(table, gains, smoothing, products, columns, phases))
     best = max(fitted, key=lambda one: float(one.gains.sum()))
@@ -223,13 +225,22 @@ def tables(result: Result) -> list[Table]:
     trials = result.log.training
     speeds = [trial.odometry.v if trial.odometry is not None else trial.command.v for trial in trials]
     rates = [trial.odometry.omega if trial.odometry is not None else trial.command.omega for trial in trials]
-    ranges = {"time in the drive": (0.0, max(trial.duration for trial in trials))}
+    ranges: dict[str, tuple[float, ...]] = {"time in the drive": (0.0, max(trial.duration for trial in trials))}
     for name, series in (("speed", speeds), ("yaw rate", rates)):
-        low, high = np.quantile(np.concatenate(series), [0.002, 0.998])
-        ranges[name] = (float(low), float(max(high, low + 0.05)))
+        ranges[name] = _range(np.concatenate(series))
     ranges |= {name: (0.0, end) for name, end in REST_RANGE.items()}
-    found = [name for name in QUANTITIES if name != "heading in the room" or any(t.ground_truth for t in trials)]
+    seen = [trial.ground_truth for trial in trials if trial.ground_truth is not None]
+    places = [_range(np.concatenate([getattr(one, name) for one in seen])) for name in "xy"] if seen else []
+    if seen:
+        ranges |= {"x in the room": places[0], "y in the room": places[1], MAP: (*places[0], *places[1])}
+    found = [name for name in QUANTITIES if name not in ROOM or seen]
     return [Table(name, kind, *ranges.get(name, (0.0, 1.0))) for name in found for kind in KINDS]
+
+
+def _range(series: np.ndarray) -> tuple[float, float]:
+    """What nearly all of a quantity's values lie in."""
+    low, high = np.quantile(series, [0.002, 0.998])
+    return float(low), float(max(high, low + 0.05))
 
 
 def price(table: Table, groups: Sequence[Sequence[int]]) -> np.ndarray:
@@ -249,7 +260,7 @@ def _replayed(
     """The best table, or the few terms that stand for it, brought to its optimum by replays."""
     result, precision, table = bench.result, bench.result.evidence.precision, best.table
     size, gains = len(precision), best.gains
-    penalty, basis = penalties(best.products, precision, best.smoothing), np.eye(2 * KNOTS)
+    penalty, basis = penalties(best.products, precision, best.smoothing, table), np.eye(2 * KNOTS)
     chosen: tuple[Term, ...] = ()
     short = few_terms(best.products, precision, table)
     less = short[0] - price(table, groups)

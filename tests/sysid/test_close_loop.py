@@ -31,8 +31,9 @@ from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
+from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.report import make_report, replay, warnings, write_run
+from sysid.loop.report import make_report, own_floor, replay, warnings, write_run
 from sysid.loop.search import Candidate, Thresholds, _own
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
@@ -142,6 +143,32 @@ def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sl
     weak = replace(result.search, excess=(0.0, 0.0))
     assert checked(weak, often, result.prepared.wander, CONFIG.thresholds).verdict == "none"
     assert not weak.accepted
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(sloping, monkeypatch, accepted):
+    def rounds(found, *_):
+        if accepted:
+            found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
+
+    monkeypatch.setattr("sysid.loop.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
+    monkeypatch.setattr("sysid.loop.null_refits.pair_round", rounds)
+    nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
+                            sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
+    assert nulls.alarms == (2 if accepted else 0)
+    assert (nulls.p == 1e-4).all() == accepted
+
+
+def test_the_noise_floor_is_that_of_the_same_manoeuvres(sloping):
+    """A single held-out drive has its replicates among the training trials."""
+    trials = (*sloping.log.training, *sloping.log.held_out)
+    single = next(t for t in sloping.log.training if t.manoeuvre == "circle")
+    kept = tuple(replace(t, held_out=True) if t is single else t for t in sloping.log.training)
+    circles = own_floor(tuple(replace(t, held_out=True) for t in trials if t.manoeuvre == "circle"), True)
+    assert own_floor(kept, True)["ground_truth"] == pytest.approx(circles["ground_truth"])
+    eights = tuple(t for t in trials if t.held_out)
+    assert own_floor(trials, True)["odometry"] == pytest.approx(own_floor(eights, True)["odometry"])
+    assert own_floor((single,), False) == {}
 
 
 def test_a_name_that_leaves_more_than_days_differ_by_comes_with_a_warning(sloping):

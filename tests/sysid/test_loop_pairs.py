@@ -8,7 +8,7 @@ import pytest
 
 from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import Evidence, column_layout
-from sysid.loop.pairs import scan_pairs, tail
+from sysid.loop.pairs import scan_again, scan_pairs, tail
 from sysid.loop.power import false_alarms, power_curve, simulated_days
 from sysid.loop.refit import Refit, moved_last
 from sysid.loop.report import detectable
@@ -55,6 +55,17 @@ def test_two_effects_that_hide_one_another_are_found_together(wander):
     assert pairs.gain[best] > 2 * alone.gain.max()
     assert pairs.p_family < 0.01 and pairs.p_family < alone.p_family
     assert pairs.q[best] == pytest.approx([1.0, -1.0], abs=0.4)
+
+
+def test_other_drives_are_held_against_the_nulls_of_a_scan_made_before(wander):
+    first = pairs_of(drives(np.zeros(4), close=0.97), wander)
+    hidden = drives((1.0, -1.0, 0.0, 0.0), close=0.97)
+    again, afresh = scan_again(first, hidden, EFFECTS, wander), pairs_of(hidden, wander)
+    np.testing.assert_allclose(again.gain, afresh.gain)
+    np.testing.assert_allclose(again.worth, afresh.worth)
+    assert again.p_family < 0.01 < first.p_family
+    same = scan_again(first, drives(np.zeros(4), close=0.97), EFFECTS, wander)
+    np.testing.assert_allclose(same.p, first.p)
 
 
 def test_pairs_of_nothing_have_no_small_p_values(wander):

@@ -14,17 +14,18 @@ from sysid.loop.page import wrench as wrench_section
 from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
 from sysid.loop.terms import Term, columns_of, in_words
 from sysid.loop.unexplained import PHASES, align, wave_turns
-from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, vehicle_of, with_start_angles
+from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, tables, vehicle_of, with_start_angles
 from sysid.rollout import vehicle_plant
 from sysid.space import make_space
 from whill_mjx.config import VehicleConfig
-from whill_mjx.effects.unnamed import KNOTS
+from whill_mjx.effects.unnamed import KNOTS, MAP
 from whill_mjx.parameters import get_values
 from whill_mjx.presets import preset
 from whill_mjx.vehicle_file import load_vehicle, save_vehicle
 
 quick = pytest.mark.quick
 TIME = 9.0
+ROOM = 2.0  # m, of which the drives cover a square about their start
 DRIVES = ("straight", "turn", "circle", "s_curve", "reversal")
 ANGLES = np.arange(KNOTS) * 2 * np.pi / KNOTS
 
@@ -32,7 +33,7 @@ ANGLES = np.arange(KNOTS) * 2 * np.pi / KNOTS
 def trial_of(name, heading):
     t = np.arange(0.0, TIME + 1e-9, 0.05)
     return Trial(f"{name}_1", name, make_command(name, 0.5, 0.8, TIME - 2.0), OdometryStream(t, None, None, None, t, t),
-                 PoseStream(t, t, t, t), Start(yaw=heading))
+                 PoseStream(t, ROOM * np.cos(t), ROOM * np.sin(t), t), Start(yaw=heading))
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +107,21 @@ def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_an
     text = as_report(found)["symbolic"]["force"]
     assert "sin(z)" in text  # counted from where the wave rises through zero, and so are the starts
     np.testing.assert_allclose(np.cos(found.angles - PHASES[starts]), 1.0, atol=0.1)
+
+
+def test_soft_places_in_the_room_are_fitted_on_a_map(bench, monkeypatch):
+    truth = Table(MAP, "brake", -ROOM, ROOM, -ROOM, ROOM)
+    assert {MAP, "x in the room", "y in the room"} <= {one.quantity for one in tables(bench.result)}
+    soft = np.where(truth.knots.prod(-1) > 0, -60.0, 0.0)  # two corners: neither x nor y by itself tells them
+    measure(bench, truth, np.concatenate([soft, np.zeros(KNOTS)]))
+    monkeypatch.setattr("sysid.loop.unnamed.tables", lambda _: [truth])  # five drives are too few to choose by,
+    monkeypatch.setattr("sysid.loop.tables.SMOOTHING", (0.01,))  # the smoothing too
+    found = fit_unnamed(bench)
+    assert found.cost[1] < 1.1 < 1.3 < found.cost[0] and not found.terms
+    assert found.wrench[:KNOTS][soft < 0].mean() < -20 < found.wrench[:KNOTS][soft == 0].mean()
+    report = as_report(found)
+    assert report["symbolic"] is None and np.shape(report["knots"]) == (KNOTS, 2)
+    assert "place in the room" in describe_unnamed(report) and "y = " in wrench_section(report)
 
 
 def test_nothing_is_kept_of_noise(bench):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from effects_in_hand import DT, motion_at, quick
 
 from whill_mjx.effects import make_effect
-from whill_mjx.effects.unnamed import KNOTS, QUANTITIES
+from whill_mjx.effects.unnamed import ACROSS, KNOTS, QUANTITIES
 
 NUMBER = {name: number for number, name in enumerate(QUANTITIES, start=1)}
 
@@ -93,3 +95,23 @@ def test_yaw_rate_and_time_pick_their_own_knots():
     time = effect("time in the drive", [0.0, 9.0], low=0.0, high=float(KNOTS - 1))
     np.testing.assert_allclose(wrench_after(time, motion, 0.5).fx, 4.5, rtol=1e-2)
     assert jnp.shape(wrench_after(time, motion, 0.0).fx) == ()
+
+
+@quick
+def test_a_map_of_the_room_is_interpolated_along_both_ways():
+    rows = KNOTS // ACROSS
+    heights = [10.0 * row + column for row in range(rows) for column in range(ACROSS)]
+    one = effect("place in the room", heights, low=0.0, high=float(ACROSS - 1), low_y=-1.0, high_y=float(rows - 2))
+    for x, y in ((0.0, -1.0), (1.5, 0.0), (2.25, 0.5)):
+        motion = replace(motion_at(), position=jnp.array([x, y]))
+        np.testing.assert_allclose(one.force(one.init(), motion)[1].fx, 10 * (y + 1) + x, rtol=1e-4, atol=1e-4)
+    outside = replace(motion_at(), position=jnp.array([9.0, -9.0]))
+    np.testing.assert_allclose(one.force(one.init(), outside)[1].fx, ACROSS - 1.0, rtol=1e-4)
+
+
+@quick
+@pytest.mark.parametrize(("quantity", "force"), [("x in the room", 3.5), ("y in the room", 7.0)])
+def test_a_table_over_a_coordinate_of_the_room_does_not_know_the_other(quantity, force):
+    one = effect(quantity, [float(k) for k in range(KNOTS)], low=0.0, high=float(KNOTS - 1))
+    motion = replace(motion_at(yaw=1.0), position=jnp.array([3.5, 7.0]))
+    np.testing.assert_allclose(one.force(one.init(), motion)[1].fx, force, rtol=1e-4)

@@ -13,11 +13,15 @@ from whill_mjx.effects.smooth import soft_sign
 from whill_mjx.types import Motion, Wrench, parameter
 
 KNOTS = 12
+ACROSS = 4
+"""Knots along x of a map of the room, which has KNOTS / ACROSS rows of them along y."""
 QUANTITIES = {
     "time in the drive": "s", "speed": "m/s", "yaw rate": "rad/s", "left wheel's angle": "rad",
     "right wheel's angle": "rad", "heading in the room": "rad", "time since rest": "s", "distance since rest": "m",
+    "x in the room": "m", "y in the room": "m", "place in the room": "m",
 }  # fmt: skip
 """What the wrench may depend on, by number from 1, and its unit. Angles repeat after a full turn."""
+MAP = "place in the room"
 PERIODIC = ("left wheel's angle", "right wheel's angle", "heading in the room")
 REST_SPEED = 0.02  # [m/s] below which a vehicle rests, and that smooths the change of sign at rest
 REST_RATE = 0.05  # [rad/s] likewise
@@ -35,21 +39,27 @@ class UnnamedMemory:
 
 
 def quantities(memory: UnnamedMemory, motion: Motion) -> jax.Array:
-    """Values (8,) of `QUANTITIES`."""
+    """Values (11,) of `QUANTITIES`; of the place, its x."""
     speed = motion.spin.mean() * motion.wheel_radius
     rate = yaw_rate(motion)
+    x, y = motion.position
     return jnp.stack([memory.time, speed, rate, memory.angle[0], memory.angle[1], motion.heading, memory.moving,
-                      memory.distance])
+                      memory.distance, x, y, x])
 
 
 def hats(position: jax.Array, periodic: jax.Array) -> jax.Array:
     """Weights (KNOTS,) of linear interpolation at a position () counted in knots; constant beyond the ends."""
     knot = jnp.arange(KNOTS, dtype=position.dtype)
-    inside = jnp.clip(position, 0.0, KNOTS - 1.0)
     turned = position - KNOTS * jnp.floor(position / KNOTS)
     away = jnp.abs(turned - knot)
     around = jnp.minimum(away, KNOTS - away)
-    return jnp.maximum(1 - jnp.where(periodic, around, jnp.abs(inside - knot)), 0.0)
+    return jnp.where(periodic, jnp.maximum(1 - around, 0.0), between(position, KNOTS))
+
+
+def between(position: jax.Array, count: int) -> jax.Array:
+    """Weights (count,) of linear interpolation at a position () counted in knots; constant beyond the ends."""
+    knot = jnp.arange(count, dtype=position.dtype)
+    return jnp.maximum(1 - jnp.abs(jnp.clip(position, 0.0, count - 1.0) - knot), 0.0)
 
 
 @struct.dataclass
@@ -57,8 +67,10 @@ class Unnamed(Effect):
     """F_x = f(z) and T_z = g(z): tables over one quantity z of the motion, interpolated linearly.
 
     z is chosen by `quantity`: 1 time in the drive, 2 speed, 3 yaw rate, 4 and 5 angle of the left and the right wheel,
-    6 heading in the room, 7 time and 8 distance since rest. The knots lie evenly from `low` to `high`, and the ends
-    hold beyond; angles repeat, with knots every 30 degrees from 0 on. A wheel stands at `start_angle` when a drive
+    6 heading in the room, 7 time and 8 distance since rest, 9 x and 10 y of the chassis origin in the room. The knots
+    lie evenly from `low` to `high`, and the ends hold beyond; angles repeat, with knots every 30 degrees from 0 on.
+    11 is a map of the room, of four knots along x from `low` to `high` by three along y from `low_y` to `high_y`, those
+    of the least y first, interpolated along both. A wheel stands at `start_angle` when a drive
     begins, which nobody knows: it is another one in every drive. With `with_motion` = 1 the force
     turns with the direction in which each side rolls and the torque with that of the turn, as friction does (negative
     values brake); with 0 they push whatever the motion. `sysid.close_loop` writes it where something is missing that
@@ -68,14 +80,17 @@ class Unnamed(Effect):
     name = "unnamed"
     room_fixed = True
     typical = {"quantity": (2.0, 2.0), "low": (-1.0, -1.0), "high": (1.0, 1.0), "with_motion": (0.0, 1.0),
+               "low_y": (-1.0, -1.0), "high_y": (1.0, 1.0),
                **{f"force_{k}": (-10.0, 10.0) for k in range(1, KNOTS + 1)},
                **{f"torque_{k}": (-5.0, 5.0) for k in range(1, KNOTS + 1)}}
     source = "fitted by `sysid.close_loop`; sizes are estimates"
-    quantity: jax.Array = parameter("-", 1.0, 8.0, 1.0, "which quantity, 1 to 8")
+    quantity: jax.Array = parameter("-", 1.0, 11.0, 1.0, "which quantity, 1 to 11")
     low: jax.Array = parameter("SI", -1000.0, 1000.0, 0.0, "value of it at the first knot")
     high: jax.Array = parameter("SI", -1000.0, 1000.0, 1.0, "value of it at the last knot")
     with_motion: jax.Array = parameter("-", 0.0, 1.0, 0.0, "1 where the wrench turns with the motion")
     start_angle: jax.Array = parameter("rad", -6.3, 6.3, 0.0, "angle of the wheels at the start of the drive")
+    low_y: jax.Array = parameter("m", -1000.0, 1000.0, 0.0, "y of a map's first row")
+    high_y: jax.Array = parameter("m", -1000.0, 1000.0, 1.0, "y of its last row")
     force_1: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 1")
     force_2: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 2")
     force_3: jax.Array = parameter("N", -300.0, 300.0, 0.0, "force forward at knot 3")
@@ -110,9 +125,12 @@ class Unnamed(Effect):
         number = jnp.round(self.quantity) - 1
         periodic = (number >= 3) & (number <= 5)
         value = jnp.where(jnp.arange(len(QUANTITIES)) == number, seen, 0.0).sum()
-        span = jnp.where(self.high == self.low, 1.0, self.high - self.low)
-        position = jnp.where(periodic, value * (KNOTS / TURN), (value - self.low) * ((KNOTS - 1) / span))
-        weights = hats(position, periodic)
+        share = (value - self.low) / span_of(self.low, self.high)
+        over_one = hats(jnp.where(periodic, value * (KNOTS / TURN), share * (KNOTS - 1)), periodic)
+        rows = KNOTS // ACROSS
+        row = (motion.position[1] - self.low_y) / span_of(self.low_y, self.high_y)
+        over_map = (between(row * (rows - 1), rows)[:, None] * between(share * (ACROSS - 1), ACROSS)).reshape(-1)
+        weights = jnp.where(number == list(QUANTITIES).index(MAP), over_map, over_one)
         forces = jnp.stack([getattr(self, f"force_{k}") for k in range(1, KNOTS + 1)])
         torques = jnp.stack([getattr(self, f"torque_{k}") for k in range(1, KNOTS + 1)])
         force, torque = (weights * forces).sum(), (weights * torques).sum()
@@ -121,6 +139,11 @@ class Unnamed(Effect):
         wrench = replace(Wrench.zero(), fx=force * sides.mean(),
                          tz=torque * turning + force * (sides[1] - sides[0]) * motion.track / 4)
         return _advanced(memory, motion), wrench
+
+
+def span_of(low: jax.Array, high: jax.Array) -> jax.Array:
+    """high - low (), or 1 where that is 0."""
+    return jnp.where(high == low, 1.0, high - low)
 
 
 def _advanced(memory: UnnamedMemory, motion: Motion) -> UnnamedMemory:
