@@ -62,7 +62,9 @@ def together(options: argparse.Namespace) -> None:
 
     The time is that of all of them, so it says nothing of one run's.
     """
-    preset = with_repeat(find_preset(options.preset, options.task), options.repeat)
+    preset = find_preset(options.preset, options.task)
+    if options.repeat:
+        preset = with_repeat(preset, options.repeat)
     task = dataclasses.replace(preset.task, layout=options.layout)
     steps = options.steps or preset.total_steps
     changes = {name: json.loads(value) for name, value in (one.split("=", 1) for one in options.change)}
@@ -333,7 +335,7 @@ def parse() -> argparse.Namespace:
     side.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     side.add_argument("--preset", default="paper")
     side.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
-    side.add_argument("--repeat", type=int, default=1, help="control periods that a decision holds")
+    side.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
     side.add_argument("--layout", default="randomised")
     side.add_argument("--vehicle", type=Path)
     side.add_argument("--steps", type=int)

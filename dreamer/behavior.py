@@ -188,8 +188,9 @@ def imagination_loss(
     actions, raw = spaces.actions_of(params), world_model.head(params["policy"], features[:-1])
     log_prob, entropy = actions.score(config, raw, rollout.actions[:-1])
     slow_logits = world_model.head(slow, features[:-1])
+    pull = config.mean_pull * stop(weight[:-1]) * actions.saturation(raw) if config.mean_pull else 0.0
     losses = {
-        "policy": actor_loss(config, log_prob, entropy, advantage, weight[:-1]),
+        "policy": actor_loss(config, log_prob, entropy, advantage, weight[:-1]) + pull,
         "value": critic_loss(config, logits[:-1], slow_logits, returns, weight[:-1]),
     }
     metrics = {

@@ -59,6 +59,9 @@ class DreamerConfig:
     noise_steps: float = 0.0
     """Longest time constant [steps] of the noise with which training acts, at least 1 (`dreamer.exploration`); 0: the
     noise of every step is independent. Continuous actions only."""
+    mean_pull: float = 0.0
+    """Weight of the square of the policy's mean before its tanh. Where the return hardly depends on the action, noise
+    drives the mean into saturation, whence no gradient leads back; 0.01 keeps it within reach. Not for classes."""
     policy_outscale: float = 0.01
     """Scale of the actor's output weights at the start."""
 
@@ -136,6 +139,9 @@ class DreamerConfig:
 
     lr: float = 4e-5
     """Learning rate. Small networks on small budgets like more, such as 3e-4."""
+    behavior_lr: float = 1.0
+    """Learning rate of policy and critic in units of the world model's. Below 1 they follow a model of little data more
+    slowly than it is corrected by what they do (DreamerV3 of 2023: 0.3)."""
     warmup: int = 1000
     """Updates over which the learning rate rises linearly."""
     lr_decay: int = 0
@@ -172,6 +178,8 @@ class DreamerConfig:
             (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
+            (self.behavior_lr > 0, "behavior_lr", "must be positive"),
+            (self.mean_pull >= 0, "mean_pull", "must not be negative"),
             (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),
             (self.batch_length >= 2, "batch_length", "must be at least 2"),
             (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),

@@ -9,6 +9,9 @@ from flax import struct
 from dreamer.config import DreamerConfig
 from dreamer.types import Params
 
+BEHAVIOR = ("policy", "value")
+"""Parameters that learn at `DreamerConfig.behavior_lr`."""
+
 
 @struct.dataclass
 class OptState:
@@ -52,16 +55,18 @@ def update(config: DreamerConfig, params: Params, gradients: Params, state: OptS
     rate = learning_rate(config, state.count)
 
     def one(
-        param: jax.Array, gradient: jax.Array, mu: jax.Array, nu: jax.Array
+        share: float, param: jax.Array, gradient: jax.Array, mu: jax.Array, nu: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         gradient = clip_adaptively(gradient, param, config.agc, config.agc_min_norm)
         nu = config.beta2 * nu + (1.0 - config.beta2) * jnp.square(gradient)
         scaled = gradient / (jnp.sqrt(nu / unbias2) + config.eps)
         mu = config.beta1 * mu + (1.0 - config.beta1) * scaled
-        return param - rate * mu / unbias1, mu, nu
+        return param - rate * share * mu / unbias1, mu, nu
 
     leaves = [jax.tree.leaves(tree) for tree in (params, gradients, state.mu, state.nu)]
-    results = [one(*group) for group in zip(*leaves, strict=True)]
+    shares = [config.behavior_lr if name in BEHAVIOR else 1.0
+              for name in sorted(params) for _ in jax.tree.leaves(params[name])]  # in the order of the leaves
+    results = [one(*group) for group in zip(shares, *leaves, strict=True)]
     structure = jax.tree.structure(params)
     new_params, mu, nu = (jax.tree.unflatten(structure, list(column)) for column in zip(*results, strict=True))
     return new_params, OptState(mu, nu, count)

@@ -125,6 +125,9 @@ class Actions(Protocol):
     def score(self, config: DreamerConfig, raw: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Log-probability (...) of actions (..., width), and entropy (...) [nat]."""
 
+    def saturation(self, raw: jax.Array) -> jax.Array:
+        """How far (...) the best action lies beyond where gradients reach it; 0 where that cannot happen."""
+
     def watch(self, config: DreamerConfig, raw: jax.Array) -> dict[str, jax.Array]:
         """Scalars worth logging."""
 
@@ -168,6 +171,9 @@ class Box:
         mean, std = self.normal(config, raw)
         return dist.normal_log_prob(mean, std, action), dist.normal_entropy(std)
 
+    def saturation(self, raw: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.square(jnp.split(raw, 2, -1)[0]), -1)
+
     def watch(self, config: DreamerConfig, raw: jax.Array) -> dict[str, jax.Array]:
         return {"policy_std": jnp.mean(self.normal(config, raw)[1])}
 
@@ -208,6 +214,9 @@ class Discrete:
     def score(self, config: DreamerConfig, raw: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         probs = self.probs(config, raw)
         return jnp.sum(action * jnp.log(probs), -1), -jnp.sum(probs * jnp.log(probs), -1)
+
+    def saturation(self, raw: jax.Array) -> jax.Array:
+        return jnp.zeros(raw.shape[:-1])
 
     def watch(self, config: DreamerConfig, raw: jax.Array) -> dict[str, jax.Array]:
         return {"policy_certainty": jnp.mean(jnp.max(self.probs(config, raw), -1))}

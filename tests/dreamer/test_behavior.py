@@ -140,6 +140,27 @@ def test_entropy_alone_widens_the_policy():
     np.testing.assert_allclose(gradient, -CONFIG.entropy_scale / 0.5, rtol=1e-5)
 
 
+def test_a_mean_in_saturation_is_pulled_back_where_every_action_pays_the_same(agent_state):
+    out = agent_state.params["policy"]["out"]
+    far = {**out, "b": out["b"].at[0].set(-5.0)}  # tanh(-5): nothing leads back, all rewards are 0
+    params = {**agent_state.params, "policy": {**agent_state.params["policy"], "out": far}}
+
+    def bias_gradient(pull):
+        config = dataclasses.replace(CONFIG, mean_pull=pull, entropy_scale=0.0)
+
+        def loss(params):
+            start, key = rssm.initial(config, M), jax.random.key(3)
+            losses, *_ = behavior.imagination_loss(config, params, agent_state.slow_value, NORM, start, key)
+            return jnp.mean(losses["policy"])
+
+        return jax.grad(loss)(params)["policy"]["out"]["b"]
+
+    np.testing.assert_allclose(bias_gradient(0.0), 0.0, atol=1e-9)
+    pulled = bias_gradient(0.01)
+    assert pulled[0] < 0  # descending it raises the mean
+    np.testing.assert_allclose(pulled[2:], 0.0, atol=1e-9)  # the deviations are left alone
+
+
 @pytest.mark.quick
 def test_small_returns_are_not_blown_up_and_large_ones_are_scaled_down():
     returns = jnp.linspace(0.0, 1000.0, 1001)[None]

@@ -112,7 +112,9 @@ def test_an_image_that_does_not_fit_names_the_rule():
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("field, value", [("deter", 2049), ("bins", 254), ("classes", 300), ("train_ratio", 0.0)])
+@pytest.mark.parametrize(
+    "field, value", [("deter", 2049), ("bins", 254), ("classes", 300), ("train_ratio", 0.0), ("behavior_lr", 0.0)]
+)
 def test_a_bad_configuration_names_field_value_and_rule(field, value):
     with pytest.raises(ValueError, match=f"{field} = {value}.*must"):
         DreamerConfig(**{field: value})
@@ -141,6 +143,16 @@ def test_the_optimiser_scales_first_and_averages_second():
         mu = 0.9 * mu + 0.1 * gradient / np.sqrt(nu / (1 - 0.999**count))
         expected -= 0.1 * mu / (1 - 0.9**count)
     assert float(params["w"][0]) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.quick
+def test_policy_and_critic_may_learn_more_slowly_than_the_model():
+    params = {name: {"w": jnp.ones(3)} for name in ("enc", "policy", "value")}
+    gradients = jax.tree.map(jnp.ones_like, params)
+    config = DreamerConfig(lr=0.1, warmup=0, behavior_lr=0.25)
+    new, _ = optim.update(config, params, gradients, optim.init(params))
+    moved = {name: 1.0 - float(part["w"][0]) for name, part in new.items()}
+    assert moved["policy"] == moved["value"] == pytest.approx(0.25 * moved["enc"], rel=1e-4)
 
 
 @pytest.mark.quick
