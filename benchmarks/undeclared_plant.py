@@ -26,7 +26,7 @@ from benchmarks.undeclared_reference import reference_days
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
 from sysid.log import load_log
 from sysid.loop.report import effects as named_effects
-from sysid.loop.report import make_report, write_run
+from sysid.loop.report import make_report, warnings, write_run
 from sysid.report import write_report
 from sysid.statistics import upper_rate
 
@@ -255,6 +255,8 @@ def judge(
         write_run(work / "reports" / job.label, result, report)
         after = report["after"]["held_out"]["ground_truth"]
         content["heldout_ratio"] = after["trajectory"] / after["noise_floor"]["trajectory"]
+        before = report["before"]["held_out"]["ground_truth"]
+        content["heldout_ratio_before"] = before["trajectory"] / before["noise_floor"]["trajectory"]
         content["full_seconds"] = time.perf_counter() - began
     verdict.parent.mkdir(parents=True, exist_ok=True)
     (work / "truth").mkdir(parents=True, exist_ok=True)
@@ -300,7 +302,7 @@ def brief(result: Result) -> dict[str, Any]:
     return {"verdict": found.verdict, "share": found.share, "excess": list(found.excess), "p_value": found.p_value,
             "scan_p": found.scan.p_family, "worth": float(found.scan.worth.max()),
             "worth_limit": float(np.quantile(found.scan.null.max(1), 1 - alpha)),
-            "excess_limit": wander.excess_limit(alpha),
+            "excess_limit": wander.excess_limit(alpha), "warnings": warnings(result),
             "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
                         for one in named_effects(result)] if found.verdict == "named" else [],
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
@@ -388,6 +390,10 @@ def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[s
         right = [said(name, one) for name, one in known]
         wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
         found[f"class_accuracy{tag}"] = figure([float(np.mean(right))], about)
+        right_ones = [one for (_, one), ok in zip(known, right, strict=True) if ok]
+        if right_ones:
+            found[f"warned_right{tag}"] = figure([float(np.mean([warned(one) for one in right_ones]))],
+                                                 f"share of {len(right_ones)} right names that come with a warning")
         found[f"wrong_name{tag}"] = figure([float(np.mean(wrong))], about)
         found[f"noticed{tag}"] = figure([float(np.mean([one["verdict"] != "none" for _, one in known]))], about)
         sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]
@@ -411,8 +417,9 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
 
 
 def warned(one: dict[str, Any]) -> bool:
-    """Whether a name comes with the warning that more is left than days differ by (`sysid.loop.report.warnings`)."""
-    return one["verdict"] == "named" and one["excess"][1] > one["excess_limit"]
+    """Whether a name comes with a warning (`sysid.loop.report.warnings`); one is that more is left than days differ
+    by, which verdicts of before others were kept tell too."""
+    return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
 
 
 def own_classes(work: Path) -> dict[str, set[str]]:

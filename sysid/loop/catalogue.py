@@ -38,6 +38,8 @@ class Axis:
     along: neutral + unit q q_0, with q_0 that of the first axis."""
     limit: float = 12.0
     """Largest |q| that a refit may reach."""
+    open: tuple[float, float] = (1.0, 1.0)
+    """Factors on the size, least and largest, that drives cannot tell from what the effect leaves open."""
     dependent: bool = False
     """Whether it does nothing by itself, but changes what the other axes do."""
 
@@ -150,7 +152,7 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
         one("traction_limit", axis("slip_traction.mu", -0.15, form="factor"), **shift),
         one("rolling_resistance_speed", axis("rolling_resistance_speed.mu_1", 0.004 / speed)),
         one("quadratic_drag", axis("quadratic_drag.coefficient", force / speed**2)),
-        one("side_force", axis("side_force.sideways", force, signed=True)),
+        one("side_force", axis("side_force.sideways", force, signed=True, open=pushed_anywhere(spec))),
         one("slope", axis("slope.along_x", 0.005, signed=True), axis("slope.along_y", 0.005, signed=True)),
         one("wind", axis("wind.along_x", force / 2, signed=True), axis("wind.along_y", force / 2, signed=True)),
         one("backlash", axis("backlash.play", 0.007, limit=10.0)),
@@ -162,6 +164,19 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
     if spec.drive == "skid":
         every.append(one("turn_efficiency", axis("turn_efficiency.efficiency", 0.02, signed=True)))
     return tuple(one for one in every if one.kind == "effect" or all(one.axes[i].parameter in base for i in one.main))
+
+
+def pushed_anywhere(spec: VehicleSpec) -> tuple[float, float]:
+    """Least and largest force to the side, over one at the chassis origin, that turns the vehicle as much.
+
+    Driven wheels hardly yield to the side: what shows is the torque about their axle. The force may act anywhere on
+    the middle half of the wheelbase. Where the origin lies on the axle, or wheels of both axles are driven, the force
+    itself is what shows.
+    """
+    arm = abs(spec.reference_x)
+    if spec.drive == "skid" or arm < 1e-3:
+        return 1.0, 1.0
+    return min(arm / (0.75 * spec.wheelbase), 1.0), max(arm / (0.25 * spec.wheelbase), 1.0)
 
 
 def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> VehicleParams:

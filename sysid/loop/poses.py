@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -14,8 +14,9 @@ from sysid.log import Trial
 from sysid.loop.drives import Drives
 from sysid.loop.evidence import with_values
 from sysid.loop.reference import difference_sizes
+from sysid.metrics import replicate_noise
 from sysid.objective import Objective, estimate_noise
-from sysid.rollout import Simulated
+from sysid.rollout import Measured, Simulated
 from sysid.space import Space
 
 
@@ -56,6 +57,35 @@ class PoseReplay:
         return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))
 
 
+POOLED = 1.0
+"""Degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own."""
+
+
+def by_own_noise(trials: Sequence[Trial], measured: Measured) -> Measured:
+    """The measurements with masks that weigh each trial by what replicates of its manoeuvre differ by.
+
+    Replicates that skid part by ten times as much as others. With one noise for all, the fit would follow their chance
+    and leave the others to errors that are small beside it. Few replicates tell little: their variance is drawn towards
+    that of all. Manoeuvres without any have that one; without replicates nothing changes.
+    """
+    pooled = replicate_noise(tuple(trials))
+    if pooled is None:
+        return measured
+    weights: dict[str, list[np.ndarray]] = {channel: [] for channel in pooled}
+    for trial in trials:
+        mine = tuple(other for other in trials if other.manoeuvre == trial.manoeuvre)
+        own = replicate_noise(mine)
+        for channel, scale in pooled.items():
+            common = np.square(scale)
+            variance = common if own is None else (
+                POOLED * common + (len(mine) - 1) * np.square(own[channel])) / (POOLED + len(mine) - 1)
+            variance, common = (np.concatenate([[each[:2].mean()] * 2, each[2:]]) for each in (variance, common))
+            ratio = np.sqrt(common / np.maximum(variance, 1e-12))
+            weights[channel].append(np.where(np.isfinite(ratio) & (ratio > 0), ratio, 1.0))
+    return replace(measured, pose_mask=measured.pose_mask * np.stack(weights["ground_truth"])[:, None],
+                   odometry_mask=measured.odometry_mask * np.stack(weights["odometry"])[:, None])
+
+
 def fit_poses(
     drives: Drives, trials: Sequence[Trial], space: Space, held: np.ndarray, spread: np.ndarray, iterations: int,
     others: np.ndarray | None = None,
@@ -69,11 +99,11 @@ def fit_poses(
         others: (S, P) further starts, in unit coordinates.
     """
     start = space.to_unit(space.initial)
-    noise = estimate_noise(tuple(trials))
+    noise, measured = estimate_noise(tuple(trials)), by_own_noise(trials, drives.measured)
 
     def objective(at: np.ndarray) -> Objective:
         replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
-        return Objective(replay, space, tuple(trials), drives.measured, noise)
+        return Objective(replay, space, tuple(trials), measured, noise)
 
     if noise.source == "defaults":
         noise = objective(start).residual_noise(start)

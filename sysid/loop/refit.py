@@ -109,6 +109,11 @@ class Refitter:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
         return self.fit_all([Start(tuple(hypotheses), self.reference.u, q)], iterations)[0]
 
+    def stuck(self, fit: Refit) -> bool:
+        """Whether a fit ended at the end of a range: there may be a better one elsewhere."""
+        limits = np.array([axis.limit for one in fit.hypotheses for axis in one.axes])
+        return bool((fit.u <= self.low).any() or (fit.u >= self.high).any() or (np.abs(fit.q) >= limits).any())
+
     def fit_all(self, starts: Sequence[Start], iterations: int) -> list[Refit]:
         """Fits from several starts, side by side: what they ask of the simulator at one time goes into one call."""
         runs = [self._run(start, iterations) for start in starts]

@@ -53,6 +53,7 @@ from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_comma
 from sysid.loop.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
 from sysid.loop.refit import Refit
 from sysid.loop.solver import Solver
+from sysid.loop.unexplained import held_back_gains
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
 from sysid.metrics import METRICS, Prediction, noise_floor
 from sysid.report import code_hashes, error_rows
@@ -68,6 +69,8 @@ SCHEMA = 1
 KIND = "sysid-close-loop"
 CONFIDENCE = 0.95
 RESAMPLES = 2000
+UNDONE = 0.5
+"""What two effects change together, as a share of what each does by itself, below which one may stand for both."""
 
 
 def make_report(result: Result) -> dict[str, Any]:
@@ -227,13 +230,46 @@ def warnings(result: Result) -> list[str]:
     found, alpha = result.search, result.config.thresholds.alpha
     if found.verdict != "named":
         return []
-    crowd = [f"{', '.join(found.crowd)} cannot be told from it either: more than a class may have for a name to be "
-             "worth much"] if found.crowd else []
-    if found.excess[1] <= result.prepared.wander.excess_limit(alpha):
-        return crowd
-    names = " and ".join(one.hypothesis.effect for one in found.accepted)
-    return [*crowd, f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has "
-            "another form here than in the catalogue, or is imitated by an effect that the catalogue does not have"]
+    said = [f"{', '.join(found.crowd)} cannot be told from it either: more than a class may have for a name to be "
+            "worth much"] if found.crowd else []
+    said += [f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
+             "catalogue does not have may do what is left of both"
+             for first, second, left in undone(found.final) if left < UNDONE]
+    said += [f"{name} lies within its standard error of the end of what is looked for: another effect may do it with "
+             "less" for name in at_the_end(result)]
+    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
+    quantity = max(gains, key=lambda name: gains[name])
+    if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
+        said.append(f"what is left is a smooth function of {quantity} more than on reference days: the form is another "
+                    "one, or another effect")
+    if found.excess[1] > result.prepared.wander.excess_limit(alpha):
+        names = " and ".join(one.hypothesis.effect for one in found.accepted)
+        said.append(f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has "
+                    "another form here than in the catalogue, or is imitated by an effect that the catalogue does not "
+                    "have")
+    return said
+
+
+def undone(final: Refit) -> list[tuple[str, str, float]]:
+    """Of every two effects of a joint fit: what both change in the features together, squared, over the sum of what
+    each does by itself. Two effects that have nothing to do with one another leave about 1."""
+    columns = final.jacobian[..., len(final.u) :]
+    changes = [columns[..., part] @ q for part, q in zip(final.parts, final.split, strict=True)]
+    out = []
+    for j, second in enumerate(changes):
+        for i, first in enumerate(changes[:j]):
+            alone = float(np.square(first).sum() + np.square(second).sum())
+            out.append((final.hypotheses[i].effect, final.hypotheses[j].effect,
+                        float(np.square(first + second).sum()) / max(alone, 1e-12)))
+    return out
+
+
+def at_the_end(result: Result) -> list[str]:
+    """Parameters of the final fit that are as large as they may be, within one standard error."""
+    final = result.search.final
+    deviation, axes = deviations(final, result), [axis for one in final.hypotheses for axis in one.axes]
+    return [axis.parameter for axis, q, error in zip(axes, final.q, deviation, strict=True)
+            if not axis.dependent and abs(q) + error >= axis.limit]
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
@@ -279,21 +315,33 @@ def equation_of(one: Hypothesis) -> str:
 
 
 def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (k,), (k,) of the coordinates' confidence intervals: blocks are whole manoeuvres, and what the coordinates
-    seem to be on days without the effect adds to their variance."""
+    """Ends (k,), (k,) of the coordinates' confidence intervals."""
     from scipy import stats
 
-    covariance = np.linalg.inv(with_prior(final, result.evidence.precision))
-    size = len(final.u)
-    scores = np.einsum("bni,bn->bi", final.jacobian, final.residual)
-    groups = result.evidence.groups
-    summed = np.stack([scores[list(group)].sum(0) for group in groups])
-    robust = covariance @ (summed.T @ summed) @ covariance * len(groups) / max(len(groups) - 1, 1)
+    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(result.evidence.groups) - 1, 1))
+    reach = quantile * deviations(final, result)
+    axes = [axis for one in final.hypotheses for axis in one.axes]
+    ends = np.stack([final.q - reach, final.q + reach])
+    factors = np.array([[axis.open[end] for axis in axes] for end in (0, 1)]).reshape(2, -1)
+    every = np.concatenate([ends, *(ends[i] * factors for i in (0, 1))])  # what one size could be taken for
+    return every.min(0), every.max(0)
+
+
+def deviations(final: Refit, result: Result) -> np.ndarray:
+    """(k,) standard errors of the coordinates: by how much they change when a manoeuvre is left out (the jackknife,
+    which holds for a wrong model and few manoeuvres too), and what they seem to be on days without the effect."""
+    precision, groups = result.evidence.precision, result.evidence.groups
+    matrix, size = with_prior(final, precision), len(final.u)
+    moved = []
+    for group in groups:
+        flat = final.jacobian[list(group)].reshape(-1, len(matrix))
+        left = matrix - flat.T @ flat + 1e-9 * np.diag(np.diag(matrix))
+        moved.append(np.linalg.solve(left, flat.T @ final.residual[list(group)].reshape(-1)))
+    jackknife = np.square(moved).sum(0) * (len(groups) - 1) / len(groups)
+    told = np.maximum(np.diag(np.linalg.inv(matrix)), jackknife)[size:]
     wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
               for one, q in zip(final.hypotheses, final.split, strict=True)]
-    deviation = np.sqrt(np.maximum(np.diag(covariance), np.diag(robust))[size:] + np.concatenate([[], *wander]))
-    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(groups) - 1, 1))
-    return final.q - quantile * deviation, final.q + quantile * deviation
+    return np.asarray(np.sqrt(told + np.concatenate([[], *wander])))
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from sysid.result import Progress
 
 LARGEST = 4  # members of a class
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
+ELSEWHERE = (1.0, 3.0)
+"""Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
 
 
 @dataclass(frozen=True)
@@ -394,6 +396,9 @@ def refitted(
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
+    for i in (i for i in best_of if refitter.stuck(fits[i])):
+        again = refitter.fit_all(_elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
+        fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
     report("polish")
     rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
@@ -452,6 +457,21 @@ def _rivals(
             done.add(hypotheses[h].effect)
             out.append(int(h))
     return out[: thresholds.candidates]
+
+
+def _elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
+    """Other starts of a fit whose last effect comes behind `before` coordinates: the base parameters as they were, and
+    what only changes the effect at 0, so that the effect itself has the first chance."""
+    q = fit.q.copy()
+    axes = fit.hypotheses[-1].axes
+    q[before:] = [0.0 if axis.dependent else size for axis, size in zip(axes, q[before:], strict=True)]
+    limits = np.array([axis.limit for axis in axes])
+    out = []
+    for factor in ELSEWHERE:
+        start = q.copy()
+        start[before:] = np.clip(factor * q[before:], -limits, limits)
+        out.append(Start(fit.hypotheses, refitter.reference.u, start))
+    return out
 
 
 def _best_start(scans: Sequence[Looked], h: int) -> np.ndarray:

@@ -44,6 +44,8 @@ class Wander:
     """Standard deviation from day to day of the squared residual over the noise, less 1."""
     usual: float = 0.0
     """What smooth functions that know no physics gain on a reference day, per trial."""
+    usual_size: float = 0.0
+    """Root mean square of it over the days, for a new one; 0 where reference days do not tell."""
     scatter: float = 0.0
     """Excess of what a reference day's replicates do not share."""
 
@@ -82,6 +84,14 @@ class Wander:
         from scipy import stats
 
         return float(stats.t.isf(alpha, self.freedom)) * self.excess
+
+
+    def smooth_limit(self, alpha: float) -> float:
+        """What they gain per trial on a day with nothing in it with probability alpha; infinite where days do not
+        tell."""
+        from scipy import stats
+
+        return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")
 
 
 def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:
@@ -125,7 +135,9 @@ def estimate(
     apart = [one for one in apart if np.isfinite(one)]
     estimates = [coordinates(evidence, np.flatnonzero(day == number)) for number in range(count)]
     return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)),
-                   usual=float(np.mean(usual)), scatter=float(np.mean(apart)) if apart else 0.0)
+                   usual=float(np.mean(usual)),
+                   usual_size=float(np.sqrt(np.square(usual).mean() * (1 + 1 / count))),
+                   scatter=float(np.mean(apart)) if apart else 0.0)
 
 
 def _spread(excess: np.ndarray) -> float:

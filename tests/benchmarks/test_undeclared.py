@@ -97,6 +97,7 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
 def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, results):
     recorded = json.loads(results.read_text())
     verdict = {"stage": "scaled", "scale": 4.0, "verdict": "named", "share": 0.9, "p_value": 0.01, "seconds": 1.0,
+               "excess": [1.0, 0.0], "excess_limit": 0.1,
                "effects": [{"name": "slope", "class": ["slope", "wind"], "parameters": {}}]}
     judged(tmp_path, "wind_x4_0", verdict, {"wind": 0.1})
     contact.figures(tmp_path, 2.0)
@@ -140,6 +141,8 @@ def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong_unless_it_is_war
     assert found["left_out_wrong"]["value"] == pytest.approx(1 / 6)  # dry friction for a slope
     assert found["left_out_outside_class"]["value"] == pytest.approx(2 / 6)
     assert found["left_out_unexplained"]["value"] == pytest.approx(1 / 6)
+    said = {**verdict("dry_friction"), "warnings": ["it may be another effect"]}
+    assert contact.of_left_out([("slope", said)], {})["left_out_wrong"]["value"] == 0
 
 
 @pytest.mark.quick

@@ -92,6 +92,9 @@ class Linear:
         cost = float(np.square(residual).sum() + solution[:1] @ self.precision @ solution[:1])
         return Refit(tuple(chosen), solution[:1], solution[1:], cost, residual, columns, solution)
 
+    def stuck(self, _):
+        return False
+
     def fit_all(self, starts, _):
         return [self.fit(start.hypotheses, None) for start in starts]
 

@@ -1,0 +1,117 @@
+"""How well a named effect's size is known, and what warns that it may be another one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.loop.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
+from sysid.loop.evidence import column_layout
+from sysid.loop.poses import by_own_noise
+from sysid.loop.refit import Refit, Refitter
+from sysid.loop.report import at_the_end, intervals, undone
+from sysid.loop.search import _elsewhere
+from sysid.loop.wander import no_wander
+from sysid.metrics import replicate_noise
+from sysid.rollout import Measured
+from whill_mjx.presets import preset
+
+pytestmark = pytest.mark.quick
+ONE = Hypothesis("slope", (Axis("slope.along_x", 0.01, signed=True, limit=50.0),))
+TWO = Hypothesis("wind", (Axis("wind.along_x", 1.0, signed=True, limit=50.0),))
+GROUPS = tuple((2 * i, 2 * i + 1) for i in range(8))
+
+
+def fitted(rng, spread=0.0, axes=(ONE,)):
+    """A joint fit of one base parameter and some effects of size 1, whose manoeuvres each have a size of their own."""
+    size = 1 + sum(len(one.axes) for one in axes)
+    columns = rng.standard_normal((16, 60, size))
+    sizes = np.repeat(1 + spread * rng.standard_normal(8), 2)
+    data = np.einsum("bni,b->bn", columns[..., 1:], sizes) + rng.standard_normal((16, 60))
+    flat = columns.reshape(-1, size)
+    found = np.linalg.solve(flat.T @ flat, flat.T @ data.reshape(-1))
+    return Refit(axes, found[:1], found[1:], 0.0, data - columns @ found, columns, found)
+
+
+def result_of(axes=(ONE,)):
+    layout = column_layout(axes, 1)
+    return SimpleNamespace(evidence=SimpleNamespace(groups=GROUPS, precision=1e-6 * np.eye(1), columns=layout),
+                           hypotheses=axes, prepared=SimpleNamespace(wander=no_wander(layout)))
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 0.5])
+def test_intervals_hold_the_mean_size_however_much_manoeuvres_differ(spread):
+    rng, inside = np.random.default_rng(0), []
+    for _ in range(200):
+        (low,), (high,) = intervals(fitted(rng, spread), result_of())
+        inside.append(low <= 1.0 <= high)
+    assert np.mean(inside) > 0.91
+
+
+def test_what_an_effect_leaves_open_widens_its_interval_to_one_side_only():
+    axis = replace(ONE.axes[0], open=(1.0, 3.0))
+    for sign in (1, -1):
+        fit = fitted(np.random.default_rng(1))
+        fit = replace(fit, q=sign * fit.q)
+        (low,), (high,) = intervals(fit, result_of())
+        wider = (replace(ONE, axes=(axis,)),)
+        (wide_low,), (wide_high,) = intervals(replace(fit, hypotheses=wider), result_of(wider))
+        near, far = (low, high) if sign > 0 else (high, low)
+        assert (wide_low, wide_high) == pytest.approx((near, 3 * far) if sign > 0 else (3 * far, near))
+
+
+def test_a_side_force_may_act_anywhere_ahead_of_the_driven_axle():
+    spec, params = preset("whill_cr_physical")
+    [side] = [one for one in hypotheses(spec, params) if one.effect == "side_force"]
+    least, most = side.axes[0].open
+    arm = abs(spec.reference_x)
+    for place in (0.3, 0.5, 0.7):  # of the wheelbase: a force there that turns as much as 1 at the origin
+        assert least <= arm / (place * spec.wheelbase) <= most
+    assert pushed_anywhere(replace(spec, drive="skid")) == (1.0, 1.0)
+    assert pushed_anywhere(replace(spec, rear_axle_x=0.0)) == (1.0, 1.0)
+
+
+def test_effects_that_undo_one_another_are_told_from_those_that_do_not():
+    fit = fitted(np.random.default_rng(2), axes=(ONE, TWO))
+    [(first, second, left)] = undone(fit)
+    assert (first, second) == ("slope", "wind") and 0.8 < left < 1.2
+    columns = fit.jacobian.copy()
+    columns[..., 2] = -columns[..., 1] + 0.3 * columns[..., 2]
+    assert undone(replace(fit, jacobian=columns))[0][2] < 0.2
+
+
+def test_a_size_at_the_end_of_its_range_is_told():
+    fit, result = fitted(np.random.default_rng(3)), result_of()
+    assert not at_the_end(SimpleNamespace(**vars(result), search=SimpleNamespace(final=fit)))
+    end = replace(ONE, axes=(replace(ONE.axes[0], limit=1.0),))
+    moved = replace(fit, hypotheses=(end,), q=np.array([0.99]))
+    short = result_of((end,))
+    assert at_the_end(SimpleNamespace(**vars(short), search=SimpleNamespace(final=moved))) == ["slope.along_x"]
+
+
+def test_a_fit_at_the_end_of_a_range_starts_anew_with_the_effect_alone():
+    axes = (Axis("payload_shift.mass", 4.0), Axis("payload_shift.x", 1.0, form="moment", signed=True, dependent=True))
+    payload = Hypothesis("payload_shift", axes)
+    refitter = Refitter.__new__(Refitter)
+    refitter.low, refitter.high, refitter.reference = np.zeros(1), np.ones(1), SimpleNamespace(u=np.array([0.5]))
+    fit = Refit((ONE, payload), np.array([0.4]), np.array([2.0, 5.0, 3.0]), 0.0, *[np.zeros((1, 1))] * 2, np.zeros(1))
+    assert not refitter.stuck(fit)
+    assert refitter.stuck(replace(fit, u=np.zeros(1))) and refitter.stuck(replace(fit, q=np.array([2.0, 5.0, -12.0])))
+    starts = _elsewhere(refitter, fit, 1)
+    assert [start.q.tolist() for start in starts] == [[2.0, 5.0, 0.0], [2.0, 12.0, 0.0]]
+    assert all(start.u == 0.5 for start in starts)
+
+
+def test_drives_are_weighed_by_what_their_replicates_differ_by(unicycle_log):
+    trials = tuple(replace(one, name=f"{one.manoeuvre}_{k}") for one in unicycle_log.training[:4:2] for k in (1, 2))
+    rng = np.random.default_rng(4)
+    rough = [replace(one, ground_truth=replace(one.ground_truth, x=one.ground_truth.x + size * rng.standard_normal()))
+             for one, size in zip(trials, (0.001, 0.001, 0.2, 0.2), strict=True)]
+    ones = np.ones((4, 3, 3))
+    plain = Measured(ones, ones, np.ones((4, 3, 5)), np.ones((4, 3, 5)))
+    weighed = by_own_noise(rough, plain).pose_mask[:, 0, 0]
+    assert replicate_noise(tuple(rough)) is not None
+    assert weighed[0] == weighed[1] > 1.1 > 0.95 > weighed[2] == weighed[3]
+    alone = [replace(one, name=one.manoeuvre) for one in trials[::2]]
+    assert by_own_noise(alone, plain) is plain
