@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from benchmarks.harness import RESULTS, device_name, figure, record
+from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
@@ -158,13 +159,18 @@ def ablation(options: argparse.Namespace) -> None:
             late = [line[key] for line in lines if key in line and line["env_steps"] >= 0.75 * last[-1]]
             values.append(statistics.median(late))
             config = json.loads((path / "config.json").read_text())
-        usual = json.loads(json.dumps(dataclasses.asdict(learner_preset("size12m"))))
-        changed = {field: value for field, value in config.items() if field in usual and value != usual[field]}
+        changed = min((_changes(config, size) for size in PRESETS), key=len)
         ending = "" if options.metric == "return" else f"_{options.metric.removesuffix('_return')}"
         entry = {**figure(values, "-", options.device), "seeds": sorted(seeds), "steps": last, "changed": changed}
         figures[f"ablation_{name}{ending}_return"] = entry
         print(f"{name}{ending}: {[round(value) for value in values]} at {last} steps, {changed}")
     record("course", CLAIM, figures)
+
+
+def _changes(config: dict[str, Any], size: str) -> dict[str, Any]:
+    """Settings of a run that are not those of a size."""
+    usual = json.loads(json.dumps(dataclasses.asdict(learner_preset(size))))
+    return {field: value for field, value in config.items() if field in usual and value != usual[field]}
 
 
 def load_run(path: Path) -> dict[str, Any]:
