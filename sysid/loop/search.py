@@ -396,7 +396,7 @@ def refitted(
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
-    for i in (i for i in best_of if refitter.stuck(fits[i])):
+    for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
         again = refitter.fit_all(_elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
         fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
     report("polish")
