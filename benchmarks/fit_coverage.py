@@ -22,7 +22,8 @@ from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
 from sysid.fit import FitConfig, fit_log, make_problem
 from sysid.log import Log, load_log
-from sysid.space import Space, make_space
+from sysid.models import with_effects
+from sysid.space import Space, make_space, searched
 from sysid.synthetic import write_dataset
 from whill_mjx.parameters import get_values, set_values
 from whill_mjx.presets import preset_params
@@ -33,6 +34,8 @@ PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")
 PLANT_LENGTH = 11.0  # s that are driven of each of them
 REPLICATES = 4
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
+MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension")
+USUAL = {"body.com_z": 0.1, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5, "sensor_delay.delay": 0.01}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted
@@ -46,10 +49,16 @@ def draw_truth(space: Space, random: np.random.Generator) -> np.ndarray:
     return space.to_values(np.clip(space.to_unit(np.where(signed, moved, scaled)), 1e-3, 0.97))
 
 
+def typical_vehicle() -> Any:
+    """The physical model with all that a fit gives it, at usual values: on most bounds nothing could be told."""
+    start = with_effects(preset_params(WHILL_CR, "physical"), MORE)
+    return set_values(start, tuple(USUAL), jnp.asarray(list(USUAL.values())))
+
+
 def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
     """A log of the physical model and its values."""
-    start = preset_params(WHILL_CR, "physical")
-    space = make_space(start, WHILL_CR)
+    start = typical_vehicle()
+    space = make_space(start, WHILL_CR, searched(start))
     values = draw_truth(space, np.random.default_rng([seed, 90]))
     truth = set_values(start, space.names, jnp.asarray(values))
     path = write_dataset(folder / "log", WHILL_CR, truth, manoeuvres=MANOEUVRES, held_out=(), replicates=REPLICATES,
@@ -98,7 +107,7 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     return {"torque_drive.kp": chair.kp * ratio, "torque_drive.ki": chair.ki * ratio,
             "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": inertia,
             "body.com_x": spec.rear_x + float(middle[0]), "body.com_y": float(middle[1]),
-            "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
+            "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 
 
 def job(label: str, iterations: int, compiled: Path) -> dict[str, Any]:

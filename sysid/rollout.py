@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -23,6 +23,7 @@ from flax import struct
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
+from whill_mjx.effects import PoseDelay, SensorDelay
 from whill_mjx.specs import VehicleSpec
 
 WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
@@ -239,6 +240,7 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
             state = plant.substeps(params, state, commands)
         return state, plant.observe(state)
 
+    params, latency = _without_latency(params)
     state = plant.place(params, start)
     if warm_up:
         state = plant.move(_settle(plant, params, state, start[3:], warm_up), start)
@@ -247,11 +249,34 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
     path = jnp.concatenate([first[None], later])
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
-    outside = [effect for effect in getattr(params, "effects", ()) if hasattr(effect, "outside")]
-    for effect in outside:
-        path = path.at[:, POSE].set(effect.outside((), path[:, POSE], plant.dt * command.shape[1])[1])
+    gap = plant.dt * command.shape[1]
+    if latency is not None:
+        path = path.at[:, ODOMETRY].set(_late(path[:, ODOMETRY], latency, gap))
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "outside"):
+            path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
     # The measured yaw may count full turns from another origin than the simulated one.
     return path.at[:, 2].add(jax.lax.stop_gradient(_turns(start[2] - first[2])))
+
+
+def _without_latency(params: Any) -> tuple[Any, Any]:
+    """The vehicle without a latency of its odometry, where that comes last, and the latency () [s] or None.
+
+    What was recorded is read later instead: the same law, without a buffer that every step would have to carry.
+    """
+    effects = getattr(params, "effects", ())
+    last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
+    if not last or getattr(last[0], "name", "") != SensorDelay.name:
+        return params, None
+    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0].delay
+
+
+def _late(path: jax.Array, latency: jax.Array, dt: float) -> jax.Array:
+    """Odometry (R, 5) as reported `latency` [s] after it was true, of one recorded every `dt` [s], yaw unwrapped."""
+    place = jnp.clip(jnp.arange(path.shape[0]) - latency / dt, 0.0, None)
+    before = jnp.minimum(place.astype(int), path.shape[0] - 2)
+    speeds = path[before, 3:] + (place - before)[:, None] * (path[before + 1, 3:] - path[before, 3:])
+    return jnp.concatenate([PoseDelay(latency).outside((), path[:, :3], dt)[1], speeds], axis=1)
 
 
 class PathReplay:

@@ -22,6 +22,7 @@ FIXED = {
     "body.mass": "acts only as a ratio to forces that are fitted; weigh the vehicle",
     "body.com_z": "has next to no effect on level ground",
 }
+LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns tell how high the mass lies
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,23 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
     middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
     return {**scaled, "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
             "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
+
+
+def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
+    """What a fit searches unless told otherwise: all but `FIXED`, and the height of the mass where wheels may skid.
+
+    Args:
+        asked: effects that were asked for; lateral damping of driven wheels, which slip besides, is searched only then.
+    """
+    from whill_mjx.parameters import describe
+
+    about = describe(params)
+    left_out = set(FIXED)
+    if LOADED in about:
+        left_out.discard("body.com_z")
+        if "lateral_damping" not in asked:
+            left_out.add("lateral_damping.c_rear")
+    return [name for name in about if name not in left_out]
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:

@@ -79,5 +79,5 @@ def plane_under(
     rear, front = (height[0] + height[1]) / 2, (height[2] + height[3]) / 2
     left, right = (height[0] + height[2]) / 2, (height[1] + height[3]) / 2
     rise_ahead = (front - rear) / (ahead[2] - ahead[0])
-    rise_left = (left - right) / (aside[0] - aside[1])
+    rise_left = (left - right) / ((aside[0] + aside[2] - aside[1] - aside[3]) / 2)
     return rear - rise_ahead * ahead[0], rise_ahead, rise_left

@@ -60,6 +60,7 @@ class World:
     wind: jax.Array  # (3,) world frame [m/s]
     payload: Payload | None = None
     ground: tuple = ()  # surfaces on the plane z = 0, see ground.py; none costs nothing
+    sag: jax.Array | float = 0.005  # () m, compression of each contact under a quarter of the weight
 
 
 @struct.dataclass

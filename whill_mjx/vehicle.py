@@ -160,7 +160,8 @@ def nominal_world(model: VehicleModel) -> World:
         wheel_radius=jnp.full(2, spec.wheel_radius),
         driven=jnp.array(driven),
     )
-    return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3))
+    sag = jnp.asarray(STATIC_SAG, jnp.result_type(float))
+    return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3), sag=sag)
 
 
 def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
@@ -182,7 +183,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
 
     forward, left, normal = under.contact_axes
     mass, inertia, com = mass_distribution(model, params, world)
-    stiffness, damping = suspension(params.body.mass)
+    stiffness, damping = suspension(params.body.mass, world.sag)
     smooth = SMOOTH_LOAD * params.body.mass * GRAVITY / 4  # [N]
     load = stiffness * (spec.wheel_radius - under.height) - damping * along(normal)
     return Motion(
@@ -217,9 +218,9 @@ def softplus(value: jax.Array) -> jax.Array:
     return jnp.maximum(value, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(value)))
 
 
-def suspension(mass: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Stiffness [N/m] and damping [N s/m] of each of the four contacts: STATIC_SAG under a quarter of the weight."""
-    stiffness = mass * GRAVITY / (4 * STATIC_SAG)
+def suspension(mass: jax.Array, sag: jax.Array | float = STATIC_SAG) -> tuple[jax.Array, jax.Array]:
+    """Stiffness [N/m] and damping [N s/m] of each of the four contacts: `sag` under a quarter of the weight."""
+    stiffness = mass * GRAVITY / (4 * sag)
     return stiffness, 2 * DAMPING_RATIO * jnp.sqrt(stiffness * mass / 4)
 
 
@@ -262,9 +263,11 @@ def place(
     """
     spec, body = model.spec, params.body
     middle = (spec.rear_x + spec.front_x) / 2  # of the four contacts
-    pitch = 4 * STATIC_SAG * (body.com_x - middle) / spec.wheelbase**2
-    roll = -4 * STATIC_SAG * body.com_y / spec.track**2
-    height = spec.wheel_radius - STATIC_SAG + pitch * middle
+    memory = tuple(effect.init() for effect in params.effects)
+    _, world = apply_chain(params.effects, memory, "world", nominal_world(model))
+    pitch = 4 * world.sag * (body.com_x - middle) / spec.wheelbase**2
+    roll = -4 * world.sag * body.com_y / spec.track**2
+    height = spec.wheel_radius - world.sag + pitch * middle
     x, y, yaw, v, omega = (jnp.asarray(value, dtype=body.mass.dtype) for value in (x, y, yaw, v, omega))
     forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
     # The origin lies reference_x behind (or ahead of) the reference point, which moves with v along the heading.
@@ -273,8 +276,6 @@ def place(
     velocity = v * forward + sideways * jnp.stack([-forward[1], forward[0]])
     zero = jnp.zeros_like(v)
     climb = zero
-    memory = tuple(effect.init() for effect in params.effects)
-    _, world = apply_chain(params.effects, memory, "world", nominal_world(model))
     if world.ground:
         level, ahead, aside = plane_under(world, origin[0], origin[1], yaw)
         height = level + height * jnp.sqrt(1 + ahead**2 + aside**2)

@@ -18,8 +18,7 @@ from benchmarks.fit_jobs import (
     staged,
 )
 from benchmarks.plant.chair import Chair
-from sysid.space import make_space
-from whill_mjx.presets import preset_params
+from sysid.space import make_space, searched
 from whill_mjx.specs import WHILL_CR
 
 
@@ -69,7 +68,8 @@ def test_coverage_counts_a_parameter_only_where_a_log_tells_it():
 
 @pytest.mark.quick
 def test_drawn_vehicles_lie_within_the_bounds_and_differ():
-    space = make_space(preset_params(WHILL_CR, "physical"), WHILL_CR)
+    start = fit_coverage.typical_vehicle()
+    space = make_space(start, WHILL_CR, searched(start))
     drawn = np.stack([fit_coverage.draw_truth(space, np.random.default_rng(n)) for n in range(50)])
     assert (drawn > space.low).all() and (drawn < space.high).all()
     assert (np.ptp(drawn, axis=0) > 0.01 * (space.high - space.low)).sum() > 5
@@ -84,6 +84,7 @@ def test_values_of_the_contact_plant_are_per_nominal_inertia():
     assert heavy["torque_drive.kp"] == pytest.approx(light["torque_drive.kp"] / 2, rel=0.1)
     assert light["torque_drive.limit"] / light["torque_drive.kp"] == pytest.approx(14.0 / 9.0)
     assert light["command_delay.delay"] == 0.02 and light["body.com_y"] == pytest.approx(0.0, abs=1e-6)
+    assert 0.1 < light["body.com_z"] < 0.167  # wheels are lower than the frame's 0.167 m above the axle
     # The centre of mass is ahead of the driven axle by a bit less than that of the frame alone.
     assert 0.12 < light["body.com_x"] - WHILL_CR.rear_x < 0.2
     assert 2.0 < light["body.yaw_inertia"] < 8.0

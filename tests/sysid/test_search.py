@@ -9,7 +9,7 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
 
 from sysid import gradient, tpe, uncertainty
-from sysid.log import Command, PoseStream, Start, Trial
+from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.objective import Noise
 from sysid.rollout import Replay, make_batch, predictions
 from sysid.space import Space
@@ -243,3 +243,47 @@ def test_a_vehicle_that_starts_in_motion_is_under_way_at_the_start_pose():
     speed = np.hypot(*np.diff(pose[:, :2], axis=0).T) / 0.05
     np.testing.assert_allclose(speed, 0.5, rtol=0.05)
     np.testing.assert_allclose(np.diff(pose[:, 2]) / 0.05, (pose[-1, 2] - pose[0, 2]) / t[-1], rtol=0.15)
+
+
+@pytest.mark.parametrize("speeds", [(0.0, 0.0), (0.5, 0.4)])
+def test_a_replay_reads_late_odometry_off_the_path(speeds):
+    """As the odometry without latency was that long before; counted from where the vehicle starts, as a log is."""
+    from sysid.rollout import vehicle_plant
+    from whill_mjx.config import VehicleConfig
+    from whill_mjx.effects import make_effect
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    t = np.arange(0.0, 1.2, 0.025)
+    command = Command(np.array([0.0, 0.2]), np.array([speeds[0], 0.7]), np.array([speeds[1], -0.3]))
+    trial = Trial("a_1", "a", command, OdometryStream(t, 0 * t, 0 * t, 0 * t, 0 * t, 0 * t), None,
+                  Start(v=speeds[0], omega=speeds[1]))
+    plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.0125))
+    batch, _ = make_batch((trial,), plant.dt)
+    params = preset_params(WHILL_CR, "physical")
+
+    def driven(late):
+        vehicle = params.replace(effects=(*params.effects, make_effect("sensor_delay", delay=late)))
+        return Replay(plant, batch, lambda values: vehicle).simulate(np.zeros((1, 1))).odometry[0, 0]
+
+    now, late = driven(0.0), driven(0.05)  # two records
+    np.testing.assert_allclose(late[2:, 3:], now[:-2, 3:], atol=1e-5)
+    np.testing.assert_allclose(np.diff(late[2:, 2]), np.diff(now[:-2, 2]), atol=1e-5)
+    step = lambda path: np.hypot(*np.diff(path[:, :2], axis=0).T)  # noqa: E731
+    np.testing.assert_allclose(step(late[2:]), step(now[:-2]), atol=1e-5)
+    np.testing.assert_allclose(late[0, :3], 0.0, atol=1e-6)
+
+
+@pytest.mark.quick
+def test_how_high_the_mass_lies_is_searched_where_wheels_skid_by_their_load():
+    from sysid.models import with_effects
+    from sysid.space import searched
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    physical = with_effects(preset_params(WHILL_CR, "physical"), ("lateral_damping",))
+    assert {"body.com_z", "lateral_damping.c_front"} <= set(searched(physical))
+    assert "lateral_damping.c_rear" not in searched(physical)
+    assert "lateral_damping.c_rear" in searched(physical, ("lateral_damping",))
+    paper = searched(preset_params(WHILL_CR, "paper"))
+    assert "body.com_z" not in paper and "lateral_damping.c_rear" in paper

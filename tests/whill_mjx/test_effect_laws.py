@@ -252,6 +252,22 @@ def test_turn_efficiency_moves_the_driven_contacts_out(name, free):
 
 
 @quick
+@pytest.mark.parametrize(
+    ("name", "freedom", "passive"), [("whill_cr", 1.0, 0.0), ("whill_cr", 0.5, 0.124), ("husky", 1.0, 0.275)]
+)
+def test_a_pivot_takes_the_roll_from_the_passive_wheels(name, freedom, passive):
+    model, params = chair(name)
+    _, world = make_effect("axle_pivot", freedom=freedom).world((), nominal_world(model))
+    half = model.spec.track / 2
+    np.testing.assert_allclose(world.geometry.contact_y, [half, -half, passive, -passive], rtol=1e-6, atol=1e-7)
+    leaning = place(model, params, 0.0, 0.0, 0.0)
+    roll = jnp.array([1.0, 1e-3, 0.0, 0.0])  # quaternion of 2 mrad to the right
+    load = measure(model, params, world, leaning.replace(qpos=leaning.qpos.at[3:7].set(roll))).normal_force
+    share = (load[3] - load[2]) / (load[1] - load[0])
+    np.testing.assert_allclose(share, passive / half, atol=0.02)
+
+
+@quick
 def test_a_payload_adds_its_mass_and_inertia_about_the_common_centre():
     """52 kg at the origin and 13 kg 0.5 m ahead: centre at 0.1 m; I_z grows by 52 x 0.1^2 + 13 x 0.4^2."""
     payload = Payload(*(jnp.array(value) for value in (13.0, 0.5, 0.0, 0.0)))

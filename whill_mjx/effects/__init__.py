@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from whill_mjx.effects.acceleration_limit import AccelerationLimit
 from whill_mjx.effects.actuator_lag import ActuatorLag
 from whill_mjx.effects.air_drag import AirDrag
+from whill_mjx.effects.axle_pivot import AxlePivot
 from whill_mjx.effects.backlash import Backlash
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.bump import Bump
@@ -42,6 +43,7 @@ from whill_mjx.effects.slip_traction import SlipTraction
 from whill_mjx.effects.slope import Slope
 from whill_mjx.effects.state_rate import StateRate
 from whill_mjx.effects.supply_sag import SupplySag
+from whill_mjx.effects.suspension import Suspension
 from whill_mjx.effects.torque_drive import TorqueDrive
 from whill_mjx.effects.torque_saturation import TorqueSaturation
 from whill_mjx.effects.track_width import TrackWidth
@@ -59,6 +61,7 @@ EFFECTS: dict[str, type[Effect]] = {
         AccelerationLimit,
         ActuatorLag,
         AirDrag,
+        AxlePivot,
         Backlash,
         Bump,
         CasterKick,
@@ -94,6 +97,7 @@ EFFECTS: dict[str, type[Effect]] = {
         Slope,
         StateRate,
         SupplySag,
+        Suspension,
         TorqueDrive,
         TorqueSaturation,
         TrackWidth,

@@ -20,7 +20,7 @@ class Ahead:
 
     forward: jax.Array  # (2,) speed of the driven contacts of the left and the right side [m/s]
     left: jax.Array  # (2,) speed of the rear and the front contacts to the left [m/s]
-    arm_y: jax.Array  # (2,) of the left and right contacts, from the centre of mass to the left [m]
+    arm_y: jax.Array  # (2,) of the driven contacts of each side, from the centre of mass to the left [m]
     arm_x: jax.Array  # (2,) of the rear and front contacts, from the centre of mass forward [m]
 
 
@@ -36,7 +36,7 @@ def look_ahead(motion: Motion) -> Ahead:
     ax = others.fx / mass + gravity[0] + rate * vy
     ay = others.fy / mass + gravity[1] - rate * vx
     turn = (others.tz - com[0] * others.fy + com[1] * others.fx) / motion.yaw_inertia
-    arm_y = motion.world.geometry.contact_y[:2] - com[1]
+    arm_y = driven_mean(motion, motion.world.geometry.contact_y) - com[1]
     arm_x = motion.world.geometry.contact_x[1:3] - com[0]
     return Ahead(
         driven_mean(motion, motion.contact_vx) + motion.dt * (ax - turn * arm_y),
