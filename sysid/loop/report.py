@@ -69,6 +69,10 @@ SCHEMA = 1
 KIND = "sysid-close-loop"
 CONFIDENCE = 0.95
 RESAMPLES = 2000
+FOLLOWED = 0.9
+"""Largest share of a direction that one manoeuvre tells with which what it leaves is made larger."""
+NEARLY = 0.9
+"""Share of the largest size that is looked for from which a size is at its end."""
 UNDONE = 0.5
 """What two effects change together, as a share of what each does by itself, below which one may stand for both."""
 
@@ -235,8 +239,8 @@ def warnings(result: Result) -> list[str]:
     said += [f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
              "catalogue does not have may do what is left of both"
              for first, second, left in undone(found.final) if left < UNDONE]
-    said += [f"{name} lies within its standard error of the end of what is looked for: another effect may do it with "
-             "less" for name in at_the_end(result)]
+    said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
+             for name in at_the_end(result)]
     gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
     quantity = max(gains, key=lambda name: gains[name])
     if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
@@ -265,11 +269,11 @@ def undone(final: Refit) -> list[tuple[str, str, float]]:
 
 
 def at_the_end(result: Result) -> list[str]:
-    """Parameters of the final fit that are as large as they may be, within one standard error."""
+    """Parameters of the final fit that are nearly as large as they may be."""
     final = result.search.final
-    deviation, axes = deviations(final, result), [axis for one in final.hypotheses for axis in one.axes]
-    return [axis.parameter for axis, q, error in zip(axes, final.q, deviation, strict=True)
-            if not axis.dependent and abs(q) + error >= axis.limit]
+    axes = [axis for one in final.hypotheses for axis in one.axes]
+    return [axis.parameter for axis, q in zip(axes, final.q, strict=True)
+            if not axis.dependent and abs(q) >= NEARLY * axis.limit]
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
@@ -328,20 +332,25 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
 
 
 def deviations(final: Refit, result: Result) -> np.ndarray:
-    """(k,) standard errors of the coordinates: by how much they change when a manoeuvre is left out (the jackknife,
-    which holds for a wrong model and few manoeuvres too), and what they seem to be on days without the effect."""
-    precision, groups = result.evidence.precision, result.evidence.groups
-    matrix, size = with_prior(final, precision), len(final.u)
+    """(k,) standard errors of the coordinates: from whole manoeuvres, which a wrong form pulls each its own way, and
+    what the coordinates seem to be on days without the effect.
+
+    What a manoeuvre leaves is smaller than its error by what the fit followed it: the more, the more of a direction it
+    tells (bias-reduced linearisation, Bell and McCaffrey 2002). Where it tells nearly all, none can contradict it.
+    """
+    groups = result.evidence.groups
+    matrix, size = with_prior(final, result.evidence.precision), len(final.u)
+    root = np.linalg.inv(np.linalg.cholesky(matrix))
     moved = []
     for group in groups:
         flat = final.jacobian[list(group)].reshape(-1, len(matrix))
-        left = matrix - flat.T @ flat + 1e-9 * np.diag(np.diag(matrix))
-        moved.append(np.linalg.solve(left, flat.T @ final.residual[list(group)].reshape(-1)))
-    jackknife = np.square(moved).sum(0) * (len(groups) - 1) / len(groups)
-    told = np.maximum(np.diag(np.linalg.inv(matrix)), jackknife)[size:]
+        told, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
+        score = along.T @ (root @ (flat.T @ final.residual[list(group)].reshape(-1)))
+        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(told, 0.0, FOLLOWED)))))
+    variance = np.maximum(np.diag(root.T @ root), np.square(moved).sum(0))[size:]
     wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
               for one, q in zip(final.hypotheses, final.split, strict=True)]
-    return np.asarray(np.sqrt(told + np.concatenate([[], *wander])))
+    return np.asarray(np.sqrt(variance + np.concatenate([[], *wander])))
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:

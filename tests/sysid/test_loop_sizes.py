@@ -40,6 +40,16 @@ def result_of(axes=(ONE,)):
                            hypotheses=axes, prepared=SimpleNamespace(wander=no_wander(layout)))
 
 
+def test_a_size_that_one_manoeuvre_tells_is_not_judged_by_the_others():
+    rng = np.random.default_rng(5)
+    fit = fitted(rng)
+    columns = fit.jacobian.copy()
+    columns[2:, :, 1] *= 1e-3
+    (low,), (high,) = intervals(replace(fit, jacobian=columns), result_of())
+    told = 1 / np.sqrt(np.square(columns[:2, :, 1]).sum())
+    assert 4 * told < high - low < 16 * told
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.1, 0.5])
 def test_intervals_hold_the_mean_size_however_much_manoeuvres_differ(spread):
     rng, inside = np.random.default_rng(0), []
