@@ -1,7 +1,7 @@
 """Coverage of the fit's 90 % intervals: logs of vehicles with known parameters, each fitted from the preset's values.
 
 Synthetic logs are driven by the model that is fitted, with values drawn around the preset's; logs of the contact plant
-by another physics, of which the values that both have in common are known. Each log has four replicates of a few short
+by another physics, of which the values that both have in common are known. Each log has six replicates of a few short
 manoeuvres (10 s, 11 s); the search and the intervals are those of `sysid.fit` without options.
 """
 
@@ -32,7 +32,7 @@ from whill_mjx.specs import WHILL_CR, VehicleSpec
 MANOEUVRES = ("straight", "turn", "circle", "s_curve")
 PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")
 PLANT_LENGTH = 11.0  # s that are driven of each of them
-REPLICATES = 4
+REPLICATES = 6
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
 MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension")
 USUAL = {"body.com_z": 0.1, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5, "sensor_delay.delay": 0.01}
