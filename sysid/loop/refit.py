@@ -19,6 +19,8 @@ TOLERANCE = 2e-3
 """Share of what is left above the noise that a step must bring to go on."""
 REACH = 4.0
 """Standard deviations of the day-to-day spread that a base parameter may be off. What lies further is an effect."""
+STIFF = 0.25
+"""Share of the day-to-day spread that a fit leaves base parameters which shall hardly move."""
 STEP_Q = 0.08
 """Difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small."""
 
@@ -99,6 +101,14 @@ class Refitter:
         """The same for other drives with these commands, of white features `target` (B, n)."""
         other = copy.copy(self)
         other.target = target
+        return other
+
+    def stiffened(self) -> Refitter:
+        """The same with base parameters that hardly move."""
+        other = copy.copy(self)
+        other.precision = self.precision / STIFF**2
+        other.low = self.reference.u + STIFF * (self.low - self.reference.u)
+        other.high = self.reference.u + STIFF * (self.high - self.reference.u)
         return other
 
     def white_of(self, u: np.ndarray) -> np.ndarray:

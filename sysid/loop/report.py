@@ -51,7 +51,7 @@ from sysid.loop.evidence import Evidence, at_fit
 from sysid.loop.falsifiers import as_report as predictions_of
 from sysid.loop.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.loop.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
-from sysid.loop.refit import Refit
+from sysid.loop.refit import Refit, Start
 from sysid.loop.solver import Solver
 from sysid.loop.unexplained import held_back_gains
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
@@ -73,6 +73,8 @@ FOLLOWED = 0.9
 """Largest share of a direction that one manoeuvre tells with which what it leaves is made larger."""
 NEARLY = 0.9
 """Share of the largest size that is looked for from which a size is at its end."""
+MOVED = 0.01
+"""p-value of how far base parameters went, below which they went further than from day to day."""
 UNDONE = 0.5
 """What two effects change together, as a share of what each does by itself, below which one may stand for both."""
 
@@ -282,7 +284,8 @@ def effects(result: Result) -> list[dict[str, Any]]:
     Values are those of the joint refit that decided; the vehicle file has them after the last refit to whole poses.
     """
     final, found = result.search.final, result.search
-    low, high = intervals(final, result)
+    ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
+    low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
     values = dict(zip(result.names, final.values.tolist(), strict=True))
     base = base_values(result.full)
     for index, name in enumerate(result.reference.space.names):
@@ -305,6 +308,24 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "evidence": evidence_for(result, slice(start, stop), one.effect)})
         start = stop
     return out
+
+
+def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
+    """The final effects fitted beside base parameters that hardly move; nothing where these moved as days do.
+
+    Where the form is not quite right, base parameters go further than from day to day to mend it, and take a part of
+    the effect along or give it one. How much lies between this fit and the final one.
+    """
+    from scipy import stats
+
+    from sysid.loop.next_manoeuvre import refitter_of
+
+    final, reference = result.search.final, result.reference
+    away = final.u - reference.u
+    if not reference.known or away @ result.evidence.precision @ away < stats.chi2.isf(MOVED, len(away)):
+        return []
+    refitter = refitter_of(result).stiffened()
+    return refitter.fit_all([Start(final.hypotheses, reference.u, final.q)], iterations)
 
 
 def unit_of(parameter: str) -> str:

@@ -33,7 +33,7 @@ from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.report import make_report, own_floor, replay, warnings, write_run
+from sysid.loop.report import beside_still_base, effects, make_report, own_floor, replay, warnings, write_run
 from sysid.loop.search import Candidate, Thresholds, _own
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
@@ -199,6 +199,21 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
     assert provenance["verdict"] == "named"
     assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_base_parameters_that_went_far_widen_the_interval_of_an_effect(sloping):
+    usual = effects(sloping)[0]["parameters"]
+    final, reference = sloping.search.final, sloping.reference
+    assert not beside_still_base(replace(sloping, search=replace(sloping.search, final=replace(
+        final, u=reference.u.copy()))))
+    far = replace(final, u=reference.u + 3.5 * np.sqrt(np.diag(reference.spread)))
+    moved = replace(sloping, search=replace(sloping.search, final=far))
+    [still] = beside_still_base(moved)
+    away = (still.u - reference.u) / np.sqrt(np.diag(reference.spread))
+    assert np.abs(away).max() <= 1.001 < 3.5
+    for name, one in effects(moved)[0]["parameters"].items():
+        low, high = one["interval"]
+        assert low <= usual[name]["interval"][1] and high >= usual[name]["interval"][0]
 
 
 def test_the_report_says_what_a_named_effect_stood(sloping):
