@@ -75,7 +75,7 @@ def find_preset(name: str, task: str) -> Preset:
         case "cpu":
             course = make_task(task, action_repeat=5, **easy)
             small = PpoConfig(rollout=32, minibatches=4, width=128, channels=(16, 32, 32))
-            return Preset(course, learner_preset("cpu", lr=6e-4), 8_000, instances=8, ppo=small)
+            return Preset(course, learner_preset("cpu", lr=6e-4, mean_pull=0.01), 8_000, instances=8, ppo=small)
         case "smoke":
             course = make_task(task, action_repeat=5, **easy)
             tiny = learner_preset("cpu", deter=64, hidden=32, units=32, stoch=8, patch_units=16, batch_size=4)
