@@ -26,7 +26,8 @@ from benchmarks.undeclared_reference import reference_days
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
 from sysid.log import load_log
 from sysid.loop.report import effects as named_effects
-from sysid.loop.report import make_report, warnings, write_run
+from sysid.loop.report import make_report, write_run
+from sysid.loop.trust import warnings
 from sysid.report import write_report
 from sysid.statistics import upper_rate
 
@@ -417,7 +418,7 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
 
 
 def warned(one: dict[str, Any]) -> bool:
-    """Whether a name comes with a warning (`sysid.loop.report.warnings`); one is that more is left than days differ
+    """Whether a name comes with a warning (`sysid.loop.trust.warnings`); one is that more is left than days differ
     by, which verdicts of before others were kept tell too."""
     return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
 

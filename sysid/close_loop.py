@@ -34,13 +34,14 @@ from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with
 from sysid.loop.drives import CHUNK, Drives, make_drives
 from sysid.loop.evidence import PARTS, Evidence, column_layout, gather
 from sysid.loop.falsifiers import FALSIFIERS
+from sysid.loop.found import Search, Thresholds
 from sysid.loop.guards import Stood, guarded, stand
 from sysid.loop.late_pose import PARAMETER, told_late
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.reference import Reference, make_reference
 from sysid.loop.refit import Refitter
-from sysid.loop.search import Search, Thresholds, search
+from sysid.loop.search import search
 from sysid.loop.unexplained import best_gain
 from sysid.loop.wander import Wander, estimate
 from sysid.models import with_effects

@@ -14,8 +14,8 @@ import numpy as np
 
 from sysid.log import Trial
 from sysid.loop.agreement import disagreement, foretold
+from sysid.loop.found import Search, Thresholds
 from sysid.loop.noise import repeated
-from sysid.loop.search import Search, Thresholds
 
 UNTOLD = "neither replicates nor reference drives tell the noise, so whether anything else is missing cannot be told"
 

@@ -10,8 +10,8 @@ import numpy as np
 from sysid.log import Trial
 from sysid.loop.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.loop.falsifiers import Tested, in_words, put_to_test
+from sysid.loop.found import Search, Thresholds
 from sysid.loop.refit import Refitter
-from sysid.loop.search import Search, Thresholds
 
 
 @dataclass(frozen=True)

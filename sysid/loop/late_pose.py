@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid.loop.evidence import with_values
+from sysid.loop.found import Candidate
 from sysid.loop.pose_lag import pose_lag
 from sysid.loop.poses import fit_poses
-from sysid.loop.search import Candidate
 from sysid.space import make_space
 
 if TYPE_CHECKING:

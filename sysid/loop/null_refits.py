@@ -17,11 +17,13 @@ import numpy as np
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit, white_leftover
+from sysid.loop.found import Search, Thresholds
 from sysid.loop.pairs import PairScan, scan_again
 from sysid.loop.reference import alike
 from sysid.loop.refit import Refit, Refitter
+from sysid.loop.rounds import refitted
 from sysid.loop.scan import Scan, best, drawn_away, family, tail
-from sysid.loop.search import Search, Thresholds, pair_round, refitted
+from sysid.loop.search import pair_round
 from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,119 +11,14 @@ from sysid.loop.agreement import beside, disagreement, foretold, interval_of_sum
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit
-from sysid.loop.pairs import PairScan, scan_pairs
+from sysid.loop.found import LARGEST, Candidate, Search, Thresholds
+from sysid.loop.pairs import scan_pairs
 from sysid.loop.refit import Refit, Refitter, Start, moved_last
-from sysid.loop.scan import Scan, best, run
+from sysid.loop.rounds import FIRST_LOOK, POLISH, candidate_of, refitted, rescan
+from sysid.loop.scan import best, run
 from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress
-
-LARGEST = 4  # members of a class
-FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
-ELSEWHERE = (1.0, 3.0)
-"""Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
-
-    alpha: float = 0.005
-    """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
-    the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
-    alarms."""
-    share: float = 0.6
-    """Least share of the excess residual that named effects explain together."""
-    most: float = 0.5
-    """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
-    excess: float = 0.06
-    """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
-    quiet: float = 0.05
-    """p-value of the excess that is left from which it passes for a day's own."""
-    second: float = 0.25
-    """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
-    step: float = 0.15
-    """Least further share of the excess that it explains."""
-    own: float = 0.3
-    """Least share of what the effects before it left that a smaller one must explain."""
-    agree: float = 0.6
-    """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
-    of it, at which it is there for its own sake."""
-    alone: float = 1.8
-    """Largest factor by which its gain may then change."""
-    differ: float = 0.35
-    """Largest disagreement of manoeuvres on its size."""
-    little: float = 0.1
-    """What one must explain of it that manoeuvres tell of each other."""
-    foretold: float = 0.7
-    """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
-    same: float = 0.2
-    """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
-    loss: float = 0.1
-    """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
-    scatter: float = 1.0
-    """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
-    more one in six would find the opposite."""
-    rounds: int = 3
-    pairs: int = 3
-    """Pairs of effects that are refitted."""
-    worthwhile: float = 0.15
-    """Least scanned gain of an effect that is refitted, as a share of the best one's."""
-    candidates: int = 4
-    """Effects refitted in a round, of each scan."""
-    close: float = 0.5
-    """Share of the best refit's gain from which another one is polished too."""
-    rival: float = 0.5
-    """|cos| of two effects' signatures above which one is not named before the other was refitted."""
-    between: float = 0.5
-    """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
-    alike: float = 0.9
-    """|cos| of two effects' signatures above which they are not told apart."""
-
-
-@dataclass
-class Candidate:
-    """One refitted hypothesis of a round."""
-
-    hypothesis: Hypothesis
-    gain: float
-    """By how much it lowers the cost, refitted."""
-    p: float
-    """Family-wise, of that gain."""
-    share: float
-    refit: Refit
-    own: bool = False
-    """Small beside the first, but as large and as useful without it, and most of what the others left."""
-
-
-@dataclass
-class Search:
-    """What the search found."""
-
-    verdict: str
-    base: Refit
-    final: Refit
-    scan: Scan
-    rounds: list[list[Candidate]] = field(default_factory=list)
-    accepted: list[Candidate] = field(default_factory=list)
-    classes: list[list[str]] = field(default_factory=list)
-    crowd: list[str] = field(default_factory=list)
-    """Effects that look alike too, beyond the `LARGEST` nearest of a class."""
-    share: float = 0.0
-    excess: tuple[float, float] = (0.0, 0.0)
-    """Squared white residual over its number, less 1: before and after."""
-    reason: str = ""
-    pairs: PairScan | None = None
-    together: float | None = None
-    """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
-
-    @property
-    def p_value(self) -> float:
-        """Of "nothing is missing": that of the scan and, where refits were tried, of the best of them."""
-        if self.together is not None:
-            return self.together
-        refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
-        return max(self.scan.p_family, refitted)
 
 
 def search(
@@ -169,7 +64,7 @@ def search(
         if len(found.accepted) == thresholds.rounds:
             break
         scans = [far, (first.gain, first.worth, first.q)] if number == 0 else [
-            _rescan(evidence, hypotheses, current, refitter, wander)]
+            rescan(evidence, hypotheses, current, refitter, wander)]
         candidates = refitted(refitter, current, evidence, hypotheses, wander, first, scans, thresholds, similar,
                               explained, lambda text: report(f"{text}, round {len(found.rounds) + 1}"))
         found.rounds.append(candidates)
@@ -222,7 +117,7 @@ def _drop_stand_ins(
         [without] = refitter.fit_all([Start(kept, final.u, q)], POLISH)
         if explained(final) - explained(without) >= thresholds.step:
             continue
-        worth = _candidate(hypotheses.index(one.hypothesis), moved_last(final, place), without, evidence, hypotheses,
+        worth = candidate_of(hypotheses.index(one.hypothesis), moved_last(final, place), without, evidence, hypotheses,
                            wander, found.scan, 0.0)
         if worth.p >= thresholds.alpha:
             number = found.accepted.index(one)
@@ -269,7 +164,7 @@ def pair_round(
     members = []
     for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
         h = hypotheses.index(fit.hypotheses[-1])
-        one = _candidate(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
+        one = candidate_of(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
         part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
         told = foretold(fit, part, evidence.groups, refitter.precision)
         if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
@@ -370,146 +265,6 @@ def _decide(
         found.verdict = "unexplained"
         found.reason = (f"the best of the catalogue explains {max(found.share, 0):.0%} of what exceeds the noise, and "
                         f"{after:.0%} above the noise is left")
-
-
-Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
-"""Gain (H,), worth (H,) and coordinates of every hypothesis."""
-
-
-def refitted(
-    refitter: Refitter, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
-    first: Scan, scans: Sequence[Looked], thresholds: Thresholds, similar: np.ndarray,
-    explained: Callable[[Refit], float], report: Callable[[str], None],
-) -> list[Candidate]:
-    """One round: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and so is
-    what might imitate the best; in order of gain."""
-    taken = {one.effect for one in current.hypotheses}
-    chosen = _starts(hypotheses, scans, first, taken, thresholds)
-    at = Start.at(current)
-
-    def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
-        return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
-
-    fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
-    report("refits")
-    least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
-    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
-    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
-        fits[i] = fit
-    for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
-        again = refitter.fit_all(_elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
-        fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
-    report("polish")
-    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
-    chosen += [(h, _best_start(scans, h)) for h in rivals]
-    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
-    report("rivals")
-    candidates = [_candidate(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
-                  for (h, _), fit in zip(chosen, fits, strict=True)]
-    return sorted(candidates, key=lambda one: -one.gain)
-
-
-def _rescan(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], current: Refit, refitter: Refitter, wander: Wander
-) -> Looked:
-    """Of every hypothesis given what is accepted so far."""
-    return best(Solver(at_fit(evidence, current.residual, current.jacobian, current.u - refitter.reference.u)),
-                hypotheses, wander)
-
-
-def _starts(
-    hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, taken: set[str], thresholds: Thresholds
-) -> list[tuple[int, np.ndarray]]:
-    """Hypotheses to refit and where to start.
-
-    Of each scan those that gain most, and of the last the one that stands out most. A large effect shows best in the
-    scan around the reference, a small one in that around the base refitted to these drives.
-    """
-    left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
-    order: dict[str, tuple[int, np.ndarray]] = {}
-    for number, (gain, worth, q) in enumerate(scans):
-        standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
-        chosen = sorted(standing, key=lambda h: -gain[h])
-        chosen = [h for h in chosen if gain[h] >= thresholds.worthwhile * gain[chosen[0]]]
-        if number == len(scans) - 1:
-            chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
-        new = 0
-        for h in chosen:
-            wide, start = _widest(hypotheses, h, q, standing)
-            if hypotheses[wide].key not in order and new < thresholds.candidates:
-                order[hypotheses[wide].key] = (wide, start)
-                new += 1
-    return list(order.values())
-
-
-def _rivals(
-    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
-    thresholds: Thresholds,
-) -> list[int]:
-    """What might imitate the best fit and was not tried: it must have had its chance before another is named."""
-    if not fits:
-        return []
-    winner = tried[int(np.argmin([fit.cost for fit in fits]))]
-    done = {hypotheses[h].effect for h in tried} | taken
-    out: list[int] = []
-    for h in np.argsort(-similar[winner]):
-        if similar[winner, h] > thresholds.rival and hypotheses[h].effect not in done:
-            done.add(hypotheses[h].effect)
-            out.append(int(h))
-    return out[: thresholds.candidates]
-
-
-def _elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
-    """Other starts of a fit whose last effect comes behind `before` coordinates: the base parameters as they were, and
-    what only changes the effect at 0, so that the effect itself has the first chance."""
-    q = fit.q.copy()
-    axes = fit.hypotheses[-1].axes
-    q[before:] = [0.0 if axis.dependent else size for axis, size in zip(axes, q[before:], strict=True)]
-    limits = np.array([axis.limit for axis in axes])
-    out = []
-    for factor in ELSEWHERE:
-        start = q.copy()
-        start[before:] = np.clip(factor * q[before:], -limits, limits)
-        out.append(Start(fit.hypotheses, refitter.reference.u, start))
-    return out
-
-
-def _best_start(scans: Sequence[Looked], h: int) -> np.ndarray:
-    """Coordinates from the scan in which a hypothesis gains most; a small size where it gains nothing."""
-    gain, _, q = max(scans, key=lambda scan: scan[0][h])
-    return q[h] if gain[h] > 0 else np.full(len(q[h]), 0.5)
-
-
-def _widest(
-    hypotheses: Sequence[Hypothesis], h: int, q: Sequence[np.ndarray], standing: Sequence[int]
-) -> tuple[int, np.ndarray]:
-    """The hypothesis of the same effect that has all axes of h and more, started where those alone were found."""
-    mine = {axis.parameter for axis in hypotheses[h].axes}
-    wider = [i for i, one in enumerate(hypotheses) if one.effect == hypotheses[h].effect
-             and mine < {axis.parameter for axis in one.axes}]
-    if not wider:
-        return h, q[h]
-    most = max(wider, key=lambda i: len(hypotheses[i].axes))
-    alone = {hypotheses[i].axes[0].parameter: float(q[i][0]) for i in standing
-             if hypotheses[i].effect == hypotheses[h].effect and len(hypotheses[i].axes) == 1}
-    return most, np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[most].axes])
-
-
-def _candidate(
-    h: int, fit: Refit, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
-    first: Scan, share: float,
-) -> Candidate:
-    """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
-    one = hypotheses[h]
-    gain = max(current.cost - fit.cost, 0.0)
-    q = fit.q[-len(one.axes) :]
-    inside = beside(fit.products(evidence.precision), len(q))
-    moved = np.abs(q) > 1e-9
-    inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
-    alone = float(q[moved] @ inside @ q[moved])
-    whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
-    worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
-    return Candidate(one, gain, first.p_of(h, worth), share, fit)
 
 
 def _class_of(

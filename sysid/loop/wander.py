@@ -85,10 +85,9 @@ class Wander:
 
         return float(stats.t.isf(alpha, self.freedom)) * self.excess
 
-
     def smooth_limit(self, alpha: float) -> float:
-        """What they gain per trial on a day with nothing in it with probability alpha; infinite where days do not
-        tell."""
+        """What smooth functions gain per trial on a day with nothing in it with probability alpha; infinite where days
+        do not tell."""
         from scipy import stats
 
         return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")

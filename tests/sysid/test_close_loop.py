@@ -28,13 +28,15 @@ from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives, make_drives
 from sysid.loop.evidence import Columns, signature_columns
 from sysid.loop.falsifiers import course_of, put_to_test, without_each
 from sysid.loop.features import CHANNELS, make_features
+from sysid.loop.found import Candidate, Thresholds
 from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.report import beside_still_base, effects, make_report, own_floor, replay, warnings, write_run
-from sysid.loop.search import Candidate, Thresholds, _own
+from sysid.loop.report import effects, make_report, own_floor, replay, write_run
+from sysid.loop.search import _own
+from sysid.loop.trust import beside_still_base, warnings
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant

@@ -14,8 +14,8 @@ from sysid.loop.alone import UNTOLD, judged, simplest, stands_alone
 from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import manoeuvre_groups
 from sysid.loop.features import BIN, bin_width, make_features
+from sysid.loop.found import Candidate, Thresholds
 from sysid.loop.refit import Refit
-from sysid.loop.search import Candidate, Thresholds
 from sysid.rollout import make_batch, path_of
 from whill_mjx.effects import make_effect
 

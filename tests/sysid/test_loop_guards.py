@@ -10,9 +10,9 @@ from sysid.loop import falsifiers
 from sysid.loop.agreement import SCATTER, heterogeneity, interval_of_sum
 from sysid.loop.catalogue import Axis, Hypothesis, hypotheses
 from sysid.loop.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, course_of, side, sizes_in_parts
+from sysid.loop.found import Candidate, Search, Thresholds
 from sysid.loop.guards import Stood, guarded
 from sysid.loop.refit import Refit
-from sysid.loop.search import Candidate, Search, Thresholds
 from whill_mjx.presets import preset
 
 pytestmark = pytest.mark.quick

@@ -13,9 +13,9 @@ from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.loop import late_pose
 from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import Columns
+from sysid.loop.found import Search
 from sysid.loop.pose_lag import pose_lag, sign_flips
 from sysid.loop.refit import Refit
-from sysid.loop.search import Search
 from sysid.space import Space
 
 pytestmark = pytest.mark.quick

@@ -8,12 +8,13 @@ import pytest
 
 from sysid.loop.catalogue import Axis, Hypothesis
 from sysid.loop.evidence import Evidence, column_layout
+from sysid.loop.found import Thresholds
 from sysid.loop.pairs import scan_again, scan_pairs, tail
 from sysid.loop.power import false_alarms, power_curve, simulated_days
 from sysid.loop.refit import Refit, moved_last
 from sysid.loop.report import detectable
 from sysid.loop.scan import run
-from sysid.loop.search import Thresholds, search
+from sysid.loop.search import search
 from sysid.loop.wander import no_wander
 
 pytestmark = pytest.mark.quick

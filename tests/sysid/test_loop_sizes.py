@@ -10,8 +10,8 @@ from sysid.loop.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
 from sysid.loop.evidence import column_layout
 from sysid.loop.poses import by_own_noise
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.report import at_the_end, intervals, undone
-from sysid.loop.search import _elsewhere
+from sysid.loop.rounds import elsewhere
+from sysid.loop.trust import at_the_end, intervals, undone
 from sysid.loop.wander import no_wander
 from sysid.metrics import replicate_noise
 from sysid.rollout import Measured
@@ -108,7 +108,7 @@ def test_a_fit_at_the_end_of_a_range_starts_anew_with_the_effect_alone():
     fit = Refit((ONE, payload), np.array([0.4]), np.array([2.0, 5.0, 3.0]), 0.0, *[np.zeros((1, 1))] * 2, np.zeros(1))
     assert not refitter.stuck(fit)
     assert refitter.stuck(replace(fit, u=np.zeros(1))) and refitter.stuck(replace(fit, q=np.array([2.0, 5.0, -12.0])))
-    starts = _elsewhere(refitter, fit, 1)
+    starts = elsewhere(refitter, fit, 1)
     assert [start.q.tolist() for start in starts] == [[2.0, 5.0, 0.0], [2.0, 12.0, 0.0]]
     assert all(start.u == 0.5 for start in starts)
 
