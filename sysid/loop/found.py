@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.pairs import PairScan
 from sysid.loop.refit import Refit
@@ -112,3 +114,14 @@ class Search:
             return self.together
         refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
         return max(self.scan.p_family, refitted)
+
+
+def excess_of(fit: Refit, count: float) -> float:
+    """Squared white residual of a fit over its number of values, less 1."""
+    return float(np.square(fit.residual).sum()) / count - 1
+
+
+def explained_share(base: Refit, count: float, thresholds: Thresholds, fit: Refit) -> float:
+    """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
+    before = excess_of(base, count)
+    return float(np.clip((before - excess_of(fit, count)) / max(before, thresholds.excess), 0.0, 1.0))

@@ -17,10 +17,10 @@ import numpy as np
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit, white_leftover
-from sysid.loop.found import Search, Thresholds
+from sysid.loop.found import Search, Thresholds, excess_of, explained_share
 from sysid.loop.pairs import PairScan, scan_again
 from sysid.loop.reference import alike
-from sysid.loop.refit import Refit, Refitter
+from sysid.loop.refit import Refitter
 from sysid.loop.rounds import refitted
 from sysid.loop.scan import Scan, best, drawn_away, family, tail
 from sysid.loop.search import pair_round
@@ -76,7 +76,7 @@ def run(
             candidates = refitted(one, base, around, hypotheses, wander, scan, [looked], thresholds, similar,
                                   lambda _: 0.0, lambda _: None)
             p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
-        excess = float(np.square(base.residual).sum()) / measured - 1
+        excess = excess_of(base, measured)
         alarm = p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha
         if not alarm and pairs is not None:
             again = scan_again(pairs, around, hypotheses, wander)
@@ -84,19 +84,13 @@ def run(
                 day = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
                              pairs=again)
                 pair_round(day, around, hypotheses, one, wander, similar, thresholds,
-                           partial(_explained, base, measured, thresholds), set())
+                           partial(explained_share, base, measured, thresholds), set())
                 alarm = bool(day.accepted)
                 p[n] = min(p[n], day.p_value) if alarm else p[n]
         alarms += bool(alarm)
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")
     return NullRefits(p, alarms)
-
-
-def _explained(base: Refit, measured: float, thresholds: Thresholds, fit: Refit) -> float:
-    """Share of the excess of the base fit that another fit removes, as `sysid.loop.search.search` counts it."""
-    before, after = (float(np.square(one.residual).sum()) / measured - 1 for one in (base, fit))
-    return float(np.clip((before - after) / max(before, thresholds.excess), 0.0, 1.0))
 
 
 def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresholds) -> Search:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from sysid.loop.agreement import beside, disagreement, foretold, interval_of_sum
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit
-from sysid.loop.found import LARGEST, Candidate, Search, Thresholds
+from sysid.loop.found import LARGEST, Candidate, Search, Thresholds, excess_of, explained_share
 from sysid.loop.pairs import scan_pairs
 from sysid.loop.refit import Refit, Refitter, Start, moved_last
 from sysid.loop.rounds import FIRST_LOOK, POLISH, candidate_of, refitted, rescan
@@ -42,14 +43,8 @@ def search(
     first = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
     report("scan")
     count = float((refitter.drives.mask > 0).sum())
-
-    def excess(fit: Refit) -> float:
-        return float(np.square(fit.residual).sum()) / count - 1
-
-    def explained(fit: Refit) -> float:
-        """Share of the excess that a fit removes; where there is hardly any, of one that would be worth a word."""
-        return float(np.clip((excess(base) - excess(fit)) / max(excess(base), thresholds.excess), 0.0, 1.0))
-
+    excess = partial(excess_of, count=count)
+    explained = partial(explained_share, base, count, thresholds)
     similar = imitation(evidence, hypotheses)
     pairs = scan_pairs(evidence, hypotheses, refitter.reference.spread, wander, similar, thresholds.alike, seed=seed)
     report("scan of pairs")
