@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> None:
         TrainOptions(
             out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
-            action_repeat=options.repeat, export="best" if options.preset == "cpu" else "last",
+            action_repeat=options.repeat, exploring_starts=options.starts, export="best" if options.preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip
@@ -87,7 +87,9 @@ def together(options: argparse.Namespace) -> None:
         return {f"{name}_{seed}": value for seed, one in zip(options.seeds, each, strict=True)
                 for name, value in one.items()}
 
-    env = functional_env(make_training_env(task, vehicle, preset.instances), targets=TRUTH in learner.decode_only)
+    starts = preset.exploring_starts if options.starts is None else options.starts
+    training = make_training_env(task, vehicle, preset.instances, exploring_starts=starts)
+    env = functional_env(training, targets=TRUTH in learner.decode_only)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
     result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
@@ -332,6 +334,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
+    one.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
     one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
     one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
@@ -342,6 +345,7 @@ def parse() -> argparse.Namespace:
     side.add_argument("--preset", default="paper")
     side.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
     side.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
+    side.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
     side.add_argument("--layout", default="randomised")
     side.add_argument("--vehicle", type=Path)
     side.add_argument("--steps", type=int)

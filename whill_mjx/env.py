@@ -18,6 +18,7 @@ from whill_mjx.randomize import randomize_looks
 from whill_mjx.render import pinhole, render
 from whill_mjx.scene import Scene, clearance, collides, footprint
 from whill_mjx.specs import VehicleSpec
+from whill_mjx.starts import draw_start
 from whill_mjx.task import Task, goal_position, make_task, reward_terms, sample_world, scale_action
 from whill_mjx.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle import drive, place
@@ -41,6 +42,12 @@ class Env:
     """Draw colours, light and textures anew for each episode."""
     photometric: bool = False
     """Apply the paper's photometric randomisation to the images."""
+    exploring_starts: float = 0.0
+    """Share of episodes that begin at a random free place on the way to the goal; for training (`whill_mjx.starts`)."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.exploring_starts <= 1.0:
+            raise ValueError(f"exploring_starts is {self.exploring_starts}: it is a share of episodes; use 0 to 1.")
 
 
 @struct.dataclass
@@ -76,6 +83,7 @@ def make_env(
     photometric: bool | None = None,
     height: int = 64,
     width: int = 64,
+    exploring_starts: float = 0.0,
 ) -> tuple[Env, VehicleParams]:
     """Environment, and the nominal parameters of its vehicle.
 
@@ -85,9 +93,10 @@ def make_env(
         layout: "randomised" or "fixed"; None keeps the task's own.
         random_looks, photometric: see `Env`; None means off, except in a randomised corridor, as in the paper.
         height, width: image size [pixels].
+        exploring_starts: see `Env`.
 
     Raises:
-        ValueError: unknown task, layout or vehicle.
+        ValueError: unknown task, layout or vehicle; a share that is none.
     """
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
@@ -101,6 +110,7 @@ def make_env(
         width,
         default if random_looks is None else random_looks,
         default if photometric is None else photometric,
+        exploring_starts,
     )
     return env, params
 
@@ -157,13 +167,16 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
     world = sample_world(env.task, world_key)
     scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
     photometry = draw_photometry(photometry_key) if env.photometric else neutral()
-    vehicle = place(env.model, params, world.start[0], world.start[1], world.start[2])
+    start = world.start
+    if env.exploring_starts:
+        start = draw_start(env.exploring_starts, env.task, env.model.spec, world, jax.random.fold_in(world_key, 0))
+    vehicle = place(env.model, params, start[0], start[1], start[2])
     return State(
         vehicle=vehicle,
         scene=scene,
         photometry=photometry,
         command=jnp.zeros(2),
-        goal_distance=jnp.linalg.norm(goal_position(scene) - world.start[:2]),
+        goal_distance=jnp.linalg.norm(goal_position(scene) - start[:2]),
         step_count=jnp.zeros((), jnp.int32),
         episode_return=jnp.zeros(()),
         done=jnp.zeros((), bool),

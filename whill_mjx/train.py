@@ -86,6 +86,9 @@ class TrainOptions:
     targets: bool = False
     """Let the world model also tell goal, speeds and free distances, which the simulator knows (`whill_mjx.truth`). The
     policy still sees the camera alone."""
+    exploring_starts: float | None = None
+    """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
+    and a real course cannot; evaluations always begin at the start. None takes the preset's."""
     instances: int | None = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
@@ -176,6 +179,7 @@ def choose_preset(options: TrainOptions) -> Preset:
         ppo=baseline,
         total_steps=options.steps or preset.total_steps,
         instances=options.instances or preset.instances,
+        exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
@@ -218,7 +222,9 @@ def prepare_vehicle(options: TrainOptions) -> Path:
 def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
     """Train the world model and its policy, with an evaluation every `eval_every` steps."""
     devices = choose_devices(options.devices)
-    batch = make_training_env(preset.task, vehicle, preset.instances, devices=devices)
+    batch = make_training_env(
+        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts
+    )
     held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
     evaluate = keep_best(options.out, preset, evaluation_of(held_out, preset, options.seed))
     stopper = Stopper(options.out, preset.stop_success)
@@ -240,7 +246,10 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
 
 def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
     """Train the model-free baseline with as many environment steps."""
-    batch = make_training_env(preset.task, vehicle, preset.instances, devices=choose_devices(options.devices))
+    batch = make_training_env(
+        preset.task, vehicle, preset.instances, devices=choose_devices(options.devices),
+        exploring_starts=preset.exploring_starts,
+    )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt

@@ -37,6 +37,8 @@ class Preset:
     """Environment steps between evaluations."""
     eval_episodes: int = 100
     """Episodes of an evaluation inside the run; they are not those of the final one."""
+    exploring_starts: float = 0.0
+    """Share of training episodes that begin anywhere on the way (`whill_mjx.starts`); evaluations never do."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -180,10 +182,11 @@ MIRROR = Mirror(mirrored_obs, lambda action: action * jnp.array([1.0, -1.0]))
 
 
 def make_training_env(
-    task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = ()
-) -> BatchEnv:
-    """`instances` chairs of a vehicle file or preset in a task, split over `devices`."""
-    env, params = make_env(task, vehicle)
+    task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
+    exploring_starts: float = 0.0,
+) -> BatchEnv:  # fmt: skip
+    """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the last see `Preset`."""
+    env, params = make_env(task, vehicle, exploring_starts=exploring_starts)
     return make_batch(env, params, instances, spread, devices)
 
 
