@@ -1,0 +1,56 @@
+"""Exploring starts: training episodes that begin anywhere on the way."""
+
+import jax
+import numpy as np
+import pytest
+
+from whill_mjx.env import make_env, reset
+
+EPISODES = 256
+
+
+def begin(task: str, layout: str, share: float, episodes: int = EPISODES) -> dict[str, np.ndarray]:
+    env, params = make_env(task, layout=layout, exploring_starts=share, random_looks=False, photometric=False)
+    first = jax.jit(jax.vmap(lambda key: reset(env, params, key)[1]))(jax.random.split(jax.random.key(3), episodes))
+    return {name: np.asarray(values) for name, values in first.metrics.items()}
+
+
+@pytest.mark.parametrize("task", ["obstacle_course", "corridor"])
+@pytest.mark.parametrize("layout", ["fixed", "randomised"])
+def test_every_episode_begins_clear_of_boxes_and_before_the_goal(task, layout):
+    seen = begin(task, layout, 1.0)
+    assert seen["clearance"].min() > 0.05
+    assert seen["goal_distance"].min() > 1.2  # the radius of arrival is 1 m
+
+
+def test_a_fixed_course_is_begun_on_both_sides_of_both_gates():
+    x = begin("obstacle_course", "fixed", 1.0)["x"]
+    before, between, behind = (x < 1.5).mean(), ((x > 2.6) & (x < 3.6)).mean(), (x > 3.6).mean()
+    assert min(before, between) > 0.1 and behind > 0.02
+
+
+def test_the_share_is_that_of_episodes_and_the_rest_begins_at_the_start():
+    x, y, yaw = (begin("obstacle_course", "fixed", 0.5, 1000)[name] for name in ("x", "y", "yaw"))
+    own = (np.abs(x) < 1e-3) & (np.abs(y) < 1e-3) & (np.abs(yaw) < 1e-3)
+    assert 0.45 < own.mean() < 0.55
+
+
+def test_worlds_stay_the_same():
+    """Layouts are drawn as without: only the vehicle's place differs."""
+    keys = jax.random.split(jax.random.key(8), 4)
+    worlds = []
+    for share in (0.0, 1.0):
+        env, params = make_env("obstacle_course", exploring_starts=share)
+        worlds.append(jax.jit(jax.vmap(lambda key, env=env, params=params: reset(env, params, key)[0].scene))(keys))
+    jax.tree.map(np.testing.assert_array_equal, *worlds)
+
+
+def test_without_a_free_place_an_episode_begins_at_its_own_start(monkeypatch):
+    monkeypatch.setattr("whill_mjx.starts.CLEAR", 1e6)
+    assert np.abs(begin("obstacle_course", "fixed", 1.0, 8)["x"]).max() < 1e-3
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+def test_what_is_no_share_is_refused(share):
+    with pytest.raises(ValueError, match="exploring_starts"):
+        make_env(exploring_starts=share)
