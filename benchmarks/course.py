@@ -41,7 +41,8 @@ def run(options: argparse.Namespace) -> None:
         TrainOptions(
             out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
-            action_repeat=options.repeat, exploring_starts=options.starts, export="best" if options.preset == "cpu" else "last",
+            action_repeat=options.repeat, exploring_starts=options.starts,
+            export="best" if options.preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip

@@ -86,6 +86,7 @@ def act(
     key: jax.Array | None,
     mode: bool = False,
     noise: jax.Array | None = None,
+    greedy: jax.Array | None = None,
 ) -> tuple[Carry, jax.Array]:
     """Infer the state of N instances from their frames and choose actions.
 
@@ -98,6 +99,7 @@ def act(
         key: consumed; may be None in mode.
         mode: take the most probable latent and action, as on the vehicle.
         noise: (N, ...) random numbers that choose the actions (`spaces`); drawn here unless given.
+        greedy: (N,) bool, those which take the most probable action all the same; none unless given.
 
     Returns:
         The carry, whose latent is the state after this frame, and actions (N, A), not clipped; one-hot classes.
@@ -117,6 +119,8 @@ def act(
     else:
         noise = actions.noise(action_key, raw.shape[:1]) if noise is None else noise
         action = actions.sample(config, raw, noise)
+        if greedy is not None:
+            action = jnp.where(greedy[:, None], actions.mode(config, raw), action)
     return {"deter": latent.deter, "stoch": latent.stoch, "action": action}, action
 
 

@@ -59,6 +59,9 @@ class DreamerConfig:
     noise_steps: float = 0.0
     """Longest time constant [steps] of the noise with which training acts, at least 1 (`dreamer.exploration`); 0: the
     noise of every step is independent. Continuous actions only."""
+    greedy_share: float = 0.0
+    """Share of the instances that act in training as evaluations do, by the most probable action, rounded up: the model
+    then sees where that leads. Without, it may believe in a place where only the best actions would stay."""
     mean_pull: float = 0.0
     """Weight of the square of the policy's mean before its tanh. Where the return hardly depends on the action, noise
     drives the mean into saturation, whence no gradient leads back; 0.01 keeps it within reach. Not for classes."""
@@ -178,6 +181,7 @@ class DreamerConfig:
             (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
+            (0 <= self.greedy_share < 1, "greedy_share", "must lie in 0..1 and below 1"),
             (self.behavior_lr > 0, "behavior_lr", "must be positive"),
             (self.mean_pull >= 0, "mean_pull", "must not be negative"),
             (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),

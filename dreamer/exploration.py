@@ -1,12 +1,17 @@
-"""Action noise with a memory, for acting during training.
+"""How training acts: noise with a memory, and instances without any.
 
 Noise that is drawn anew at every step averages out within a few of them: whatever integrates its actions, as a vehicle
 does, hardly leaves its place. Here each instance's noise is a first-order autoregressive process with a unit normal
 margin, so that every single action is distributed as the policy says. The instances' time constants spread over
 decades, which together is close to pink noise (Eberhard et al., "Pink noise is all you need", ICLR 2023).
+
+Evaluations act by the most probable action. Where noise carries every training episode past a place at which that
+action stands still, the model has never seen that standing there pays nothing; instances without noise show it.
 """
 
 from __future__ import annotations
+
+import math
 
 import jax
 import jax.numpy as jnp
@@ -51,3 +56,10 @@ def advance(config: DreamerConfig, noise: jax.Array, key: jax.Array) -> jax.Arra
 def uniform(noise: jax.Array) -> jax.Array:
     """Random actions (N, A), uniform in [-1, 1], with the memory of unit normal noise (N, A)."""
     return jax.scipy.special.erf(noise / jnp.sqrt(2.0))
+
+
+def greedy(config: DreamerConfig, instances: int) -> jax.Array | None:
+    """(N,) bool: the last `greedy_share` of the instances; None where that is none."""
+    if not config.greedy_share:
+        return None
+    return jnp.arange(instances) >= instances - math.ceil(config.greedy_share * instances)

@@ -137,8 +137,11 @@ def collect(
     if state.noise is not None:
         noise = exploration.advance(config, state.noise, random_key)
         drawn = jnp.concatenate([noise] * (1 + config.mirror))  # the mirrored ones do not choose
+    greedy = exploration.greedy(config, env.num_envs)
+    if greedy is not None:
+        greedy = jnp.concatenate([greedy] * (1 + config.mirror))
     carry, action = agents.act(
-        config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key, noise=drawn
+        config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key, noise=drawn, greedy=greedy
     )
     random_action = actions.random(random_key, action.shape[:1]) if drawn is None else exploration.uniform(drawn)
     action = jnp.where(started(config, state) & (not always_random), action, random_action)

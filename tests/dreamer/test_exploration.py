@@ -1,4 +1,4 @@
-"""Action noise with a memory: its distribution, its time scales, and where it acts."""
+"""How training acts: noise with a memory, its distribution and where it acts, and instances without any."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from dreamer_toys import choice_env, corridor_env, tiny_config
 
-from dreamer import exploration, iteration
+from dreamer import exploration, iteration, spaces, world_model
+from dreamer.rssm import Latent
 
 INSTANCES, WIDTH, STEPS = 8, 512, 60
 CONFIG = tiny_config(noise_steps=20.0)
@@ -71,3 +72,30 @@ def test_classes_and_too_short_memories_are_refused():
         iteration.init_state(choice_env(2), CONFIG, 0)
     with pytest.raises(ValueError, match="noise_steps = 0.5"):
         tiny_config(noise_steps=0.5)
+
+
+@pytest.mark.parametrize("make_env", [corridor_env, choice_env])
+def test_greedy_instances_act_as_evaluations_do_once_learning_has_begun(make_env):
+    """Two of eight."""
+    env, config = make_env(8), tiny_config(greedy_share=0.2)
+    state = jax.jit(lambda: iteration.init_state(env, config, 0))()
+    collect = jax.jit(lambda state: iteration.collect(env, config, state, jax.random.key(3))[0].carry)
+    kind = spaces.actions(env.action_dim)
+
+    def best(state):  # of each instance: is its action the most probable one of the state that it has inferred?
+        carry, policy = collect(state), state.agent.params["policy"]
+        features = Latent(carry["deter"], carry["stoch"]).features()
+        action = np.asarray(kind.mode(config, world_model.head(policy, features)))
+        return np.all(np.isclose(carry["action"], action, atol=1e-6), axis=1).tolist()
+
+    learning = jax.tree.map(jnp.copy, state).replace(env_steps=jnp.int32(config.learning_starts))
+    assert best(learning)[6:] == [True, True] and not all(best(learning)[:6])
+    assert not all(best(state)[6:])  # the first steps are random everywhere
+
+
+def test_a_share_rounds_up_and_leaves_noise_somewhere():
+    assert exploration.greedy(tiny_config(), 16) is None
+    assert int(exploration.greedy(tiny_config(greedy_share=0.25), 16).sum()) == 4
+    assert int(exploration.greedy(tiny_config(greedy_share=0.01), 16).sum()) == 1
+    with pytest.raises(ValueError, match=r"greedy_share = 1.0.*below 1"):
+        tiny_config(greedy_share=1.0)
