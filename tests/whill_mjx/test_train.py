@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.devices import choose_devices, join, launched_processes
+from whill_mjx.env import make_env
 from whill_mjx.intervals import wilson_interval
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.task import Corridor, ObstacleCourse
@@ -223,9 +224,34 @@ def test_the_falling_rate_spans_the_run_whatever_its_train_ratio():
         assert learner.lr_decay == 22_000 * ratio / (learner.batch_size * learner.batch_length)
 
 
+@pytest.mark.parametrize("learner", ["dreamer", "ppo"])
+def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
+    """Evaluations, inside the run and after it, are driven from the start."""
+    shares = []
+
+    class Enough(Exception):
+        pass
+
+    def stop(*args, **kwargs):
+        raise Enough
+
+    def noted(*args, exploring_starts=0.0):
+        shares.append(exploring_starts)
+        return make_env(*args)
+
+    monkeypatch.setattr("whill_mjx.training.make_env", noted)
+    monkeypatch.setattr("whill_mjx.train.train", stop)
+    monkeypatch.setattr("whill_mjx.train.train_ppo", stop)
+    options = TrainOptions(out=tmp_path, vehicle=Path("whill_cr_ramp"), preset="smoke", exploring_starts=0.5,
+                           learner=learner)
+    with pytest.raises(Enough):
+        main(options)
+    assert shares == [0.5, 0.0]
+
+
 @pytest.mark.quick
 def test_targets_are_for_the_decoder_alone():
-    plain, told = (choose_preset(TrainOptions(preset="paper", targets=asked)).learner for asked in (False, True))
+    plain, told = (choose_preset(TrainOptions(preset="cpu", targets=asked)).learner for asked in (False, True))
     assert plain.decode_only == () and told == dataclasses.replace(plain, decode_only=("truth",))
 
 
