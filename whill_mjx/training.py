@@ -66,19 +66,19 @@ def find_preset(name: str, task: str) -> Preset:
     easy: dict[str, Any] = {"v_min": 0.0, "gates": 1} if task == "obstacle_course" else {}
     match name:
         case "paper":
-            course = task == "obstacle_course"
-            steps, ratio = (22_000, 512) if course else (200_000, 160)
+            on_course = task == "obstacle_course"
+            steps, ratio = (22_000, 512) if on_course else (200_000, 160)
             learner = learner_preset(
                 "size12m", train_ratio=float(ratio), lr=1.5e-4, lr_decay=steps * ratio // 1024, entropy_scale=1e-3,
                 replay_capacity=250_000, mirror=True, average_rate=0.002,
             )  # fmt: skip
-            if course:
+            if on_course:
                 learner = dataclasses.replace(
                     learner, horizon=100.0, return_lambda=0.98, imag_horizon=25, decode_only=(TRUTH,), greedy_share=0.25
                 )
             return Preset(
                 make_task(task), learner, steps, eval_every=max(1000, steps // 40), eval_episodes=200,
-                exploring_starts=0.5 if course else 0.0,
+                exploring_starts=0.5 if on_course else 0.0,
             )  # fmt: skip
         case "wallclock":
             learner = learner_preset("size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000)
