@@ -3,8 +3,8 @@
 Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. Trials are
 independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive. What
 replicates share is no noise but what the model gets wrong about a manoeuvre; where they share more than chance would
-have it, manoeuvres are the independent blocks. Where too few trials tell a parameter, blocks are pieces of trials, and
-errors are taken to be no less than those of independent samples.
+have it, manoeuvres are the independent blocks. Where too few trials tell a parameter, or where they happen to differ
+less than pieces of them do, blocks are pieces of trials, and errors are no less than those of independent samples.
 """
 
 from __future__ import annotations
@@ -178,20 +178,30 @@ def _choose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors (P,) and their degrees of freedom: between trials where they know it, or else within them.
 
+    A few trials may by chance differ little: no interval is narrower than what varies within them allows.
+
     Args:
         between, within: trials are the blocks, or pieces of them.
         across: manoeuvres are the blocks, where the model is wrong about them; then no error is less than that.
         independent: (P,) variances if all samples were independent.
     """
     enough = (between.freedom >= ENOUGH) & (between.told > 0.5)
-    pieces = np.maximum(np.diag(within.covariance), independent)
-    variance = np.where(enough, np.diag(between.covariance), pieces)
+    pieces, drives = np.maximum(np.diag(within.covariance), independent), np.diag(between.covariance)
+    enough &= _width(drives, between.freedom) >= _width(pieces, within.freedom)
+    variance = np.where(enough, drives, pieces)
     freedom = np.where(enough, between.freedom, within.freedom)
     if across is not None:
         wrong = (across.told > 0.5) & (np.diag(across.covariance) > variance)
         variance = np.where(wrong, np.diag(across.covariance), variance)
         freedom = np.where(wrong, across.freedom, freedom)
     return np.sqrt(variance), np.maximum(freedom, 1.0)
+
+
+def _width(variance: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Half widths (P,) of intervals."""
+    from scipy import stats
+
+    return stats.t.ppf((1 + CONFIDENCE) / 2, np.maximum(freedom, 1.0)) * np.sqrt(variance)
 
 
 def _pieces(

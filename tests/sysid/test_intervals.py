@@ -71,13 +71,14 @@ def covered(objective: Linear) -> tuple[list[bool], np.ndarray]:
 
 @pytest.mark.quick
 @pytest.mark.parametrize("rho", [0.0, 0.9])
-def test_intervals_of_correlated_errors_cover_nine_in_ten(rho):
+def test_intervals_of_correlated_errors_cover_nine_in_ten_and_a_little_more(rho):
+    """The wider of two estimates is taken: of drives that happen to differ little, and of what varies within them."""
     random = np.random.default_rng(1)
     inside = []
     for _ in range(400):
         inside.append(covered(Linear(designs(random), correlated(random, rho)))[0])
     share = np.mean(inside, axis=0)
-    assert (share > 0.86).all() and (share < 0.94).all()
+    assert (share > 0.88).all() and (share < 0.965).all()
 
 
 @pytest.mark.quick
