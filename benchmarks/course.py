@@ -184,7 +184,7 @@ def load_run(path: Path) -> dict[str, Any]:
 
 
 def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Success of each seed over 100 episodes, against a random policy in the same worlds."""
+    """Success of each seed over 100 episodes, against a random policy and without sight in the same worlds."""
     device = runs[0]["device"]
     success = [one["policy"]["success"] for one in runs]
     gain = [one["policy"]["success_interval_95"][0] - one["random"]["success"] for one in runs]
@@ -195,6 +195,7 @@ def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "cpu_lower_bound_above_random": figure(gain, "share", device),
         "cpu_minutes": figure([training_s(one) / 60 for one in runs], "min", device),
         "cpu_first_sign_minutes": figure(first, "min", device),
+        **{f"cpu_{name}": found for name, found in sight_figures(runs).items()},
     }
 
 
