@@ -93,6 +93,9 @@ def together(options: argparse.Namespace) -> None:
     env = functional_env(training, targets=TRUTH in learner.decode_only)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
+    options.out.mkdir(parents=True, exist_ok=True)
+    told = {"task": options.task, "layout": options.layout, "exploring_starts": starts}
+    (options.out / "environment.json").write_text(json.dumps(told) + "\n")
     result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
                    checkpoint_every_s=1e9, progress=False, time_limit_s=limit)
     if result.env_steps < steps:
@@ -165,6 +168,8 @@ def ablation(options: argparse.Namespace) -> None:
         changed = min((_changes(config, size) for size in PRESETS), key=len)
         ending = "" if options.metric == "return" else f"_{options.metric.removesuffix('_return')}"
         entry = {**figure(values, "-", options.device), "seeds": sorted(seeds), "steps": last, "changed": changed}
+        if (path / "environment.json").exists():  # older runs have none
+            entry["environment"] = json.loads((path / "environment.json").read_text())
         figures[f"ablation_{name}{ending}_return"] = entry
         print(f"{name}{ending}: {[round(value) for value in values]} at {last} steps, {changed}")
     record("course", CLAIM, figures)
