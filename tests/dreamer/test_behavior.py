@@ -101,8 +101,8 @@ def test_imagination_has_sixteen_states_and_fifteen_returns(agent_state, imagina
 
 def test_losses_are_weighted_by_the_continues_from_the_root_on(agent_state):
     params = constant_continue(agent_state.params, 0.7)
-    # Both critics are arguments: jaxlib 0.10.2 on a CPU reads foreign memory in a product with a matrix that it knows to
-    # be zero when it compiles (a softmax behind it, NaN in every other program).
+    # Both critics are arguments: jaxlib 0.10.2 on a CPU reads foreign memory where a softmax follows a product with a
+    # matrix that is known to be zero when it compiles (NaN in every other program).
     losses, returns, _, _ = jax.jit(
         lambda p, slow: behavior.imagination_loss(
             CONFIG, p, slow, NORM, rssm.initial(CONFIG, M), jax.random.PRNGKey(3)

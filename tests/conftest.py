@@ -1,0 +1,45 @@
+"""Most of the suite's time is XLA compiling small programs: none is compiled twice, many with few optimisations."""
+
+import os
+from contextlib import contextmanager
+
+import jax
+import pytest
+
+QUICK_TO_COMPILE = ("dreamer", "whill_mjx")
+"""Folders whose programs take far longer to compile than to run; those of `sysid` replay many long drives."""
+
+
+@contextmanager
+def options(**values):
+    """JAX's options with these values, in processes that are started meanwhile too."""
+    old = {name: jax.config.values[name] for name in values}
+    for name, value in values.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)
+    try:
+        yield
+    finally:
+        for name, value in old.items():
+            jax.config.update(name, value)
+            del os.environ[name.upper()]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compilation_cache(tmp_path_factory):
+    """One cache of compiled programs for all workers of a run and for the processes that tests start."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=1.0):
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_optimisations(request):
+    """XLA compiles these folders' programs in about half the time."""
+    if request.path.parent.name not in QUICK_TO_COMPILE:
+        yield
+        return
+    with options(jax_disable_most_optimizations=True):
+        yield
