@@ -297,21 +297,33 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     known = result.reference.space.size
     spread[:known, :known] = result.reference.spread
     trials = result.log.training
-    u = fit_poses(drives_of(result, trials), trials, space, all_values(result, vehicle), spread, iterations)
+    drives, held = drives_of(result, trials, vehicle), all_values(result, vehicle)
+    u = fit_poses(drives, trials, space, held, spread, iterations)
     return vehicle if u is None else set_values(
         vehicle, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
 
 
-def drives_of(result: Result, trials: tuple[Trial, ...]) -> Drives:
-    """Trials replayed by the vehicle with the catalogue, as it was compiled for the search."""
-    ready = result.prepared
-    return make_drives(ready.plant, ready.full, ready.names, trials, ready.reference.width, ready.paths)
+def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> Drives:
+    """Trials replayed by a vehicle, as it was compiled for the search where the catalogue has all its effects."""
+    ready, width = result.prepared, result.reference.width
+    if in_catalogue(result, vehicle):
+        return make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
+    return make_drives(ready.plant, vehicle, tuple(base_values(vehicle)), trials, width)
 
 
 def all_values(result: Result, vehicle: Any) -> np.ndarray:
-    """Values of all parameters of the vehicle with the catalogue; effects that `vehicle` does not have are neutral."""
-    values = {**base_values(result.full), **base_values(vehicle)}
-    return np.array([values[name] for name in result.names])
+    """Values of all parameters that `drives_of` replays; effects of the catalogue that `vehicle` does not have are
+    neutral."""
+    values = base_values(vehicle)
+    if in_catalogue(result, vehicle):
+        values = {**base_values(result.full), **values}
+        return np.array([values[name] for name in result.names])
+    return np.array(list(values.values()))
+
+
+def in_catalogue(result: Result, vehicle: Any) -> bool:
+    """Whether the vehicle with the whole catalogue has all parameters of a vehicle."""
+    return set(describe(vehicle)) <= set(result.names)
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:

@@ -66,7 +66,7 @@ def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     from sysid.close_loop import all_values, drives_of
 
     reference = result.reference
-    drives = drives_of(result, result.log.training)
+    drives = drives_of(result, result.log.training, reference.params)
     at = drives.simulate(all_values(result, reference.params)[None])[0]
     drives = drives.weighted(at, reference.factors, result.log.spec.track)
     left = [reference.whitener.apply(reference.target_of(drives) - one, drives.mask) for one in drives.simulate(values)]
@@ -85,7 +85,8 @@ def fitted(result: Result, delay: float) -> np.ndarray:
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))
     first = space.to_unit(reference.space.initial)
-    u = fit_poses(drives_of(result, result.log.training), result.log.training, space, values, reference.spread,
+    drives = drives_of(result, result.log.training, result.full)
+    u = fit_poses(drives, result.log.training, space, values, reference.spread,
                   ITERATIONS, first[None])
     found = space.to_values(space.to_unit(space.initial) if u is None else u)
     return with_values(values, names, dict(zip(space.names, found.tolist(), strict=True)))

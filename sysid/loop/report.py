@@ -26,8 +26,9 @@
     detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
                       noticed on simulated days (`power`)
     lives_in          where the unexplained residual lives
-    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.loop.unnamed.as_report`); where
-                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
+    unnamed           the wrench over one quantity that best predicts what is unexplained, or what named effects leave
+                      whose form is another one (keys: `sysid.loop.unnamed.as_report`); where it is `kept`, "after"
+                      and vehicle.toml have it; else null
     next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
                       there is nothing to tell (keys: `sysid.loop.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
@@ -79,8 +80,8 @@ def make_report(result: Result) -> dict[str, Any]:
     trials = (*result.log.training, *result.log.held_out)
     wrench = find_unnamed(result)
     before = replay(result, result.before, trials)
-    after = replay(result, result.after, trials) if wrench is None or not wrench.kept else replay_unnamed(
-        result, wrench, trials)
+    kept = wrench if wrench is not None and wrench.kept else None
+    after = replay_unnamed(result, kept, trials) if kept else replay(result, result.after, trials)
     rows = error_rows(trials, before, after)
     moved = by_manoeuvre(trials, before, after)
     days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
@@ -121,7 +122,7 @@ def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Pred
     """Replays of trials by a vehicle."""
     from sysid.close_loop import all_values, drives_of
 
-    simulated = drives_of(result, trials).replay(all_values(result, vehicle)[None])
+    simulated = drives_of(result, trials, vehicle).replay(all_values(result, vehicle)[None])
     return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
 
 
@@ -348,6 +349,7 @@ def summary(report: dict[str, Any]) -> str:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
+    from sysid.close_loop import vehicle_after
     from sysid.loop.page import write_page
     from sysid.report import write_report
     from whill_mjx.vehicle_file import save_vehicle
@@ -356,7 +358,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     unnamed = report["unnamed"]
     kept = unnamed is not None and unnamed["kept"]
-    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else result.after
+    vehicle = vehicle_of(vehicle_after(result), unnamed["parameters"]) if kept else result.after
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all()}
