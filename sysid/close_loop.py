@@ -308,7 +308,8 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> Drives
     ready, width = result.prepared, result.reference.width
     if in_catalogue(result, vehicle):
         return make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
-    return make_drives(ready.plant, vehicle, tuple(base_values(vehicle)), trials, width)
+    drives = make_drives(ready.plant, vehicle, tuple(base_values(vehicle)), trials, width)
+    return replace(drives, courses=replace(drives.courses, shared=False))  # each may start with its wheels turned
 
 
 def all_values(result: Result, vehicle: Any) -> np.ndarray:

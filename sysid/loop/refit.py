@@ -12,7 +12,6 @@ from sysid.loop.catalogue import Hypothesis
 from sysid.loop.drives import Drives, quotients
 from sysid.loop.evidence import with_values
 from sysid.loop.reference import Reference, difference_sizes
-from sysid.space import Space
 
 TRIES = ((1.0, 1.0), (1.0, 0.3), (30.0, 1.0))
 """Factors on the damping and shares of the step that are tried in one iteration."""
@@ -84,20 +83,6 @@ class Start:
         return cls(refit.hypotheses, refit.u, refit.q, refit.jacobian[..., : len(refit.u)])
 
 
-def values_at(
-    values: np.ndarray, names: Sequence[str], space: Space, hypotheses: Sequence[Hypothesis], u: np.ndarray,
-    q: np.ndarray,
-) -> np.ndarray:
-    """(all,) `values` with base coordinates u (P,) and the hypotheses' own q (k,) in place of theirs."""
-    values = with_values(values, names, dict(zip(space.names, space.to_values(u).tolist(), strict=True)))
-    start = 0
-    for one in hypotheses:
-        base = dict(zip(names, values.tolist(), strict=True))  # two may move the same parameter
-        values = with_values(values, names, one.values(q[start : start + len(one.axes)], base))
-        start += len(one.axes)
-    return values
-
-
 class Refitter:
     """Refits on one set of drives. The base Jacobian is kept from the reference: a day moves it by percents."""
 
@@ -110,6 +95,7 @@ class Refitter:
         self.precision = np.linalg.inv(reference.spread)
         away = REACH * np.sqrt(np.diag(reference.spread))
         self.low, self.high = np.maximum(reference.u - away, 0.0), np.minimum(reference.u + away, 1.0)
+        self.base_index = [self.names.index(name) for name in reference.space.names]
 
     def aimed(self, target: np.ndarray) -> Refitter:
         """The same for other drives with these commands, of white features `target` (B, n)."""
@@ -233,7 +219,15 @@ class Refitter:
 
     def values_at(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
         """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
-        return values_at(self.values, self.names, self.reference.space, hypotheses, u, q)
+        values = self.values.copy()
+        values[self.base_index] = self.reference.space.to_values(u)
+        start = 0
+        for one in hypotheses:
+            base = dict(zip(self.names, values.tolist(), strict=True))  # two may move the same parameter
+            part = q[start : start + len(one.axes)]
+            values = with_values(values, self.names, one.values(part, base))
+            start += len(one.axes)
+        return values
 
     def _differences(self, hypotheses: Sequence[Hypothesis], u: np.ndarray,
                      q: np.ndarray) -> tuple[list[np.ndarray], list[float]]:

@@ -26,9 +26,8 @@
     detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
                       noticed on simulated days (`power`)
     lives_in          where the unexplained residual lives
-    unnamed           the wrench over one quantity that best predicts what is unexplained, or what named effects leave
-                      whose form is another one (keys: `sysid.loop.unnamed.as_report`); where it is `kept`, "after"
-                      and vehicle.toml have it; else null
+    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.loop.unnamed.as_report`); where
+                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
     next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
                       there is nothing to tell (keys: `sysid.loop.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
@@ -80,8 +79,8 @@ def make_report(result: Result) -> dict[str, Any]:
     trials = (*result.log.training, *result.log.held_out)
     wrench = find_unnamed(result)
     before = replay(result, result.before, trials)
-    kept = wrench if wrench is not None and wrench.kept else None
-    after = replay_unnamed(result, kept, trials) if kept else replay(result, result.after, trials)
+    after = replay(result, result.after, trials) if wrench is None or not wrench.kept else replay_unnamed(
+        result, wrench, trials)
     rows = error_rows(trials, before, after)
     moved = by_manoeuvre(trials, before, after)
     days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
@@ -349,7 +348,6 @@ def summary(report: dict[str, Any]) -> str:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
-    from sysid.close_loop import vehicle_after
     from sysid.loop.page import write_page
     from sysid.report import write_report
     from whill_mjx.vehicle_file import save_vehicle
@@ -358,7 +356,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     unnamed = report["unnamed"]
     kept = unnamed is not None and unnamed["kept"]
-    vehicle = vehicle_of(vehicle_after(result), unnamed["parameters"]) if kept else result.after
+    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else result.after
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all()}

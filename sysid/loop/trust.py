@@ -43,7 +43,9 @@ def warnings(result: Result) -> list[str]:
              for first, second, left in undone(found.final) if left < UNDONE]
     said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
              for name in at_the_end(result)]
-    if quantity := other_form(result):
+    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
+    quantity = max(gains, key=lambda name: gains[name])
+    if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
         said.append(f"what is left is a smooth function of {quantity} more than on reference days: the form is another "
                     "one, or another effect")
     if found.excess[1] > result.prepared.wander.excess_limit(alpha):
@@ -52,15 +54,6 @@ def warnings(result: Result) -> list[str]:
                     "another form here than in the catalogue, or is imitated by an effect that the catalogue does not "
                     "have")
     return said
-
-
-def other_form(result: Result) -> str:
-    """The quantity of which what named effects leave is a smooth function, more than on reference days; else ""."""
-    found = result.search
-    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
-    quantity = max(gains, key=lambda name: gains[name])
-    usual = result.prepared.wander.smooth_limit(result.config.thresholds.alpha) * len(found.final.residual)
-    return quantity if gains[quantity] > usual else ""
 
 
 def undone(final: Refit) -> list[tuple[str, str, float]]:

@@ -1,16 +1,15 @@
 """A wrench without a name for what the catalogue does not have.
 
 A force along the vehicle and a torque about it, as tables over one quantity of the motion, are fitted to what the base
-model leaves, or to what named effects leave whose form is another one. Each knot of a table is switched on by itself at
-a small size; what that changes in the features is its column. The table is a linear regression of the white residual on
-these columns beside those of the base parameters. Which quantity, how smooth, and which sum of few terms stands for the
-table: manoeuvres that were held back decide. The winner is then replayed as the effect `unnamed`. A table over a
-wheel's angle starts at its own angle in every drive.
+model leaves. Each knot of a table is switched on by itself at a small size; what that changes in the features is its
+column. The table is a linear regression of the white residual on these columns beside those of the base parameters.
+Which quantity, how smooth, and which sum of few terms stands for the table: manoeuvres that were held back decide. The
+winner is then replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.log import Trial
-from sysid.loop.catalogue import base_values
 from sysid.loop.drives import Drives, make_drives
-from sysid.loop.refit import Refit, values_at
 from sysid.loop.tables import (
     Products,
     Table,
@@ -34,7 +31,7 @@ from sysid.loop.tables import (
 from sysid.loop.terms import Term, columns_of, in_words
 from sysid.loop.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.metrics import Prediction
-from sysid.rollout import Plant, predictions
+from sysid.rollout import Plant, Replay, make_batch, predictions
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.parameters import describe, get_values, set_values
@@ -95,71 +92,32 @@ class Unnamed:
     kept: bool
 
 
-@dataclass(frozen=True)
-class Left:
-    """What a wrench is looked for in."""
-
-    vehicle: VehicleParams
-    """The vehicle that left it."""
-    fit: Refit
-    """Where that was fitted."""
-    excess: float
-    """Squared residual over the noise, less 1."""
-    values: Callable[[np.ndarray], dict[str, float]]
-    """Parameters of that vehicle at base coordinates (P,)."""
-
-
-def left_of(result: Result) -> Left | None:
-    """What the base model leaves where something is unexplained, or what named effects do where their form is another
-    one; else None."""
-    from sysid.close_loop import vehicle_after, vehicle_before
-    from sysid.loop.trust import other_form
-
-    search, base = result.search, base_values(result.full)
-    if search.verdict == "unexplained":
-        vehicle, fit, excess = vehicle_before(result), search.base, search.excess[0]
-    elif search.verdict == "named" and other_form(result):
-        vehicle, fit, excess = vehicle_after(result), search.final, search.excess[1]
-    else:
-        return None
-    start, have = np.array([base[name] for name in result.names]), set(describe(vehicle))
-
-    def values(u: np.ndarray) -> dict[str, float]:
-        found = values_at(start, result.names, result.reference.space, fit.hypotheses, u, fit.q)
-        return {name: value for name, value in zip(result.names, found.tolist(), strict=True) if name in have}
-
-    return Left(vehicle, fit, excess, values)
-
-
 class Bench:
-    """Replays of a vehicle with the effect `unnamed` in it."""
+    """Replays of the base model with the effect `unnamed` in it."""
 
-    def __init__(self, result: Result, left: Left):
-        reference = result.reference
-        self.result, self.left, self.u = result, left, left.fit.u
-        self.params = VehicleParams(left.vehicle.body, (*left.vehicle.effects, make_effect("unnamed")))
-        self.neutral = base_values(self.params)
-        self.names = list(self.neutral)
+    def __init__(self, result: Result):
+        reference, base = result.reference, result.search.base
+        self.result, self.base_names = result, list(reference.space.names)
+        self.params = VehicleParams(reference.params.body, (*reference.params.effects, make_effect("unnamed")))
+        self.names = [name for name in describe(self.params) if name.startswith("unnamed.")] + self.base_names
+        self.neutral = np.asarray(get_values(self.params, self.names), float)
+        self.u = base.u
         drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width)
-        start = np.array(list(self.neutral.values()))
-        self.drives = drives.weighted(drives.simulate(start[None])[0], reference.factors, result.log.spec.track)
+        self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
         weight = 0.01 * result.log.spec.mass * 9.81
         self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m
         self.target = self.white(self.drives, reference.target_of(self.drives))
         self.target_shape = self.drives.target.shape
 
-    @property
-    def base(self) -> tuple[np.ndarray, np.ndarray]:
-        """White residual (B, n) that is to be explained, and its derivatives (B, n, P) by the base coordinates."""
-        return self.left.fit.residual, self.left.fit.jacobian[..., : len(self.u)]
-
     def values(self, u: np.ndarray, table: Table | None = None, wrench: np.ndarray | None = None, start: float = 0.0
                ) -> np.ndarray:
         """All replayed parameters at base coordinates and a table."""
-        found = {**self.neutral, **self.left.values(u)}
+        out = self.neutral.copy()
+        out[len(out) - len(u) :] = self.result.reference.space.to_values(u)
         if table is not None and wrench is not None:
-            found |= {f"unnamed.{name}": value for name, value in table.parameters(wrench, start).items()}
-        return np.array([found[name] for name in self.names])
+            for name, value in table.parameters(wrench, start).items():
+                out[self.names.index(f"unnamed.{name}")] = value
+        return out
 
     def white(self, drives: Drives, series: np.ndarray) -> np.ndarray:
         """(B, n, ...) white and flat, of (B, K, C, ...)."""
@@ -193,23 +151,20 @@ class Bench:
 
 
 def find_unnamed(result: Result) -> Unnamed | None:
-    """The wrench over one quantity that best predicts held-back manoeuvres; None where nothing asks for one.
+    """The wrench over one quantity that best predicts held-back manoeuvres; None unless something is unexplained.
 
-    Where vehicles are refitted to whole poses, so is that with the wrench, if it is kept.
+    Where the base model is refitted to whole poses, so is it with the wrench that is kept.
     """
     from sysid.close_loop import refit_poses
 
-    left = left_of(result)
-    if left is None:
+    if result.search.verdict != "unexplained":
         return None
-    found = fit_unnamed(Bench(result, left))
+    found = fit_unnamed(Bench(result))
     if not found.kept or not result.config.poses:
         return found
     if found.table.quantity in WHEELS:
         trials = result.log.training
         if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
-            if result.search.verdict == "named":
-                return found
             names = list(result.reference.space.names)
             return replace(found, vehicle=set_values(found.vehicle, names, get_values(result.before, names)))
         plant = with_start_angles(result.plant, found.vehicle, trials, found.angles)
@@ -239,7 +194,7 @@ def fit_unnamed(bench: Bench) -> Unnamed:
     groups = [list(group) for group in result.evidence.groups]
     if len(groups) < 3:  # too few manoeuvres to hold one back: trials are
         groups = [[i] for i in range(len(result.log.training))]
-    residual, jacobian = bench.base
+    residual, jacobian = result.search.base.residual, result.search.base.jacobian
     firsts = [group[0] for group in groups]
     screened = []
     for table in tables(result):
@@ -259,7 +214,7 @@ def fit_unnamed(bench: Bench) -> Unnamed:
         gains = gains - price(table, groups)
         fitted.append(Fit(table, gains, smoothing, products, columns, phases))
     best = max(fitted, key=lambda one: float(one.gains.sum()))
-    excess = max(bench.left.excess, 1e-9) * float((bench.drives.mask > 0).sum())
+    excess = max(result.search.excess[0], 1e-9) * float((bench.drives.mask > 0).sum())
     tried = [(one.table.quantity, one.table.kind, float(one.gains.sum()) / excess) for one in fitted]
     tried += [(table.quantity, table.kind, gain / excess) for gain, table in screened[FINALISTS:]]
     return _replayed(bench, best, groups, excess, tuple(sorted(tried, key=lambda one: -one[2])))
@@ -315,11 +270,10 @@ def _replayed(
         penalty = np.zeros((size + basis.shape[1], size + basis.shape[1]))
         penalty[:size, :size] = precision
     columns = best.columns @ basis
-    now, jacobian = bench.base
-    u, wrench = bench.u.copy(), np.zeros(basis.shape[1])
+    u, wrench, now = bench.u.copy(), np.zeros(basis.shape[1]), result.search.base.residual
     cost = before = float(np.square(now).sum())
     for _ in range(ROUNDS):
-        here = multiplied(now, jacobian, columns, groups)
+        here = multiplied(now, result.search.base.jacobian, columns, groups)
         at = np.concatenate([u - bench.u, wrench])
         pulled = replace(here, moments=here.moments - penalty @ at / len(here.moments))
         step = pulled.solve(penalty)
@@ -381,20 +335,19 @@ def describe_unnamed(one: dict[str, Any]) -> str:
     return f"kept as effect `unnamed`: {text}; {sums}"
 
 
-def vehicle_of(vehicle: VehicleParams, parameters: dict[str, float]) -> VehicleParams:
-    """A vehicle with the effect `unnamed` beside its own, at these values."""
-    full = VehicleParams(vehicle.body, (*vehicle.effects, make_effect("unnamed")))
+def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
+    """The base model with the effect `unnamed`, at these values."""
+    params = result.reference.params
+    full = VehicleParams(params.body, (*params.effects, make_effect("unnamed")))
     return set_values(full, list(parameters), jnp.asarray(list(parameters.values()), jnp.result_type(float)))
 
 
 def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
     held-out ones too: nothing else tells it."""
-    values = base_values(found.vehicle)
-    drives = make_drives(result.plant, found.vehicle, tuple(values), trials, result.reference.width)
-    turns = PHASES if found.table.quantity in WHEELS else PHASES[:1]
-    seen = drives.replay(np.array([list({**values, "unnamed.start_angle": float(turn)}.values()) for turn in turns]))
-    measured = drives.measured
+    batch, measured = make_batch(trials, result.plant.dt)
+    replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
+    seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])
     error = np.square((np.asarray(seen.odometry) - measured.odometry) * measured.odometry_mask)[..., 3:]
     away = (error.sum(2) / np.maximum(np.square(result.reference.whitener.scale[:2]), 1e-12)).sum(-1)  # (G, B)
     best = away.argmin(0)

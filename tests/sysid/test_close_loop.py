@@ -33,12 +33,12 @@ from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, fit_roughness, fit_whitener, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
-from sysid.loop.refit import Refit, values_at
+from sysid.loop.refit import Refit, Refitter
 from sysid.loop.report import effects, make_report, own_floor, replay, write_run
 from sysid.loop.search import _own
 from sysid.loop.tables import Table
 from sysid.loop.trust import beside_still_base, warnings
-from sysid.loop.unnamed import left_of, vehicle_of
+from sysid.loop.unnamed import vehicle_of
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
@@ -47,7 +47,7 @@ from whill_mjx.config import VehicleConfig
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS
 from whill_mjx.manoeuvres import Scenario
-from whill_mjx.parameters import describe, set_values
+from whill_mjx.parameters import set_values
 from whill_mjx.presets import preset
 from whill_mjx.types import VehicleParams
 from whill_mjx.vehicle_file import load_vehicle
@@ -293,26 +293,11 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
 def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, sloping):
     """Refits to poses replay like this too: without the wrench, base parameters would move to stand for it."""
     trials = tuple(one for one in drives["plain"].training if one.name == "straight_1")
-    vehicle = vehicle_before(sloping)
     push = Table("speed", "push", -1.0, 1.0).parameters(np.repeat([-20.0, 0.0], KNOTS), 0.0)
-    pushed = vehicle_of(vehicle, {f"unnamed.{name}": value for name, value in push.items()})
-    [free], [held] = (replay(sloping, one, trials) for one in (vehicle, pushed))
+    pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
+    [free], [held] = (replay(sloping, one, trials) for one in (sloping.reference.params, pushed))
     ends = [np.array([one.ground_truth.x[-1], one.ground_truth.y[-1]]) for one in (free, held)]
     assert np.linalg.norm(ends[1] - ends[0]) > 0.01
-
-
-def test_what_an_effect_of_another_form_leaves_is_given_to_a_wrench(sloping, monkeypatch):
-    assert left_of(sloping) is None  # the slope that was planted has the catalogue's form
-    monkeypatch.setattr("sysid.loop.trust.held_back_gains", lambda *_: {"yaw rate": 1e6})
-    ready, final = sloping.prepared, sloping.search.final
-    left = left_of(replace(sloping, prepared=replace(ready, wander=replace(ready.wander, usual_size=1.0))))
-    assert left.fit is final and left.excess == sloping.search.excess[1]
-    assert describe(left.vehicle) == describe(vehicle_after(sloping))
-    values = dict(zip(sloping.names, final.values.tolist(), strict=True))
-    assert left.values(final.u) == pytest.approx({name: values[name] for name in describe(left.vehicle)})
-    [name] = [axis.parameter for axis in final.hypotheses[0].axes][:1]
-    moved = left.values(final.u + 0.01)
-    assert moved[name] == values[name] and moved["torque_drive.kp"] > values["torque_drive.kp"]
 
 
 def test_held_out_trials_cannot_change_the_verdict(drives, sloping):
@@ -463,9 +448,10 @@ def test_a_form_that_an_effect_may_take_does_not_hide_what_it_looks_like():
 def test_two_effects_that_move_one_parameter_add_up():
     scrub = Hypothesis("scrub", (Axis("scrub.torque", 2.0), Axis("track.error", 0.01, form="along", dependent=True)))
     track = Hypothesis("track", (Axis("track.error", 0.1, signed=True),))
-    space = SimpleNamespace(names=(), to_values=lambda u: u)
-    both = values_at(np.array([1.0, 0.5]), ["scrub.torque", "track.error"], space, (track, scrub), np.zeros(0),
-                     np.array([1.0, 3.0, 2.0]))
+    space = SimpleNamespace(to_values=lambda u: u)
+    refitter = SimpleNamespace(values=np.array([1.0, 0.5]), base_index=[], names=["scrub.torque", "track.error"],
+                               reference=SimpleNamespace(space=space))
+    both = Refitter.values_at(refitter, (track, scrub), np.zeros(0), np.array([1.0, 3.0, 2.0]))
     np.testing.assert_allclose(both, [1.0 + 2 * 3, 0.5 + 0.1 + 0.01 * 3 * 2])
 
 

@@ -1,6 +1,5 @@
 """Unnamed wrenches: planted ones are found with their quantity and their few terms, and nothing is found in noise."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -15,16 +14,7 @@ from sysid.loop.page import wrench as wrench_section
 from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
 from sysid.loop.terms import Term, columns_of, in_words
 from sysid.loop.unexplained import PHASES, align, wave_turns
-from sysid.loop.unnamed import (
-    Bench,
-    Left,
-    as_report,
-    describe_unnamed,
-    fit_unnamed,
-    tables,
-    vehicle_of,
-    with_start_angles,
-)
+from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, tables, vehicle_of, with_start_angles
 from sysid.rollout import vehicle_plant
 from sysid.space import make_space
 from whill_mjx.config import VehicleConfig
@@ -57,14 +47,15 @@ def bench():
         params=params, space=space, u=space.to_unit(space.initial), factors=np.ones((4, 5)),
         whitener=Whitener(scale, np.zeros((1, 5, 5)), np.eye(5)), target_of=lambda drives: drives.target)
     trials = tuple(trial_of(name, heading) for heading, name in enumerate(DRIVES))
+    base = SimpleNamespace(u=reference.u, residual=None, jacobian=None)
     result = SimpleNamespace(
         log=SimpleNamespace(spec=spec, training=trials), reference=reference,
         plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)),
+        search=SimpleNamespace(base=base, verdict="unexplained", excess=(0.0, 0.0)),
         evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
-    fit = SimpleNamespace(u=reference.u, residual=None, jacobian=None)
-    made = Bench(result, Left(params, fit, 0.0, lambda u: dict(zip(space.names, space.to_values(u), strict=True))))
+    made = Bench(result)
     slopes = made.drives.differences(made.values, made.u, np.full(2, 0.02))
-    fit.jacobian = made.white(made.drives, slopes)
+    base.jacobian = made.white(made.drives, slopes)
     return made
 
 
@@ -79,8 +70,9 @@ def measure(bench, table=None, wrench=None, phases=None, seed=0):
     seen = -bench.residual([(bench.u, wrench)], table, phases)[0]
     noise = np.random.default_rng(seed).standard_normal(seen.shape)
     bench.target = seen + noise
-    bench.left.fit.residual = bench.residual([(bench.u, nothing)], table, still)[0]
-    bench.left = replace(bench.left, excess=float(np.square(bench.left.fit.residual).mean()) - 1)
+    search = bench.result.search
+    search.base.residual = bench.residual([(bench.u, nothing)], table, still)[0]
+    search.excess = (float(np.square(search.base.residual).mean()) - 1, 0.0)
 
 
 def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
@@ -95,7 +87,7 @@ def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
     report = as_report(found)
     assert "exp(-z" in report["symbolic"]["force"] and report["units"]["quantity"] == "s"
     assert "time in the drive" in describe_unnamed(report) and "<svg" in wrench_section(report)
-    vehicle = vehicle_of(bench.left.vehicle, report["parameters"])
+    vehicle = vehicle_of(bench.result, report["parameters"])
     save_vehicle(tmp_path / "vehicle.toml", bench.result.log.spec, vehicle)
     _, read, _ = load_vehicle(tmp_path / "vehicle.toml")
     for name, value in report["parameters"].items():
