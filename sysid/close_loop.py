@@ -297,34 +297,26 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     known = result.reference.space.size
     spread[:known, :known] = result.reference.spread
     trials = result.log.training
-    drives, held = drives_of(result, trials, vehicle), all_values(result, vehicle)
+    drives, held = drives_of(result, trials, vehicle)
     u = fit_poses(drives, trials, space, held, spread, iterations)
     return vehicle if u is None else set_values(
         vehicle, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
 
 
-def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> Drives:
-    """Trials replayed by a vehicle, as it was compiled for the search where the catalogue has all its effects."""
-    ready, width = result.prepared, result.reference.width
-    if in_catalogue(result, vehicle):
-        return make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
-    drives = make_drives(ready.plant, vehicle, tuple(base_values(vehicle)), trials, width)
-    return replace(drives, courses=replace(drives.courses, shared=False))  # each may start with its wheels turned
+def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[Drives, np.ndarray]:
+    """Trials as a vehicle replays them, and the values (all,) of its parameters there.
 
-
-def all_values(result: Result, vehicle: Any) -> np.ndarray:
-    """Values of all parameters that `drives_of` replays; effects of the catalogue that `vehicle` does not have are
-    neutral."""
-    values = base_values(vehicle)
-    if in_catalogue(result, vehicle):
-        values = {**base_values(result.full), **values}
-        return np.array([values[name] for name in result.names])
-    return np.array(list(values.values()))
-
-
-def in_catalogue(result: Result, vehicle: Any) -> bool:
-    """Whether the vehicle with the whole catalogue has all parameters of a vehicle."""
-    return set(describe(vehicle)) <= set(result.names)
+    They go through what was compiled for the search, where the catalogue has all effects of the vehicle; those that the
+    vehicle does not have are neutral.
+    """
+    ready, width, values = result.prepared, result.reference.width, base_values(vehicle)
+    if set(values) <= set(ready.names):
+        values = {**base_values(ready.full), **values}
+        drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
+        return drives, np.array([values[name] for name in ready.names])
+    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width)
+    apart = replace(drives.courses, shared=False)  # each may start with its wheels turned
+    return replace(drives, courses=apart), np.array(list(values.values()))
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:

@@ -14,15 +14,15 @@ QUICK_TO_COMPILE = ("dreamer", "whill_mjx")
 def options(**values):
     """JAX's options with these values, in processes that are started meanwhile too."""
     old = {name: jax.config.values[name] for name in values}
-    for name, value in values.items():
-        jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)
-    try:
-        yield
-    finally:
-        for name, value in old.items():
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in values.items():
             jax.config.update(name, value)
-            del os.environ[name.upper()]
+            patch.setenv(name.upper(), str(value))
+        try:
+            yield
+        finally:
+            for name, value in old.items():
+                jax.config.update(name, value)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -63,11 +63,11 @@ def told_late(result: Result, alpha: float) -> Result:
 
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     """White residuals (N, B, n) of the binned drives with values (N, all)."""
-    from sysid.close_loop import all_values, drives_of
+    from sysid.close_loop import drives_of
 
     reference = result.reference
-    drives = drives_of(result, result.log.training, reference.params)
-    at = drives.simulate(all_values(result, reference.params)[None])[0]
+    drives, before = drives_of(result, result.log.training, reference.params)
+    at = drives.simulate(before[None])[0]
     drives = drives.weighted(at, reference.factors, result.log.spec.track)
     left = [reference.whitener.apply(reference.target_of(drives) - one, drives.mask) for one in drives.simulate(values)]
     return np.stack([one.reshape(len(one), -1) for one in left])
@@ -77,16 +77,15 @@ def fitted(result: Result, delay: float) -> np.ndarray:
     """Values (all,) of the base model fitted to whole poses that are late by `delay` [s]."""
     import jax.numpy as jnp
 
-    from sysid.close_loop import all_values, drives_of
+    from sysid.close_loop import drives_of
     from whill_mjx.parameters import set_values
 
     names, reference = list(result.names), result.reference
-    values = with_values(all_values(result, result.before), names, {PARAMETER: delay})
+    drives, values = drives_of(result, result.log.training, result.before)
+    values = with_values(values, names, {PARAMETER: delay})
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))
     first = space.to_unit(reference.space.initial)
-    drives = drives_of(result, result.log.training, result.full)
-    u = fit_poses(drives, result.log.training, space, values, reference.spread,
-                  ITERATIONS, first[None])
+    u = fit_poses(drives, result.log.training, space, values, reference.spread, ITERATIONS, first[None])
     found = space.to_values(space.to_unit(space.initial) if u is None else u)
     return with_values(values, names, dict(zip(space.names, found.tolist(), strict=True)))

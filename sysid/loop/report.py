@@ -119,9 +119,10 @@ def make_report(result: Result) -> dict[str, Any]:
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials by a vehicle."""
-    from sysid.close_loop import all_values, drives_of
+    from sysid.close_loop import drives_of
 
-    simulated = drives_of(result, trials, vehicle).replay(all_values(result, vehicle)[None])
+    drives, values = drives_of(result, trials, vehicle)
+    simulated = drives.replay(values[None])
     return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
 
 

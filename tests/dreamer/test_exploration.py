@@ -74,9 +74,10 @@ def test_classes_and_too_short_memories_are_refused():
         tiny_config(noise_steps=0.5)
 
 
-def test_greedy_instances_act_as_evaluations_do_once_learning_has_begun():
+@pytest.mark.parametrize("make_env", [corridor_env, choice_env])
+def test_greedy_instances_act_as_evaluations_do_once_learning_has_begun(make_env):
     """Two of eight."""
-    env, config = corridor_env(8), tiny_config(greedy_share=0.2)
+    env, config = make_env(8), tiny_config(greedy_share=0.2)
     state = jax.jit(lambda: iteration.init_state(env, config, 0))()
     collect = jax.jit(lambda state: iteration.collect(env, config, state, jax.random.key(3))[0].carry)
     kind = spaces.actions(env.action_dim)

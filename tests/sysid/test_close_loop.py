@@ -38,7 +38,7 @@ from sysid.loop.report import effects, make_report, own_floor, replay, write_run
 from sysid.loop.search import _own
 from sysid.loop.tables import Table
 from sysid.loop.trust import beside_still_base, warnings
-from sysid.loop.unnamed import vehicle_of
+from sysid.loop.unnamed import vehicle_of, with_start_angles
 from sysid.loop.wander import _pooled
 from sysid.metrics import score
 from sysid.rollout import Measured, vehicle_plant
@@ -298,6 +298,21 @@ def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, s
     [free], [held] = (replay(sloping, one, trials) for one in (sloping.reference.params, pushed))
     ends = [np.array([one.ground_truth.x[-1], one.ground_truth.y[-1]]) for one in (free, held)]
     assert np.linalg.norm(ends[1] - ends[0]) > 0.01
+
+
+def test_replicates_start_at_their_own_angle_of_a_wheel_that_is_out_of_balance(drives, sloping):
+    trials = tuple(one for one in drives["plain"].training if one.name in ("straight_1", "straight_2"))
+    force = 40 * np.sin(np.arange(KNOTS) * 2 * np.pi / KNOTS)
+    push = Table("left wheel's angle", "push", 0.0, 1.0).parameters(np.concatenate([force, np.zeros(KNOTS)]), 0.0)
+    pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
+    speeds = []
+    for angles in ([0.0, 0.0], [0.0, np.pi]):
+        plant = with_start_angles(sloping.plant, pushed, trials, np.array(angles))
+        turned = replace(sloping, prepared=replace(sloping.prepared, plant=plant))
+        speeds.append([one.odometry.v for one in replay(turned, pushed, trials)])
+    (first, second), (same, other) = speeds
+    np.testing.assert_allclose(same, first, atol=1e-5)
+    assert np.abs(other - second).max() > 0.01
 
 
 def test_held_out_trials_cannot_change_the_verdict(drives, sloping):
