@@ -314,9 +314,7 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
         values = {**base_values(ready.full), **values}
         drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
         return drives, np.array([values[name] for name in ready.names])
-    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width)
-    apart = replace(drives.courses, shared=False)  # each may start with its wheels turned
-    return replace(drives, courses=apart), np.array(list(values.values()))
+    return make_drives(ready.plant, vehicle, tuple(values), trials, width), np.array(list(values.values()))
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:
