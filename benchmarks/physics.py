@@ -32,6 +32,7 @@ from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.kinematics import reference_pose
 from whill_mjx.manoeuvres import command_table
 from whill_mjx.model import VehicleModel, build_model
+from whill_mjx.parameters import set_values
 from whill_mjx.presets import preset
 from whill_mjx.specs import VehicleSpec
 from whill_mjx.types import VehicleParams, VehicleState, parameters_of
@@ -43,6 +44,8 @@ BASE = "whill_cr_physical"
 LOADED = ("acceleration_limit", "actuator_lag", "dry_friction", "slope", "odometry_scale")
 DRIVES = ("pid_drive", "forward_slip", "rolling_contact", "unnamed")  # of the other base model, or not one effect
 DT = VehicleConfig().physics_dt
+SLIPPERY = 0.1
+"""Friction of a floor on which the chair's wheels break away whenever it starts or stops."""
 PARTS = ("timestep", "kernels", "speed", "roofline", "effects", "peers_step", "peers")
 
 
@@ -185,14 +188,19 @@ def kernels_per_step(vehicle: str, dynamics: str) -> int:
     return max(len(kernel.findall(body)) for body in bodies if not body.startswith("ENTRY"))
 
 
-def timestep_errors(vehicle: str, dt: float) -> tuple[float, float, float]:
+def timestep_errors(vehicle: str, dt: float, grip: float | None = None) -> tuple[float, float, float]:
     """Largest differences of a figure-eight at step dt from one at dt / 8, in float64.
+
+    Args:
+        grip: friction of driven wheels, instead of the preset's.
 
     Returns:
         Position of the reference point [m], heading [rad], speed of the wheels' rims [m/s].
     """
     with jax.enable_x64(True):
         spec, params = preset(vehicle)
+        if grip is not None:
+            params = set_values(params, ("slip_traction.mu",), jnp.array([grip]))
         table = jnp.asarray(command_table("figure_eight")[:, 1:])
         drives = []
         for step in (dt, dt / 8):
@@ -216,12 +224,15 @@ def timestep_errors(vehicle: str, dt: float) -> tuple[float, float, float]:
 def record_timestep(vehicle: str = "whill_cr_physical") -> None:
     """Print and record the error of each time step, and the largest one within 2 mm and 2 mrad."""
     figures, within = {}, []
-    for dt in (0.01, 0.005, 0.0025, 0.00125):
-        position, turn, rim = timestep_errors(vehicle, dt)
-        print(f"{vehicle} dt {dt * 1e3:5.2f} ms: {position * 1e3:.3f} mm, {turn * 1e3:.3f} mrad, {rim * 1e3:.2f} mm/s")
-        entry = figure([position * 1e3], "mm")
-        figures[f"figure_eight_error_dt_{dt * 1e3:g}ms"] = {**entry, "yaw_mrad": turn * 1e3, "rim_mm_per_s": rim * 1e3}
-        within += [dt] if position <= 2e-3 and turn <= 2e-3 else []
+    for grip in (None, SLIPPERY):
+        floor = "" if grip is None else f"_grip_{grip:g}"
+        for dt in (0.01, 0.005, 0.0025, 0.00125):
+            position, turn, rim = timestep_errors(vehicle, dt, grip)
+            print(f"{vehicle}{floor} dt {dt * 1e3:5.2f} ms: {position * 1e3:.3f} mm, {turn * 1e3:.3f} mrad, "
+                  f"{rim * 1e3:.2f} mm/s")
+            figures[f"figure_eight_error{floor}_dt_{dt * 1e3:g}ms"] = {
+                **figure([position * 1e3], "mm"), "yaw_mrad": turn * 1e3, "rim_mm_per_s": rim * 1e3}
+            within += [dt] if grip is None and position <= 2e-3 and turn <= 2e-3 else []
     if within:
         figures["largest_dt_within_2mm_2mrad"] = figure([max(within)], "s")
     record("physics", CLAIM, figures)

@@ -64,6 +64,37 @@ class World:
 
 
 @struct.dataclass
+class Yielding:
+    """How a motor torque changes within the step where its wheel does not turn as the drive foresaw: by
+
+        factor clip(slack - slope (spin - foreseen), low, high)    with the spin after the step.
+
+    A wheel that slips has its own small inertia only: at a torque that is held for the step a speed controller would
+    throw it from one limit to the other.
+    """
+
+    foreseen: jax.Array  # (2,) spin after the step [rad/s] at which the torque would be what the controller wants
+    slope: jax.Array  # (2,) by how much it falls with a faster wheel [N m s/rad]
+    slack: jax.Array  # (2,) wanted torque beyond the limit [N m]
+    low: jax.Array  # (2,) N m
+    high: jax.Array  # (2,) N m
+    factor: jax.Array  # (2,) what of it reaches the wheel [-]
+
+    @staticmethod
+    def none() -> Yielding:
+        """A torque that does not change."""
+        zero = jnp.zeros(2)
+        return Yielding(zero, zero, zero, zero, zero, jnp.ones(2))
+
+    def change(self, line: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Change (2,) of the wanted torque [N m] where no limit would give the spin `line` (2,) after the step, and
+        which wheels are within the limits: the torque falls with the spin, so that no other side of a limit fits."""
+        wanted = self.slack - self.slope * (line - self.foreseen)
+        change = jnp.clip(wanted, self.low, self.high)
+        return change, change == wanted
+
+
+@struct.dataclass
 class Motion:
     """What an effect may look at: the present motion of one instance in the chassis frame."""
 
@@ -82,6 +113,7 @@ class Motion:
     normal_force: jax.Array  # (4,) suspension force at the contact patches [N]
     spin: jax.Array  # (2,) speed of the driven wheels, left and right [rad/s]
     drive_torque: jax.Array  # (2,) motor torque on the driven wheels [N m]; zero for the paper's drive
+    yielding: Yielding  # of that torque
     wheel_inertia: jax.Array  # () spin inertia of the driven wheels of one side [kg m^2]
     total_mass: jax.Array  # () kg, with payload
     com: jax.Array  # (3,) centre of mass with payload, chassis frame [m]
@@ -120,6 +152,7 @@ class Drive:
     target: jax.Array  # (2,) commanded wheel speeds, left and right [m/s]
     force: jax.Array  # (2,) traction of each side put straight on the chassis [N] (the paper's drive)
     torque: jax.Array  # (2,) motor torque on the wheel [N m] (the physical drive)
+    yielding: Yielding = struct.field(default_factory=Yielding.none)  # of that torque
 
 
 @struct.dataclass

@@ -19,7 +19,18 @@ from whill_mjx.ground import footing, plane_under
 from whill_mjx.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.model import VehicleModel, box_inertia
 from whill_mjx.scalars import apart, scan_apart
-from whill_mjx.types import Drive, Geometry, Motion, Odometry, Payload, VehicleParams, VehicleState, World, Wrench
+from whill_mjx.types import (
+    Drive,
+    Geometry,
+    Motion,
+    Odometry,
+    Payload,
+    VehicleParams,
+    VehicleState,
+    World,
+    Wrench,
+    Yielding,
+)
 
 STATIC_SAG = 0.005  # [m] suspension and tyre compression under the static load
 DAMPING_RATIO = 0.5  # [-] of the suspension
@@ -84,7 +95,7 @@ def forces(
     memory, command = apply_chain(effects, memory, "command", command, motion)
     target = wheel_speeds(command, model.spec.track)
     memory, signal = apply_chain(effects, memory, "actuation", _no_drive(target), motion)
-    motion = dataclasses.replace(motion, drive_torque=signal.torque)
+    motion = dataclasses.replace(motion, drive_torque=signal.torque, yielding=signal.yielding)
     memory, wrench = sum_forces(effects, memory, motion, reacts=False)
     wrench = wrench + contact_wrench(motion, side_forces(motion, signal.force), jnp.zeros(4), motion.normal_force)
     memory, reaction = sum_forces(effects, memory, dataclasses.replace(motion, others=wrench), reacts=True)
@@ -202,6 +213,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         normal_force=smooth * softplus(load / smooth),
         spin=state.qvel[6:8],
         drive_torque=jnp.zeros(2),
+        yielding=Yielding.none(),
         wheel_inertia=jnp.asarray(spec.wheel_inertia),
         total_mass=mass,
         com=com,

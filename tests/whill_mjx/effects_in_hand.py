@@ -13,7 +13,7 @@ import pytest
 from whill_mjx.effects.base import place_of
 from whill_mjx.model import build_model
 from whill_mjx.presets import preset
-from whill_mjx.types import Drive, Odometry
+from whill_mjx.types import Drive, Odometry, Yielding
 from whill_mjx.vehicle import measure, nominal_world, place
 
 DT = 0.005  # s
@@ -42,6 +42,12 @@ def still():
 
 def signal(force=(0.0, 0.0), torque=(0.0, 0.0)):
     return Drive(jnp.zeros(2), jnp.asarray(force, jnp.float32), jnp.asarray(torque, jnp.float32))
+
+
+def over_time(target, force, torque):
+    """Drive over time, leaves (T, 2), whose torque yields within 30 N m."""
+    about = Yielding(*(jnp.full_like(torque, value) for value in (0.1, 2.0, 0.0, -30.0, 30.0, 1.0)))
+    return Drive(target, force, torque, about)
 
 
 def reading(x=0.0, y=0.0, yaw=0.0, v=0.0, omega=0.0, gyro=0.0):

@@ -8,13 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_in_hand import DT, WEIGHT, chair, motion_at, path, quick, reading, run, signal, step_command, still
+from effects_in_hand import (
+    DT,
+    WEIGHT,
+    chair,
+    motion_at,
+    over_time,
+    path,
+    quick,
+    reading,
+    run,
+    signal,
+    step_command,
+    still,
+)
 
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.command_quantisation import MAKER
 from whill_mjx.effects.gyro_range import MAKER as GYRO
 from whill_mjx.specs import HUSKY
-from whill_mjx.types import Drive, Payload
+from whill_mjx.types import Payload
 from whill_mjx.vehicle import add_payload, measure, nominal_world, place
 
 # Commands
@@ -202,7 +215,7 @@ def test_a_gain_difference_strengthens_the_left_drive():
 def test_after_a_reversal_backlash_passes_nothing_and_then_what_the_motor_gathered(rotor):
     """0.05 rad, 0.02 kg m^2 and 4 N m: late by sqrt(4 beta I / T), 32 ms, and nothing of the momentum is lost."""
     torque = jnp.concatenate([jnp.full((40, 2), 4.0), jnp.full((40, 2), -4.0)])
-    drives = Drive(jnp.zeros_like(torque), jnp.zeros_like(torque), torque)
+    drives = over_time(jnp.zeros_like(torque), jnp.zeros_like(torque), torque)
     effect = make_effect("backlash", play=0.05, rotor=rotor)
     passed = np.asarray(run(effect, drives).torque)[40:, 0]
     late = np.sqrt(4 * 0.05 * rotor * 0.02 / 4)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from effects_in_hand import over_time
 
 from whill_mjx.effects import (
     EFFECTS,
@@ -216,6 +217,36 @@ def test_the_torque_drive_acts_on_the_speed_in_the_middle_of_the_step():
     _, out = drive.actuation(memory, Drive(jnp.array([1.0, 1.0]), jnp.zeros(2), jnp.zeros(2)), motion)
     loaded = 4.0 * (error + gain / 2) / (1 + 4.0 * motion.dt / 2 / (0.02 + 52 / 2 * 0.1325**2))
     np.testing.assert_allclose(out.torque, loaded * np.ones(2), rtol=1e-4)
+
+
+def test_a_torque_yields_to_a_wheel_that_turns_faster_than_foreseen_and_stays_within_its_limit():
+    drive, motion = make_effect("torque_drive", kp=4.0, ki=0.0, limit=10.0), motion_at()
+    _, out = drive.actuation(drive.init(), Drive(jnp.array([0.2, 1.0]), jnp.zeros(2), jnp.zeros(2)), motion)
+    for faster in (0.0, 1.0, 5.0, 1000.0):
+        spin = out.yielding.foreseen + faster
+        change, inside = out.yielding.change(spin)
+        # The mean of the speeds before and after the step is what the controller sees, at rest before.
+        wanted = 4.0 * (np.array([0.2, 1.0]) / 0.1325 - np.asarray(spin) / 2)
+        np.testing.assert_allclose(out.torque + change, np.clip(wanted, -10.0, 10.0), rtol=1e-4, atol=1e-4)
+        np.testing.assert_array_equal(inside, np.abs(wanted) < 10.0)
+
+
+@pytest.mark.parametrize(
+    "name, fields, share",
+    [
+        ("supply_sag", {}, 1.0),
+        ("drive_gain_difference", {"difference": 0.2}, None),  # that of the torque
+        ("actuator_lag", {"time_constant": 0.015}, 0.25),
+        ("torque_saturation", {"limit": 10.0}, 0.0),
+        ("traction_limit", {"mu": 0.01}, 0.0),
+    ],
+)
+def test_what_weakens_a_torque_weakens_how_it_yields(name, fields, share):
+    effect, motion = make_effect(name, **fields), motion_at()
+    drive = jax.tree.map(lambda leaf: leaf[0], over_time(jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.full((1, 2), 8.0)))
+    _, after = effect.actuation(effect.init(), drive, motion)
+    expected = after.torque / drive.torque if share is None else np.full(2, share)
+    np.testing.assert_allclose(after.yielding.factor, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("limit", [0.5, 0.02])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.smooth import yielding_by
 from whill_mjx.types import Drive, Motion, parameter
 
 
@@ -34,8 +35,13 @@ class ActuatorLag(Effect):
         """Drive with lagging force (2,) and torque (2,)."""
         first = self._lagged(jnp.stack([drive.force, drive.torque]), memory[0], 1 - self.cascade, motion)
         second = self._lagged(first, memory[1], self.cascade, motion)
-        return (first, second), replace(drive, force=second[0], torque=second[1])
+        at_once = (1 - self._kept(1 - self.cascade, motion)) * (1 - self._kept(self.cascade, motion))
+        return (first, second), replace(drive, force=second[0], torque=second[1], yielding=yielding_by(drive, at_once))
 
     def _lagged(self, wanted: jax.Array, before: jax.Array, share: jax.Array, motion: Motion) -> jax.Array:
+        return wanted + (before - wanted) * self._kept(share, motion)
+
+    def _kept(self, share: jax.Array, motion: Motion) -> jax.Array:
+        """Share of what was that a lag keeps in a step."""
         lag = self.time_constant * share
-        return wanted + (before - wanted) * (lag / (lag + motion.dt))
+        return lag / (lag + motion.dt)

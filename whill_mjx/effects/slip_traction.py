@@ -43,19 +43,29 @@ class SlipTraction(Effect):
         slide_y = -motion.contact_vy
         grip = self.mu * motion.normal_force * geometry.driven
         carried = self.mu_free * motion.normal_force * (1 - geometry.driven)
-        relaxation = motion.dt / motion.wheel_inertia
+        relaxation, yielding = motion.dt / motion.wheel_inertia, motion.yielding
+        slope = yielding.factor * yielding.slope
+        unlimited = yielding.factor * (yielding.slack + yielding.slope * yielding.foreseen)  # [N m] at spin 0
         free_spin = motion.spin + relaxation * motion.drive_torque
         ahead = look_ahead(motion)
+        forward = ahead.forward
         for _ in range(ROUNDS):
             # Forces of the form stiffness * sliding, the stiffness taken at the sliding of the previous round.
             share = grip / jnp.sqrt(1 + (slide_x / self.slip_speed) ** 2 + (slide_y / self.side_slip_speed) ** 2)  # [N]
             stiffness = share / self.slip_speed  # [N s/m]
             sideways = share / self.side_slip_speed + carried / jnp.sqrt(slide_y**2 + self.side_slip_speed**2)
-            # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v'), put into the force C (r w' - v').
+            # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v'), put into the force C (r w' - v'). The
+            # torque is T + unlimited - slope w', or at a limit.
             total = per_side(stiffness)
-            yielding = 1 + relaxation * radius**2 * total
-            forward, left = held(motion, ahead, total / yielding, radius * free_spin, per_axle(sideways))
-            spin = (free_spin + relaxation * radius * total * forward) / yielding
+            line = (free_spin + relaxation * (unlimited + radius * total * forward)) / (
+                1 + relaxation * (slope + radius**2 * total))
+            change, inside = yielding.change(line)
+            change = jnp.where(inside, unlimited, yielding.factor * change)
+            stays = 1 + relaxation * jnp.where(inside, slope, 0.0)
+            wanted = (free_spin + relaxation * change) / stays
+            pulled = 1 + relaxation / stays * radius**2 * total
+            forward, left = held(motion, ahead, total / pulled, radius * wanted, per_axle(sideways))
+            spin = (wanted + relaxation / stays * radius * total * forward) / pulled
             slide_x, slide_y = to_contacts(radius * spin - forward), -to_axles(left)
         forward, left = stiffness * slide_x, share * slide_y / self.side_slip_speed
         # A wheel that a large torque spins up within the step would leave the friction circle.
@@ -63,4 +73,6 @@ class SlipTraction(Effect):
         forward, left = forward / excess, left / excess
         left = left + (sideways - share / self.side_slip_speed) * slide_y
         wrench = contact_wrench(motion, forward, left)
-        return memory, replace(wrench, spin_torque=-radius * per_side(forward))
+        reaction = -radius * per_side(forward)
+        change, _ = yielding.change((free_spin + relaxation * (unlimited + reaction)) / (1 + relaxation * slope))
+        return memory, replace(wrench, spin_torque=reaction + yielding.factor * change)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.types import Drive
+from whill_mjx.types import Drive, Yielding
 
 
 def soft_limit(value: jax.Array, limit: jax.Array) -> jax.Array:
@@ -26,4 +26,18 @@ def soft_sign(value: jax.Array, width: float) -> jax.Array:
 
 def scale_drive(drive: Drive, factor: jax.Array) -> Drive:
     """Force and torque of the drive times `factor`, () or (2,): either drive uses one of the two."""
-    return replace(drive, force=drive.force * factor, torque=drive.torque * factor)
+    return replace(drive, force=drive.force * factor, torque=drive.torque * factor,
+                   yielding=yielding_by(drive, factor))
+
+
+def yielding_by(drive: Drive, factor: jax.Array) -> Yielding:
+    """How the drive's torque yields where only a share of it, () or (2,), still reaches the wheel within the step."""
+    return replace(drive.yielding, factor=drive.yielding.factor * factor)
+
+
+def limit_drive(drive: Drive, force: jax.Array, torque: jax.Array) -> Drive:
+    """The drive with force and torque limited (`soft_limit`): where the limit holds the torque, it yields no more."""
+    square = jnp.square(jnp.square(drive.torque / torque))
+    share = 1 / ((1 + square) * jnp.sqrt(jnp.sqrt(1 + square)))  # the limit's slope
+    return replace(drive, force=soft_limit(drive.force, force), torque=soft_limit(drive.torque, torque),
+                   yielding=yielding_by(drive, share))

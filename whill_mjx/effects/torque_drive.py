@@ -11,7 +11,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.planar import by_mode, spin_response
-from whill_mjx.types import Drive, Motion, parameter
+from whill_mjx.types import Drive, Motion, Yielding, parameter
 
 TINY = 1e-6  # [N m] or [rad/s], keeps shares defined where torque or target does not change
 
@@ -42,7 +42,8 @@ class TorqueDrive(Effect):
     """T = clip(kp e + ki integral of e, +-limit) with e = v_target / r - spin.
 
     e and its integral are those in the middle of the physics step, with the acceleration that this torque gives to
-    rolling wheels under the load of the step before: a controller that acts all the time, not once in a step.
+    rolling wheels under the load of the step before: a controller that acts all the time, not once in a step. Where a
+    wheel slips it accelerates otherwise; e is then taken as it turns out (`Yielding`).
 
     While the torque is at its limit the integral goes on at `windup` times its rate: 1 is a plain PI controller, which
     overshoots after a long acceleration, 0 stops integrating (anti-windup). A target that jumps within a step comes as
@@ -86,7 +87,10 @@ class TorqueDrive(Effect):
         done = Last(target, last.target, error - half * acceleration, wanted, crossing)
         rate = self.rate(done.error, wanted, crossing)
         after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
-        return after, replace(drive, torque=drive.torque + torque)
+        foreseen = motion.spin + motion.dt * (by_mode(wanted, response) + load)
+        yielding = Yielding(foreseen, half / motion.dt * self.kp * jnp.ones(2), wanted - torque, -self.limit - torque,
+                            self.limit - torque, jnp.ones(2))
+        return after, replace(drive, torque=drive.torque + torque, yielding=yielding)
 
     def rate(self, error: jax.Array, wanted: jax.Array, crossing: jax.Array) -> jax.Array:
         """(2,) of the integral [rad/s], by the share of a step in which the torque is within its limit."""

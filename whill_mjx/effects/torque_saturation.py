@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.effects.smooth import soft_limit
+from whill_mjx.effects.smooth import limit_drive
 from whill_mjx.types import Drive, Motion, parameter
 
 
@@ -26,5 +24,4 @@ class TorqueSaturation(Effect):
 
     def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:
         """Drive with limited force (2,) and torque (2,)."""
-        force = soft_limit(drive.force, self.limit)
-        return memory, replace(drive, force=force, torque=soft_limit(drive.torque, self.limit * motion.wheel_radius))
+        return memory, limit_drive(drive, self.limit, self.limit * motion.wheel_radius)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean
-from whill_mjx.effects.smooth import soft_limit
+from whill_mjx.effects.smooth import limit_drive
 from whill_mjx.types import Drive, Motion, parameter
 
 TINY = 1e-3  # [N], keeps the limit defined where a wheel has lifted
@@ -32,5 +30,4 @@ class TractionLimit(Effect):
         """Drive with limited force (2,) and torque (2,)."""
         wheels = motion.world.geometry.driven.sum() / 2  # of one side
         grip = self.mu * (wheels * driven_mean(motion, motion.normal_force) + TINY)
-        torque = soft_limit(drive.torque, grip * motion.wheel_radius)
-        return memory, replace(drive, force=soft_limit(drive.force, grip), torque=torque)
+        return memory, limit_drive(drive, grip, grip * motion.wheel_radius)
