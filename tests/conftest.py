@@ -31,7 +31,7 @@ def compilation_cache(tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=1.0):
+    with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=0.1):
         yield
 
 
