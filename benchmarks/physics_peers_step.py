@@ -18,12 +18,12 @@ import mujoco
 import numpy as np
 
 from benchmarks.harness import RESULTS, figure
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, TIMESTEP, Chair, build
+from benchmarks.plant.chair import TIMESTEP, Chair, Nominal, build
 from whill_mjx.manoeuvres import command_table
 
 STEPS = (0.008, 0.004, 0.002, 0.001, 0.0005)  # s
 TICK = 0.008  # s, of the wheel-speed control: a multiple of every step
-RAMP = (1.7, 2 * 1.7 / NOMINAL_TRACK)  # m/s^2, rad/s^2
+RAMP = (1.7, 2 * 1.7 / Nominal.track)  # m/s^2, rad/s^2
 DRIVES = {"": False, "_ramped": True}
 WITHIN = 2.0  # mm and mrad
 
@@ -49,17 +49,17 @@ def drive(dt: float, table: np.ndarray) -> np.ndarray:
         data.qfrc_applied[wheels] = -20.0 * data.qvel[wheels]  # brakes on
         mujoco.mj_step(model, data)
     data.qpos[:2], data.qvel[:] = 0.0, 0.0
-    half, integral, rows = NOMINAL_TRACK / 2, np.zeros(2), []
+    half, integral, rows = Nominal.track / 2, np.zeros(2), []
     for time in np.arange(round(table[-1, 0] / TICK)) * TICK:
         _, v, omega = table[np.searchsorted(table[:, 0], time + 1e-9, side="right") - 1]
-        error = np.array([v - half * omega, v + half * omega]) / NOMINAL_RADIUS - data.qvel[wheels]
+        error = np.array([v - half * omega, v + half * omega]) / Nominal.radius - data.qvel[wheels]
         integral += error * TICK
         torque = chair.kp * error + chair.ki * integral
         data.qfrc_applied[wheels] = np.clip(torque, -chair.torque_limit, chair.torque_limit)
         mujoco.mj_step(model, data, round(TICK / dt))
         w, x, y, z = data.qpos[3:7]
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-        rows.append([*data.qpos[:2], yaw, *(NOMINAL_RADIUS * data.qvel[wheels])])
+        rows.append([*data.qpos[:2], yaw, *(Nominal.radius * data.qvel[wheels])])
     return np.array(rows)
 
 

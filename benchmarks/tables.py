@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -89,19 +90,25 @@ def table(content: dict[str, Any]) -> str:
 
 def confusion(cases: list[dict[str, Any]]) -> str:
     """Every log of the contact plant: what was in it and what was said."""
-    rows = ["| in the log | size | verdict | named | cannot be told from | explained |", "|---|---|---|---|---|---|"]
-    quiet = sum(not case["truth"] and case["verdict"] == "none" for case in cases)
-    if quiet:
-        rows.append(f"| nothing, {quiet} logs | | none | | | |")
+    rows = ["| driven by | in the log | size | verdict | named | cannot be told from | explained |",
+            "|---|---|---|---|---|---|---|"]
+    quiet = Counter(driver(case) for case in cases if not case["truth"] and case["verdict"] == "none")
+    rows += [f"| {who} | nothing, {count} logs | | none | | | |" for who, count in quiet.items()]
     for case in cases:
         if not case["truth"] and case["verdict"] == "none":
             continue
         inside = ", ".join(case["truth"]) or "nothing"
         sizes = ", ".join(number(size) for size in case["truth"].values())
         others = ", ".join(name for each in case["classes"] for name in each[1:])
-        rows.append(f"| {inside} | {sizes} | {case['verdict']} | {', '.join(case['named'])} | {others} | "
-                    f"{case['explained']:.0%} |")
+        rows.append(f"| {driver(case)} | {inside} | {sizes} | {case['verdict']} | {', '.join(case['named'])} | "
+                    f"{others} | {case['explained']:.0%} |")
     return "\n".join(rows)
+
+
+def driver(case: dict[str, Any]) -> str:
+    """Vehicle and disturbances of a log; older rows are of the chair and the usual ones."""
+    noise = case.get("noise", 1.0)
+    return case.get("vehicle", "chair") + ("" if noise == 1.0 else f", noise x {number(noise)}")
 
 
 def verdicts(content: dict[str, Any]) -> str:

@@ -22,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import undeclared_figures
 from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
-from benchmarks.undeclared_reference import prepared, reference_days, reference_of
+from benchmarks.undeclared_reference import Driven, prepared, reference_days, reference_of
 from sysid.close_loop import LoopConfig, Prepared, close_loop, prepare
 from sysid.log import load_log
 from sysid.loop.report import make_report, write_run
@@ -58,6 +59,8 @@ class Benchmark:
     """Logs of each effect and multiple."""
     noise: float = 1.0
     """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
+    vehicle: str = "chair"
+    """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own."""
     pairs: int = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
@@ -79,6 +82,11 @@ class Benchmark:
     part: str = "1/1"
     """I/N: only every N-th log or effect from the I-th on, for several processes; `collect` then writes the figures."""
 
+    @property
+    def driven(self) -> Driven:
+        """What drives the logs."""
+        return Driven(self.noise, self.vehicle)
+
 
 def main(settings: Benchmark) -> None:
     """Run what was asked for."""
@@ -91,7 +99,7 @@ def main(settings: Benchmark) -> None:
     if settings.classes:
         look_alikes(settings)
     if settings.collect:
-        contact.figures(settings.work / "plant", settings.noise)
+        undeclared_figures.figures(settings.work / "plant", settings.driven)
 
 
 def shared(settings: Benchmark) -> None:
@@ -121,7 +129,7 @@ def shared(settings: Benchmark) -> None:
 
 def plant(settings: Benchmark) -> None:
     """Logs of the contact plant."""
-    work, config, part, noise = settings.work / "plant", LoopConfig(), settings.part, settings.noise
+    work, config, part, driven = settings.work / "plant", LoopConfig(), settings.part, settings.driven
     ready: dict[int, Prepared] = {}
 
     def judge(listed: Sequence[contact.Job]) -> None:
@@ -130,9 +138,9 @@ def plant(settings: Benchmark) -> None:
                 continue
             if job.reference not in ready:
                 ready.clear()  # one at a time: each has its compiled replay
-                ready[job.reference] = prepared(work, job.reference, noise, config)
+                ready[job.reference] = prepared(work, job.reference, driven, config)
             full = job.stage in ("scaled", "pair") and bool(job.effects) and number % settings.full == 0
-            one = contact.judge(job, ready[job.reference], work, config, full, noise)
+            one = contact.judge(job, ready[job.reference], work, config, full, driven)
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
@@ -141,13 +149,13 @@ def plant(settings: Benchmark) -> None:
     while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
     if settings.scales:
-        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, noise, settings.only))
+        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:
-        judge(contact.pair_jobs(work, settings.pairs, part, noise))
+        judge(contact.pair_jobs(work, settings.pairs, part, driven))
     if part == "1/1":
-        contact.figures(work, noise)
+        undeclared_figures.figures(work, driven)
 
 
 def look_alikes(settings: Benchmark) -> None:
@@ -173,7 +181,7 @@ def look_alikes(settings: Benchmark) -> None:
         members = classes(imitation(evidence, found), found)
         content["sensors"][sensors] = {"classes": members,
                                        "mean_size": float(np.mean([len(each) for each in members.values()]))}
-    write_json(contact.CLASSES, content)
+    write_json(undeclared_figures.CLASSES, content)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,8 +1,9 @@
-"""Verdicts of the closed loop on logs of the contact plant: which logs are driven, and what is counted.
+"""Verdicts of the closed loop on logs of the contact plant: which logs are driven, and what is kept of them.
 
 First every effect is driven at its base size and then at others, until it stands out about as far as what is noticed
 with 80 % power. Logs at 2 and 4 times that size (or the largest with which the chair still drives its manoeuvres), and
 with pairs of effects, follow. What a log contains is written into a file beside it that the loop never reads.
+`benchmarks/undeclared_figures.py` counts.
 """
 
 from __future__ import annotations
@@ -12,27 +13,26 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, figure, record
-from benchmarks.plant.effects import EFFECTS
+from benchmarks.harness import RESULTS
+from benchmarks.plant.chair import VEHICLES
+from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.make import make_log
-from benchmarks.undeclared_reference import reference_days
+from benchmarks.undeclared_reference import USUAL, Driven, reference_days
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
 from sysid.log import load_log
 from sysid.loop.report import effects as named_effects
 from sysid.loop.report import make_report, write_run
 from sysid.loop.trust import warnings
 from sysid.report import write_report
-from sysid.statistics import upper_rate
 
 RECORDED = RESULTS / "undeclared.json"
-CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
 POWER = 0.84
 """Standard deviations between the limit and the mean of what is noticed in 80 % of all cases."""
 NEAR, FAR = (0.3, 3.0), (0.1, 10.0)
@@ -49,17 +49,6 @@ BRACKET = 1.3
 """Factor between a size that does not stand out enough and one that does at which they are close enough."""
 REACH = 100.0
 """Factor on the base size, up or down, beyond which no size is tried."""
-SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
-    "command_scale": ("command_scale.linear", 1.0, 1.0),
-    "drive_gain_difference": ("drive_gain_difference.difference", 0.0, 1.0),
-    "wheel_radius_difference": ("wheel_radius_difference.difference", 0.0, 1.0),
-    "track_width": ("track_width.error", 0.0, 1.0),
-    "payload_shift": ("payload_shift.mass", 0.0, 1.0),
-    "quadratic_drag": ("quadratic_drag.coefficient", 0.0, 1.0),
-    "side_force": ("side_force.sideways", 0.0, 1.0),
-    "slope": ("slope.along_x", 0.0, 1.0),
-    "sensor_delay": ("sensor_delay.delay", 0.0, 1.0),
-}
 
 
 @dataclass(frozen=True)
@@ -115,11 +104,11 @@ def probe_jobs(work: Path, part: str, only: Sequence[str] = ()) -> list[Job]:
 
 
 def scaled_jobs(
-    work: Path, scales: Sequence[float], seeds: int, part: str, noise: float = 1.0, only: Sequence[str] = ()
+    work: Path, scales: Sequence[float], seeds: int, part: str, driven: Driven = USUAL, only: Sequence[str] = ()
 ) -> list[Job]:
     """Logs with one effect each (of `only`, if any), at multiples of that size, as far as the chair still drives."""
-    sizes = power_sizes(work, noise)
-    return [Job(f"{name}_x{scale:g}_{seed}", {name: capped(name, scale * sizes[name])},
+    sizes = power_sizes(work, driven)
+    return [Job(f"{name}_x{scale:g}_{seed}", {name: capped(name, scale * sizes[name], driven)},
                 30001 + 50 * i + 10 * j + seed, scale, "scaled")
             for i, name in enumerate(sorted(EFFECTS)) if name in sizes and mine(i, part) and name in (only or sizes)
             for j, scale in enumerate(scales) for seed in range(seeds)]
@@ -131,21 +120,21 @@ def left_out_jobs(work: Path, part: str) -> list[Job]:
             for job in scaled_jobs(work, (4.0,), 1, part) if all(EFFECTS[name].known for name in job.effects)]
 
 
-def pair_jobs(work: Path, pairs: int, part: str, noise: float = 1.0) -> list[Job]:
+def pair_jobs(work: Path, pairs: int, part: str, driven: Driven = USUAL) -> list[Job]:
     """Logs with two effects each, at four times that size; the sizes of all effects must be there."""
-    sizes = power_sizes(work, noise)
+    sizes = power_sizes(work, driven)
     known = [name for name in sorted(EFFECTS) if EFFECTS[name].known and name in sizes]
     random, out = np.random.default_rng(7), []
     for n in range(pairs if len(known) > 1 else 0):
         first, second = random.choice(known, 2, replace=False)
-        effects = {str(name): capped(name, 4 * sizes[name]) for name in (first, second)}
+        effects = {str(name): capped(name, 4 * sizes[name], driven) for name in (first, second)}
         out.append(Job(f"pair_{n:02d}", effects, 60000 + n, 4.0, "pair"))
     return [job for n, job in enumerate(out) if mine(n, part)]
 
 
-def capped(name: str, size: float) -> float:
-    """A size with which the chair still drives."""
-    return min(size, EFFECTS[name].most)
+def capped(name: str, size: float, driven: Driven = USUAL) -> float:
+    """A size with which the vehicle still drives."""
+    return min(size, in_proportion(name, EFFECTS[name].most, VEHICLES[driven.vehicle]))
 
 
 Point = tuple[float, float]
@@ -206,15 +195,17 @@ def _check_at(size: float | None, points: Sequence[Point]) -> float | None:
     return size * float(np.sqrt(BESIDE))
 
 
-def power_sizes(work: Path, noise: float = 1.0) -> dict[str, float]:
+def power_sizes(work: Path, driven: Driven = USUAL) -> dict[str, float]:
     """Size of each effect that would be noticed with 80 % power; without those for which no such size was found.
 
-    Of an effect that was not driven to find its size, it is the recorded one, times the noise.
+    Of an effect that was not driven to find its size, it is the recorded one of the chair, times the noise and in
+    proportion to the vehicle.
     """
-    driven = {name: seen_at(work, name) for name in EFFECTS}
+    seen = {name: seen_at(work, name) for name in EFFECTS}
     recorded = json.loads(RECORDED.read_text())["sizes"] if RECORDED.exists() else {}
     found = {name: size_between(EFFECTS[name].base, points) if points
-             else noise * recorded[name]["value"] if name in recorded else None for name, points in driven.items()}
+             else driven.noise * in_proportion(name, recorded[name]["value"], VEHICLES[driven.vehicle])
+             if name in recorded else None for name, points in seen.items()}
     return {name: size for name, size in found.items() if size is not None}
 
 
@@ -237,7 +228,7 @@ def crossing(points: Sequence[Point]) -> float | None:
 
 
 def judge(
-    job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool, noise: float = 1.0
+    job: Job, ready: Prepared, work: Path, config: LoopConfig, full: bool, driven: Driven = USUAL
 ) -> dict[str, Any]:
     """Drive a log, close the loop on it, and keep the verdict; `full` also opens its held-out trials."""
     verdict = work / "verdicts" / f"{job.label}.json"
@@ -245,7 +236,7 @@ def judge(
         return json.loads(verdict.read_text())
     folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
-        make_log(folder, effects=job.effects, seed=job.seed, noise=noise)
+        make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise, vehicle=driven.vehicle)
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = close_loop(load_log(folder), (), config, reference=ready)
@@ -282,20 +273,6 @@ def speed(work: Path, refit_nulls: int = 0) -> None:
     write_report(work / f"speed_{refit_nulls}.json", {"seconds": time.perf_counter() - began, "nulls": nulls})
 
 
-def of_speed(work: Path) -> dict[str, Any]:
-    """Seconds of the whole command, with linear nulls only and with refitted ones."""
-    found = {}
-    for path in work.glob("speed_*.json"):
-        one = json.loads(path.read_text())
-        about = "linear nulls" if one["nulls"] is None else f"{one['nulls']['count']} refitted nulls"
-        name = "cpu_quick_seconds" if one["nulls"] is None else "cpu_seconds"
-        found[name] = figure([one["seconds"]], f"s, the whole command with {about}, compilations included")
-        if one["nulls"] is not None:
-            found["refitted_null_alarms"] = figure([float(one["nulls"]["false_alarms"])],
-                                                   f"of {one['nulls']['count']} simulated days of one log")
-    return found
-
-
 def brief(result: Result) -> dict[str, Any]:
     """A verdict without its report; held-out trials stay closed."""
     found, alpha = result.search, result.config.thresholds.alpha
@@ -308,160 +285,3 @@ def brief(result: Result) -> dict[str, Any]:
                         for one in named_effects(result)] if found.verdict == "named" else [],
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
                            for each in found.rounds]}
-
-
-def figures(work: Path, noise: float = 1.0) -> None:
-    """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
-    cases = list(read_cases(work))
-    found = {**of_nulls([one for truth, one in cases if not truth])}
-    for scale in sorted({one["scale"] for _, one in cases if one["stage"] == "scaled"}):
-        inside = [(next(iter(truth)), one) for truth, one in cases
-                  if one["stage"] == "scaled" and one["scale"] == scale]
-        found.update(of_singles(inside, f"_{scale:g}x"))
-    found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
-    found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"],
-                             own_classes(work)))
-    found.update(of_parameters([(truth, one) for truth, one in cases if one["stage"] != "left_out"]))
-    ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
-    if ratios:
-        found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
-    seconds = [one["seconds"] for _, one in cases if one["stage"] in ("scaled", "pair")]
-    if seconds:
-        found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
-    found.update(of_speed(work))
-    if noise != 1.0:
-        found = {f"{name}_noise_{noise:g}": one for name, one in found.items()}
-    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
-    sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
-             for name, size in power_sizes(work).items()} if noise == 1.0 else recorded.get("sizes", {})
-    path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
-    content = {**json.loads(path.read_text()), "sizes": sizes}
-    judged = {_kind(truth, one["stage"]) for truth, one in cases}  # others may have been judged in another folder
-    kept = [row for row in recorded.get("confusion", [])
-            if _kind(row["truth"], row["stage"]) not in judged or row.get("noise", 1.0) != noise]
-    content["confusion"] = kept + [
-        {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": noise, "verdict": one["verdict"],
-         "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
-         "explained": one["share"]} for truth, one in cases]
-    write_report(path, content)
-
-
-def _kind(truth: Mapping[str, float], stage: str) -> tuple[str, ...]:
-    """What is judged in one folder: all logs of a stage, or all with which the size of one effect is looked for."""
-    return (stage, *truth) if stage == "base" else (stage,)
-
-
-Case = tuple[dict[str, float], dict[str, Any]]
-"""What was in a log, and what was said of it."""
-
-
-def read_cases(work: Path) -> Iterable[Case]:
-    """All logs that have a verdict."""
-    for path in sorted((work / "verdicts").glob("*.json")):
-        yield json.loads((work / "truth" / path.name).read_text()), json.loads(path.read_text())
-
-
-def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """False alarms and whether p-values are uniform."""
-    from scipy import stats
-
-    if not nulls:
-        return {}
-    false = sum(one["verdict"] != "none" for one in nulls)
-    sets = len({one.get("reference", 0) for one in nulls})
-    return {
-        "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
-        "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share"),
-        "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)],
-                            f"of {len(nulls)} logs over {sets} sets of reference days")}
-
-
-def said(truth: str, one: dict[str, Any]) -> bool:
-    """Whether a verdict names an effect or a class with it."""
-    return any(truth in effect["class"] for effect in one["effects"])
-
-
-def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[str, Any]:
-    """Right and wrong names of logs with one effect each."""
-    known = [(name, one) for name, one in inside if EFFECTS[name].known]
-    beyond = [one for name, one in inside if not EFFECTS[name].known]
-    found = {}
-    if known:
-        about = f"share of {len(known)} logs"
-        right = [said(name, one) for name, one in known]
-        wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
-        found[f"class_accuracy{tag}"] = figure([float(np.mean(right))], about)
-        right_ones = [one for (_, one), ok in zip(known, right, strict=True) if ok]
-        if right_ones:
-            found[f"warned_right{tag}"] = figure([float(np.mean([warned(one) for one in right_ones]))],
-                                                 f"share of {len(right_ones)} right names that come with a warning")
-        found[f"wrong_name{tag}"] = figure([float(np.mean(wrong))], about)
-        found[f"noticed{tag}"] = figure([float(np.mean([one["verdict"] != "none" for _, one in known]))], about)
-        sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]
-        if sizes:
-            found[f"mean_class_size{tag}"] = figure([float(np.mean(sizes))], "effects")
-    if beyond:
-        found[f"out_of_catalogue{tag}"] = figure(
-            [float(np.mean([one["verdict"] == "unexplained" for one in beyond]))],
-            f"share of {len(beyond)} logs that are said to be unexplained")
-    return found
-
-
-def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
-    """Both named, and no wrong one, of logs with two effects."""
-    if not pairs:
-        return {}
-    both = [all(said(name, one) for name in truth) for truth, one in pairs]
-    clean = [all(set(effect["class"]) & set(truth) for effect in one["effects"]) for truth, one in pairs]
-    return {"pair_both": figure([float(np.mean(both))], f"share of {len(pairs)} logs"),
-            "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
-
-
-def warned(one: dict[str, Any]) -> bool:
-    """Whether a name comes with a warning (`sysid.loop.trust.warnings`); one is that more is left than days differ
-    by, which verdicts of before others were kept tell too."""
-    return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
-
-
-def own_classes(work: Path) -> dict[str, set[str]]:
-    """Effect -> what its log at four times the size is named as where the catalogue has it, judged here or recorded."""
-    rows = json.loads(RECORDED.read_text()).get("confusion", []) if RECORDED.exists() else []
-    rows += [{"truth": truth, **one, "classes": [e["class"] for e in one["effects"]]}
-             for truth, one in read_cases(work)]
-    return {name: {member for members in row["classes"] for member in members} for row in rows
-            for name in row["truth"]
-            if (row["stage"], row["scale"], row.get("noise", 1.0)) == ("scaled", 4.0, 1.0)}
-
-
-def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, set[str]]) -> dict[str, Any]:
-    """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class, without
-    a warning. Its class is that of the file, and that with which the same log is named by the whole catalogue (`own`).
-    """
-    if not inside:
-        return {}
-    [*_, alike] = json.loads(CLASSES.read_text())["sensors"].values()
-    outside = [one["verdict"] == "named" and not any(
-        ({*alike["classes"][name]} | own.get(name, set())) & set(effect["class"]) for effect in one["effects"])
-        for name, one in inside]
-    wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
-    about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
-    return {"left_out_wrong": figure([float(np.mean(wrong))], about),
-            "left_out_outside_class": figure([float(np.mean(outside))], about),
-            "left_out_unexplained": figure([float(np.mean([one["verdict"] == "unexplained" for _, one in inside]))],
-                                           about)}
-
-
-def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
-    """Intervals that cover the size driven, and relative errors, where plant and catalogue write an effect alike."""
-    inside, errors = [], []
-    for truth, one in cases:
-        for effect in one["effects"]:
-            if effect["name"] in truth and effect["name"] in SAME:
-                parameter, neutral, unit = SAME[effect["name"]]
-                driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
-                inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))
-                errors.append(abs(seen["value"] - driven) / abs(driven - neutral))
-    if not inside:
-        return {}
-    return {"interval_coverage": figure([float(np.mean(inside))], f"share of {len(inside)} 95 % intervals"),
-            "parameter_error": figure(errors, "of the size")}

@@ -11,6 +11,7 @@ import hashlib
 import os
 import pickle
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.plant.make import make_log
@@ -22,6 +23,24 @@ from sysid.rollout import vehicle_plant
 from whill_mjx.config import VehicleConfig
 from whill_mjx.presets import preset_params
 
+
+@dataclass(frozen=True)
+class Driven:
+    """What drives the logs; each needs a folder of its own."""
+
+    noise: float = 1.0
+    """Factor on all disturbances and sensor noise."""
+    vehicle: str = "chair"
+    """Of `benchmarks.plant.chair.VEHICLES`."""
+
+    @property
+    def tag(self) -> str:
+        """What the names of its figures end in."""
+        noise = "" if self.noise == 1.0 else f"_noise_{self.noise:g}"
+        return noise if self.vehicle == "chair" else f"{noise}_{self.vehicle}"
+
+
+USUAL = Driven()
 DAYS = 6
 FIRST_SEED, SEEDS = 11001, 10
 """Seed of the first day of set 0, and how far the next set's first is from it; nulls start at 20000."""
@@ -34,7 +53,7 @@ def folder_of(work: Path, number: int) -> Path:
     return work / ("reference" if number == 0 else f"reference_{number}")
 
 
-def reference_days(work: Path, noise: float = 1.0, number: int = 0) -> list[Log]:
+def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[Log]:
     """Days of the contact plant with nothing in them: one with three replicates, the others with one.
 
     Args:
@@ -50,7 +69,8 @@ def reference_days(work: Path, noise: float = 1.0, number: int = 0) -> list[Log]
         path = folder_of(work, number) / f"day_{day + 1}"
         if not path.exists():
             try:
-                make_log(path, seed=FIRST_SEED + SEEDS * number + day, noise=noise, replicates=3 if day == 0 else 1)
+                make_log(path, seed=FIRST_SEED + SEEDS * number + day, noise=driven.noise,
+                         replicates=3 if day == 0 else 1, vehicle=driven.vehicle)
             except OSError:
                 if not path.exists():  # else another part was quicker
                     raise
@@ -65,9 +85,9 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
                           progress=lambda _, remark: print(remark, flush=True))
 
 
-def prepared(work: Path, number: int, noise: float, config: LoopConfig) -> Prepared:
+def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Prepared:
     """A set ready for `close_loop`; its days are driven, and fitted, where that was not done before."""
-    days = reference_days(work, noise, number)
+    days = reference_days(work, driven, number)
     path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
     if path.exists():
         reference = pickle.loads(path.read_bytes())

@@ -10,6 +10,7 @@ import json
 import sys
 from pathlib import Path
 
+from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
 
@@ -31,6 +32,7 @@ def main(arguments: list[str] | None = None) -> Path:
     parser.add_argument("--replicates", type=int, default=3)
     parser.add_argument("--answers", type=Path, help="file, outside the dataset, that tells what was driven")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--vehicle", choices=VEHICLES, default="chair")
     given = parser.parse_args(arguments)
     try:
         effects = {str(name): float(size) for name, size in json.loads(given.effects).items()}
@@ -40,7 +42,7 @@ def main(arguments: list[str] | None = None) -> Path:
         ) from None
     return make_log(
         given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
-        given.replicates, given.answers, given.processes,
+        given.replicates, given.answers, given.processes, given.vehicle,
     )  # fmt: skip
 
 

@@ -12,21 +12,35 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELBASE, NOMINAL_MASS = 0.1325, 0.496, 0.45, 54.0  # m, m, m, kg
 TIMESTEP = 0.002  # s, of the contact dynamics
-FRONT_RADIUS = 0.1  # m
+FRONT_RADIUS, FRONT_Y = 0.1, 0.19  # m, of the front wheels, from the middle
 GRAVITY = 9.81  # m/s^2
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """What the data sheet says, and what controllers and odometry assume."""
+
+    radius: float = 0.1325
+    """Of the drive wheels [m]."""
+    track: float = 0.496
+    """Between the drive wheels [m]."""
+    wheelbase: float = 0.45
+    """From the drive axle to the front wheels [m]."""
+    mass: float = 54.0
+    """[kg]"""
 
 
 @dataclass(frozen=True)
 class Chair:
     """Everything about one chair on one day. Left comes before right in every pair."""
 
-    radius: tuple[float, float] = (NOMINAL_RADIUS, NOMINAL_RADIUS)
+    nominal: Nominal = Nominal()
+    radius: tuple[float, float] = (Nominal.radius, Nominal.radius)
     """True wheel radii [m]."""
-    track: float = NOMINAL_TRACK
+    track: float = Nominal.track
     """True distance between the drive wheels' contacts [m]."""
-    mass: float = NOMINAL_MASS
+    mass: float = Nominal.mass
     """All of it, wheels included [kg]."""
     com: tuple[float, float, float] = (0.156, 0.0, 0.167)
     """Centre of mass of the frame from the drive axle [m]."""
@@ -79,6 +93,22 @@ class Chair:
         )
 
 
+VEHICLES = {
+    "chair": Chair(),
+    "scooter": Chair(
+        nominal=Nominal(0.165, 0.57, 0.62, 128.0), radius=(0.165, 0.165), track=0.57, mass=128.0,
+        com=(0.2, 0.0, 0.26), gyration=(0.3, 0.36, 0.38), wheel_mass=4.5, armature=0.08, damping=0.45, friction=0.7,
+        patch=0.004, roller_drag=9.0, kp=24.0, ki=45.0, torque_limit=42.0, delay=0.06, payload_at=(0.25, 0.2, 0.4),
+    ),
+    "robot": Chair(
+        nominal=Nominal(0.098, 0.4, 0.3, 21.0), radius=(0.098, 0.098), track=0.4, mass=21.0, com=(0.09, 0.0, 0.12),
+        gyration=(0.15, 0.16, 0.19), wheel_mass=0.8, armature=0.005, damping=0.05, friction=0.95, patch=0.001,
+        roller_drag=1.2, kp=2.6, ki=2.0, torque_limit=3.5, delay=0.04, payload_at=(0.1, 0.12, 0.25),
+    ),
+}
+"""The chair that reference data are of; a heavy scooter with its rider; a small indoor robot."""
+
+
 def build(chair: Chair) -> mujoco.MjModel:
     """The chair's model: free chassis, two driven wheels, pivoting front beam; rotors only where there is play."""
     frame_mass = chair.mass - 2 * chair.wheel_mass - 1.0
@@ -102,16 +132,16 @@ def build(chair: Chair) -> mujoco.MjModel:
   <default><geom contype="0" conaffinity="0" mass="0"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1"/>
-    <body name="chassis" pos="0 0 {NOMINAL_RADIUS}">
+    <body name="chassis" pos="0 0 {chair.nominal.radius}">
       <freejoint/>
       <inertial pos="{_numbers(chair.com)}" mass="{frame_mass}" diaginertia="{_numbers(inertia)}"/>
       {wheels}
       {box}
-      <body name="beam" pos="{NOMINAL_WHEELBASE} 0 {FRONT_RADIUS - NOMINAL_RADIUS}">
+      <body name="beam" pos="{chair.nominal.wheelbase} 0 {FRONT_RADIUS - chair.nominal.radius}">
         <joint name="pivot" axis="1 0 0" damping="0.5"/>
         <inertial pos="0 0 0" mass="1" diaginertia="0.03 0.005 0.03"/>
-        <geom name="front_left" type="sphere" size="{FRONT_RADIUS}" pos="0 0.19 0"/>
-        <geom name="front_right" type="sphere" size="{FRONT_RADIUS}" pos="0 -0.19 0"/>
+        <geom name="front_left" type="sphere" size="{FRONT_RADIUS}" pos="0 {FRONT_Y} 0"/>
+        <geom name="front_right" type="sphere" size="{FRONT_RADIUS}" pos="0 {-FRONT_Y} 0"/>
       </body>
     </body>
   </worldbody>

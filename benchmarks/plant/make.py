@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import NOMINAL_MASS, NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELBASE, Chair
+from benchmarks.plant.chair import VEHICLES, Chair, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.sensors import odometry, outside_pose
@@ -22,16 +22,6 @@ from benchmarks.plant.trial import Noise, Plant
 from whill_mjx.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
 
 HELD_OUT = ("figure_eight_1", "figure_eight_2", "figure_eight_3", "s_curve_3", "random_3", "stop_and_go_3", "reverse_3")
-FIELDS = f"""schema = 1
-vehicle = "differential-drive powered chair"
-wheel_radius = {NOMINAL_RADIUS}      # m, nominal
-track = {NOMINAL_TRACK}              # m, nominal, between drive wheels
-wheelbase = {NOMINAL_WHEELBASE}           # m, drive axle to front axle
-mass = {NOMINAL_MASS}                # kg, nominal
-command_limits = [1.0, 1.0]  # m/s, rad/s
-reference_point = "drive axle centre"
-odometry = "wheel encoders"
-"""
 
 
 @dataclass(frozen=True)
@@ -58,7 +48,7 @@ class Setting:
 def make_log(
     out: Path | str, effects: Mapping[str, float] | None = None, seed: int = 0, noise: float = 1.0, day: bool = True,
     ground_truth: bool = True, manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
-    answers: Path | str | None = None, processes: int = 1,
+    answers: Path | str | None = None, processes: int = 1, vehicle: str = "chair",
 ) -> Path:  # fmt: skip
     """Drive a dataset and write it; returns its folder. The same arguments give the same files.
 
@@ -73,12 +63,13 @@ def make_log(
         replicates: drives of each manoeuvre.
         answers: file that tells what was driven; it must lie outside `out`.
         processes: 1 drives here, more in as many processes.
+        vehicle: of `chair.VEHICLES`.
 
     Raises:
         ValueError, FileExistsError: naming the value, the rule and the remedy.
     """
     out = Path(out)
-    setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates)
+    setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates, vehicle)
     if out.exists():
         raise FileExistsError(f"{out}: exists. Name a new folder, or delete this one.")
     if answers is not None and Path(answers).resolve().is_relative_to(out.resolve()):
@@ -89,21 +80,23 @@ def make_log(
             results = [result for part in pool.map(drive_all, [setting] * processes, parts) for result in part]
     else:
         results = drive_all(setting, jobs)
-    write_dataset(out, {job.name: job.messages for job in jobs}, results, ground_truth)
+    write_dataset(out, VEHICLES[vehicle].nominal, {job.name: job.messages for job in jobs}, results, ground_truth)
     if answers is not None:
-        truth = {"effects": dict(setting.effects), "seed": seed, "noise": noise, "day": day}
+        truth = {"effects": dict(setting.effects), "seed": seed, "noise": noise, "day": day, "vehicle": vehicle}
         write_text(Path(answers), json.dumps(truth, indent=1) + "\n")
     return out
 
 
 def plan(
     effects: Mapping[str, float], seed: int, noise: float, day: bool,
-    manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
+    manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3, vehicle: str = "chair",
 ) -> tuple[Setting, list[Job]]:  # fmt: skip
     """Check the arguments of `make_log`, draw the day, list the trials."""
     unknown = sorted(set(effects) - set(EFFECTS))
     if unknown:
         raise ValueError(f"unknown effect {unknown[0]!r} (known: {', '.join(EFFECTS)}). Correct the name.")
+    if vehicle not in VEHICLES:
+        raise ValueError(f"unknown vehicle {vehicle!r} (known: {', '.join(VEHICLES)}). Correct the name.")
     active = tuple((name, float(size)) for name, size in sorted(effects.items()) if size != 0)
     bad = [f"{name}={size}" for name, size in active if not np.isfinite(size)]
     if bad or not noise >= 0:
@@ -111,7 +104,7 @@ def plan(
     backward = [f"{name}={size:g}" for name, size in active if size < 0 and not EFFECTS[name].signed]
     if backward:
         raise ValueError(f"effect {backward[0]}: must not be negative [{EFFECTS[backward[0].split('=')[0]].unit}].")
-    chair = Chair().on_day(np.random.default_rng([seed, 1])) if day else Chair()
+    chair = VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])) if day else VEHICLES[vehicle]
     for name, size in active:
         chair = EFFECTS[name].make.change(chair, size)
     tables: Mapping[str, np.ndarray] = nine(seed)
@@ -145,7 +138,7 @@ Result = tuple[str, np.ndarray, np.ndarray]
 def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
     """Drive trials one after the other; each has random numbers of its own."""
     plant = Plant(setting.chair)
-    noise = Noise().scaled(setting.noise)
+    noise = Noise().of(setting.chair).scaled(setting.noise)
     results = []
     for job in jobs:
         random, reading = (np.random.default_rng([setting.seed, 2 + part, job.index]) for part in (0, 1))
@@ -166,7 +159,23 @@ def make_effects(setting: Setting, index: int) -> list[Effect]:
     ]
 
 
-def write_dataset(out: Path, messages: Mapping[str, np.ndarray], results: Sequence[Result], ground_truth: bool) -> None:
+def fields(nominal: Nominal) -> str:
+    """Lines of `dataset.toml` that do not depend on the drives."""
+    return f"""schema = 1
+vehicle = "differential-drive powered chair"
+wheel_radius = {nominal.radius}      # m, nominal
+track = {nominal.track}              # m, nominal, between drive wheels
+wheelbase = {nominal.wheelbase}           # m, drive axle to front axle
+mass = {nominal.mass}                # kg, nominal
+command_limits = [1.0, 1.0]  # m/s, rad/s
+reference_point = "drive axle centre"
+odometry = "wheel encoders"
+"""
+
+
+def write_dataset(
+    out: Path, nominal: Nominal, messages: Mapping[str, np.ndarray], results: Sequence[Result], ground_truth: bool
+) -> None:
     """Write all trials, or nothing."""
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     try:
@@ -179,7 +188,7 @@ def write_dataset(out: Path, messages: Mapping[str, np.ndarray], results: Sequen
         held_out = ", ".join(json.dumps(name) for name in HELD_OUT if name in messages)
         outside = 'ground_truth = "overhead motion capture"\n' if ground_truth else ""
         note = "   # trials to be predicted, never fitted"
-        write_text(partial / "dataset.toml", f"{FIELDS}{outside}held_out = [{held_out}]{note}\n")
+        write_text(partial / "dataset.toml", f"{fields(nominal)}{outside}held_out = [{held_out}]{note}\n")
         out.parent.mkdir(parents=True, exist_ok=True)
         os.replace(partial, out)
     finally:

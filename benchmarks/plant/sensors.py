@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from benchmarks.plant.base import FRAME, TICK, Effect
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK
 from benchmarks.plant.trial import ENCODER, REPORT, Drive, Noise
 
 
@@ -19,14 +18,15 @@ def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.rando
     """
     every = round(FRAME / TICK)
     turned = drive.encoder[::every] / ENCODER + random.uniform(size=2)
-    radius = NOMINAL_RADIUS
+    nominal = drive.chair.nominal
+    radius = nominal.radius
     for effect in effects:
         radius *= effect.scale()
-    step, turn = arcs(radius * ENCODER * np.floor(turned))
+    step, turn = arcs(radius * ENCODER * np.floor(turned), nominal.track)
     yaw = np.cumsum(turn)
     middle = yaw - turn / 2
     pose = np.column_stack([np.cumsum(step * np.cos(middle)), np.cumsum(step * np.sin(middle)), yaw])
-    speed = low_pass(np.column_stack(arcs(radius * ENCODER * turned)) / FRAME, noise.low_pass)
+    speed = low_pass(np.column_stack(arcs(radius * ENCODER * turned, nominal.track)) / FRAME, noise.low_pass)
     due = np.arange(math.floor(drive.t[-1] / REPORT + 1e-6) + 1) * REPORT
     true, written = due, due
     for effect in effects:
@@ -37,10 +37,10 @@ def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.rando
     return np.column_stack([written, pose[frame], speed])[written >= 0]
 
 
-def arcs(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Step [m] and turn [rad] (F,) per frame, from both wheels' paths (F, 2) and the nominal track."""
+def arcs(path: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray]:
+    """Step [m] and turn [rad] (F,) per frame, from both wheels' paths (F, 2) and the track [m]."""
     moved = np.diff(path, axis=0, prepend=path[:1])
-    return moved.mean(axis=1), (moved[:, 1] - moved[:, 0]) / NOMINAL_TRACK
+    return moved.mean(axis=1), (moved[:, 1] - moved[:, 0]) / track
 
 
 def low_pass(values: np.ndarray, time_constant: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.plant.base import TICK, Effect, Load, Moment
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, NOMINAL_WHEELBASE, TIMESTEP, Chair, build
+from benchmarks.plant.chair import TIMESTEP, Chair, Nominal, build
 
 SUBSTEPS = round(TICK / TIMESTEP)
 REPORT = 0.05  # s between rows of odometry and outside pose
@@ -38,6 +38,11 @@ class Noise:
     low_pass: float = 0.042
     """Time constant of the reported speeds [s]."""
 
+    def of(self, chair: Chair) -> Noise:
+        """The same accelerations for a vehicle of another mass and size."""
+        mass, track = chair.nominal.mass / Nominal.mass, chair.nominal.track / Nominal.track
+        return replace(self, road_force=self.road_force * mass, yaw_torque=self.yaw_torque * mass * track)
+
     def scaled(self, noise: float) -> Noise:
         """All standard deviations times `noise`."""
         names = ("road_force", "yaw_torque", "grip", "position", "yaw", "v", "omega")
@@ -48,6 +53,7 @@ class Noise:
 class Drive:
     """What was true in one trial, at every tick (K)."""
 
+    chair: Chair
     t: np.ndarray
     """(K,) [s]"""
     pose: np.ndarray
@@ -71,8 +77,9 @@ class Plant:
         self.wheel_q = [int(joint[name].qposadr[0]) for name in joint]
         self.wheel_v = [int(joint[name].dofadr[0]) for name in joint]
         self.motor_v = [int(self.model.joint(name).dofadr[0]) for name in motor]
+        brake = min(20.0, 0.9 * float(self.model.dof_M0[self.wheel_v].min()) / TIMESTEP)  # N m s/rad: stable
         for _ in range(round(1.0 / TIMESTEP)):
-            self.data.qfrc_applied[self.wheel_v] = -20.0 * self.data.qvel[self.wheel_v]  # brakes on
+            self.data.qfrc_applied[self.wheel_v] = -brake * self.data.qvel[self.wheel_v]  # brakes on
             mujoco.mj_step(self.model, self.data)
         self.rest = self.data.qpos.copy()
 
@@ -103,7 +110,7 @@ class Plant:
         applied, kp, ki, limit = data.qfrc_applied, chair.kp, chair.ki, chair.torque_limit
         qpos, qvel = np.empty((count, model.nq)), np.empty((count, model.nv))
         torques = np.empty((count, 2))
-        origin = (self.rest[left_q], self.rest[right_q])
+        origin, wheelbase = (self.rest[left_q], self.rest[right_q]), chair.nominal.wheelbase
         integral = [0.0, 0.0]
         moment = Moment(session=session)
         for k in range(count):
@@ -119,7 +126,7 @@ class Plant:
             load = Load()
             rough = min(1.0, (abs(w[left_v]) + abs(w[right_v])) / ROLLING)
             side, omega = cos * w[1] - sin * w[0], w[5]
-            rollers = -2 * chair.roller_drag * (side + NOMINAL_WHEELBASE * omega)
+            rollers = -2 * chair.roller_drag * (side + wheelbase * omega)
             if makers or loaders:
                 moment.t, moment.session = k * TICK, session + k * TICK
                 moment.x, moment.y, moment.yaw = q[0], q[1], yaw
@@ -133,14 +140,14 @@ class Plant:
             forward, left_force = load.forward + rough * force[k], load.left + rollers
             applied[0], applied[1] = cos * forward - sin * left_force, sin * forward + cos * left_force
             applied[3], applied[4] = load.roll, load.pitch
-            applied[5] = load.yaw + rough * twist[k] + NOMINAL_WHEELBASE * rollers
+            applied[5] = load.yaw + rough * twist[k] + wheelbase * rollers
             applied[left_m] = applied[right_m] = 0.0
             applied[left_v], applied[right_v] = load.wheel
             applied[left_m] += left
             applied[right_m] += right
             torques[k] = left, right
             mujoco.mj_step(model, data, SUBSTEPS)
-        return _record(t, qpos, qvel, torques, self.wheel_q)
+        return _record(chair, t, qpos, qvel, torques, self.wheel_q)
 
     def _place(self, start: tuple[float, float, float]) -> None:
         """At rest, settled, at x, y, yaw: the settled attitude is turned with the heading."""
@@ -162,9 +169,9 @@ def wheel_targets(chair: Chair, messages: np.ndarray, t: np.ndarray, effects: li
     command = np.where(latest[:, None] >= 0, messages[np.maximum(latest, 0), 1:], 0.0)
     for effect in effects:
         command = effect.command(command)
-    half = NOMINAL_TRACK / 2
+    half = chair.nominal.track / 2
     target = np.column_stack([command[:, 0] - half * command[:, 1], command[:, 0] + half * command[:, 1]])
-    target /= NOMINAL_RADIUS
+    target /= chair.nominal.radius
     for effect in effects:
         target = effect.target(target)
     return target
@@ -186,12 +193,14 @@ def autoregressive(count: int, correlation: float, random: np.random.Generator) 
     return lfilter([math.sqrt(1 - rho**2)], [1.0, -rho], white)
 
 
-def _record(t: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray, wheel_q: list[int]) -> Drive:
+def _record(
+    chair: Chair, t: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray, wheel_q: list[int]
+) -> Drive:
     w, x, y, z = qpos[:, 3:7].T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward, left = cos * qvel[:, 0] + sin * qvel[:, 1], cos * qvel[:, 1] - sin * qvel[:, 0]
     return Drive(
-        t=t, pose=np.column_stack([qpos[:, :2], yaw]), speed=np.column_stack([forward, left, qvel[:, 5]]),
+        chair=chair, t=t, pose=np.column_stack([qpos[:, :2], yaw]), speed=np.column_stack([forward, left, qvel[:, 5]]),
         encoder=qpos[:, wheel_q] - qpos[0, wheel_q], torque=torque,
     )  # fmt: skip

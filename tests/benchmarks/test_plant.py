@@ -11,10 +11,10 @@ import pytest
 
 from benchmarks import plant
 from benchmarks.plant.__main__ import main
-from benchmarks.plant.chair import Chair
+from benchmarks.plant.chair import VEHICLES, Chair
 from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import channels, read
-from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.make import HELD_OUT, make_log, plan
 from benchmarks.plant.sensors import outside_pose
 from benchmarks.plant.trial import Noise, Plant
@@ -121,6 +121,37 @@ def test_all_nine_manoeuvres_have_the_form_of_the_dataset(tmp_path):
     assert set(HELD_OUT[1:]).isdisjoint(word.strip('",[] ') for word in fields.split())
 
 
+@pytest.mark.parametrize("name", VEHICLES)
+def test_every_vehicle_follows_its_commands_and_leaves_room_to_its_drives(name):
+    chair, messages = VEHICLES[name], nine(0)["circle"]
+    log = drive(messages, chair=chair)
+    steady = (log.t > 10) & (log.t < 19)
+    assert np.mean(log.speed[steady, 0]) == pytest.approx(messages[50, 1], rel=0.02)
+    assert np.mean(log.speed[steady, 2]) == pytest.approx(messages[50, 2], rel=0.02)
+    assert np.std(log.speed[steady, 2]) < 0.004
+    assert np.abs(log.torque[steady]).max() < 0.5 * chair.torque_limit
+
+
+def test_a_dataset_of_another_vehicle_has_its_nominal_values_and_its_own_odometry(tmp_path):
+    out = make_log(tmp_path / "set", seed=1, noise=0.0, manoeuvres=["straight"], replicates=1, vehicle="robot")
+    fields = (out / "dataset.toml").read_text()
+    nominal = VEHICLES["robot"].nominal
+    for name, value in (("wheel_radius", nominal.radius), ("track", nominal.track), ("wheelbase", nominal.wheelbase),
+                        ("mass", nominal.mass)):
+        assert f"{name} = {value}  " in fields
+    [trial] = read(out).values()
+    assert trial["odometry"][-1, 1] == pytest.approx(np.hypot(*np.ptp(trial["ground_truth"][:, 1:3], axis=0)), rel=0.01)
+
+
+@pytest.mark.quick
+def test_sizes_of_forces_grow_with_the_vehicle_and_shares_do_not():
+    heavy = VEHICLES["scooter"]
+    assert in_proportion("wind", 8.0, heavy) == pytest.approx(8.0 * 128 / 54)
+    assert in_proportion("dry_friction", 1.0, heavy) == pytest.approx(42 / 14)
+    assert in_proportion("command_delay", 0.06, heavy) == 0.06
+    assert all(in_proportion(name, entry.base, Chair()) == entry.base for name, entry in EFFECTS.items())
+
+
 def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
@@ -136,6 +167,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         ({"effects": {"ghost": 1.0}}, "unknown effect 'ghost'"),
+        ({"vehicle": "tank"}, "unknown vehicle 'tank'"),
         ({"effects": {"yaw_scrub": -0.01}}, "yaw_scrub=-0.01: must not be negative"),
         ({"effects": {"slope": float("nan")}}, "slope=nan: must be finite"),
         ({"manoeuvres": ["waltz"]}, "unknown manoeuvre 'waltz'"),

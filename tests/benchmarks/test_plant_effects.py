@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, Chair
+from benchmarks.plant.chair import Chair, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.sensors import odometry
@@ -83,7 +83,7 @@ def test_delay_shifts_the_response_by_its_size(factor):
 def test_larger_left_wheel_turns_the_chair_right_and_odometry_does_not_see_it():
     plain, (log, rows) = drive("straight"), base("straight", "wheel_radius_difference")
     distance = plain[0].pose[-1, 0]
-    assert log.pose[-1, 2] - plain[0].pose[-1, 2] == pytest.approx(-0.006 * distance / NOMINAL_TRACK, rel=0.15)
+    assert log.pose[-1, 2] - plain[0].pose[-1, 2] == pytest.approx(-0.006 * distance / Nominal.track, rel=0.15)
     assert abs(rows[-1, 3] - plain[1][-1, 3]) < 0.01
     mirrored = base("straight", "wheel_radius_difference", -1.0)[0]
     assert mirrored.pose[-1, 2] > 0.05
@@ -162,7 +162,7 @@ def test_wheel_ripple_follows_the_wheel_angle():
     yaw_rate = log.speed[window, 2] - log.speed[window, 2].mean()
     spectrum = np.abs(np.fft.rfft(yaw_rate * np.hanning(len(yaw_rate))))
     frequency = np.fft.rfftfreq(len(yaw_rate), 0.004)[spectrum.argmax()]
-    turns = log.speed[window, 0].mean() / NOMINAL_RADIUS / (2 * np.pi)
+    turns = log.speed[window, 0].mean() / Nominal.radius / (2 * np.pi)
     assert frequency == pytest.approx(turns, rel=0.1)
 
 
@@ -206,7 +206,7 @@ def test_backlash_delays_the_push_and_vanishing_grip_slides():
     assert at(base("reverse", "backlash")[0], 4.02, 4.06, drive("reverse")[0])[:, 0].mean() != 0
     log = base("stop_and_go", "traction_limit", 2.0)[0]
     braking = (log.t > 3.55) & (log.t < 3.7)
-    sliding = log.speed[braking, 0] - NOMINAL_RADIUS * np.gradient(log.encoder.mean(axis=1), 0.004)[braking]
+    sliding = log.speed[braking, 0] - Nominal.radius * np.gradient(log.encoder.mean(axis=1), 0.004)[braking]
     assert sliding.max() > 0.1
 
 

@@ -9,7 +9,9 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from benchmarks import undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
+from benchmarks.undeclared_reference import Driven  # noqa: E402
 
 LIMIT = 4.0
 
@@ -66,8 +68,9 @@ def results(tmp_path, monkeypatch):
     """A copy of the recorded figures, into which the benchmark writes."""
     path = tmp_path / "undeclared.json"
     path.write_text(contact.RECORDED.read_text())
-    monkeypatch.setattr(contact, "RECORDED", path)
-    monkeypatch.setattr(contact, "record", partial(contact.record, folder=tmp_path))
+    for module in (contact, undeclared_figures):
+        monkeypatch.setattr(module, "RECORDED", path)
+    monkeypatch.setattr(undeclared_figures, "record", partial(undeclared_figures.record, folder=tmp_path))
     return path
 
 
@@ -84,7 +87,7 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
     verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
                "seconds": 1.0}
     judged(tmp_path, "null_000", verdict, {})
-    contact.figures(tmp_path)
+    undeclared_figures.figures(tmp_path)
     after = json.loads(results.read_text())
     others = [row for row in recorded["confusion"] if row["stage"] != "null"]
     assert [row for row in after["confusion"] if row["stage"] != "null"] == others
@@ -100,7 +103,7 @@ def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, resul
                "excess": [1.0, 0.0], "excess_limit": 0.1,
                "effects": [{"name": "slope", "class": ["slope", "wind"], "parameters": {}}]}
     judged(tmp_path, "wind_x4_0", verdict, {"wind": 0.1})
-    contact.figures(tmp_path, 2.0)
+    undeclared_figures.figures(tmp_path, Driven(noise=2.0))
     after = json.loads(results.read_text())
     assert after["figures"]["class_accuracy_4x_noise_2"]["value"] == 1.0
     assert after["figures"]["class_accuracy_4x"] == recorded["figures"]["class_accuracy_4x"]
@@ -108,7 +111,24 @@ def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, resul
                     for content, is_usual in ((recorded, True), (after, False)))  # fmt: skip
     assert [row for row in after["confusion"] if row.get("noise", 1.0) == 1.0] == usual
     assert [row["truth"] for row in other] == [{"wind": 0.1}]
-    assert contact.power_sizes(tmp_path / "empty", 2.0)["wind"] == 2 * recorded["sizes"]["wind"]["value"]
+    assert contact.power_sizes(tmp_path / "empty", Driven(noise=2.0))["wind"] == 2 * recorded["sizes"]["wind"]["value"]
+
+
+@pytest.mark.quick
+def test_another_vehicle_has_figures_of_its_own_and_sizes_in_proportion(tmp_path, results):
+    recorded = json.loads(results.read_text())
+    verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
+               "seconds": 1.0}
+    judged(tmp_path, "null_000", verdict, {})
+    robot = Driven(vehicle="robot")
+    undeclared_figures.figures(tmp_path, robot)
+    after = json.loads(results.read_text())
+    assert after["figures"]["false_alarms_robot"]["unit"] == "of 1 logs with nothing in them"
+    assert after["figures"]["false_alarms"] == recorded["figures"]["false_alarms"]
+    assert [row for row in after["confusion"] if row.get("vehicle", "chair") == "chair"] == recorded["confusion"]
+    sizes = contact.power_sizes(tmp_path / "empty", robot)
+    assert sizes["wind"] == pytest.approx(recorded["sizes"]["wind"]["value"] * 21 / 54)
+    assert sizes["command_delay"] == recorded["sizes"]["command_delay"]["value"]
 
 
 @pytest.mark.quick
@@ -134,7 +154,7 @@ def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong_unless_it_is_war
         return {"verdict": "named" if members else "unexplained", "excess": [9.0, left], "excess_limit": 0.1,
                 "effects": [{"class": list(members)}] if members else []}
 
-    found = contact.of_left_out([("slope", verdict("wind", left=0.5)), ("slope", verdict()),
+    found = undeclared_figures.of_left_out([("slope", verdict("wind", left=0.5)), ("slope", verdict()),
                                  ("slope", verdict("dry_friction")), ("slope", verdict("yaw_scrub", left=0.5)),
                                  ("wind", verdict("slope", "x")), ("backlash", verdict("jerk_limit"))],
                                 {"backlash": {"backlash", "jerk_limit"}})
@@ -142,18 +162,18 @@ def test_a_name_outside_the_class_of_a_left_out_effect_is_wrong_unless_it_is_war
     assert found["left_out_outside_class"]["value"] == pytest.approx(2 / 6)
     assert found["left_out_unexplained"]["value"] == pytest.approx(1 / 6)
     said = {**verdict("dry_friction"), "warnings": ["it may be another effect"]}
-    assert contact.of_left_out([("slope", said)], {})["left_out_wrong"]["value"] == 0
+    assert undeclared_figures.of_left_out([("slope", said)], {})["left_out_wrong"]["value"] == 0
 
 
 @pytest.mark.quick
 def test_the_class_of_a_log_is_that_of_its_verdict_at_four_times_the_size(tmp_path):
-    own = contact.own_classes(tmp_path)  # from the recorded verdicts
+    own = undeclared_figures.own_classes(tmp_path)  # from the recorded verdicts
     assert own["slope"] == {"slope", "wind"} and "backlash" in own
 
 
 @pytest.mark.quick
 def test_committed_classes_are_small_and_of_the_catalogue():
-    sensors = json.loads(contact.CLASSES.read_text())["sensors"]
+    sensors = json.loads(undeclared_figures.CLASSES.read_text())["sensors"]
     sizes = [one["mean_size"] for one in sensors.values()]
     assert sizes == sorted(sizes, reverse=True)  # more sensors tell more apart
     for one in sensors.values():
@@ -197,7 +217,7 @@ def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path
     for one in (tmp_path / "verdicts").iterdir():
         one.write_text(json.dumps({**json.loads(one.read_text()), "scale": 0.0, "verdict": "named", "share": 0.9,
                                    "effects": [], "p_value": 0.001}))
-    contact.figures(tmp_path)
+    undeclared_figures.figures(tmp_path)
     after = json.loads(results.read_text())
     assert after["sizes"].pop("slope")["value"] == pytest.approx(0.03, rel=1e-3)
     recorded["sizes"].pop("slope")

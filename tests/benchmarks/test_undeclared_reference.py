@@ -38,7 +38,7 @@ def driven(monkeypatch):
     """Folders and seeds of the days that are driven, without driving them."""
     seen = {}
 
-    def drive(path, seed, noise, replicates):
+    def drive(path, seed, **_):
         seen[path] = seed
         path.mkdir(parents=True)
 
@@ -66,16 +66,16 @@ def test_a_set_is_fitted_once_for_all_processes_and_again_for_other_settings(tmp
     fits = []
     monkeypatch.setattr(days, "reference_of", lambda logs, config: fits.append(config) or f"fit {len(fits)}")
     monkeypatch.setattr(days, "prepare", lambda reference, spec, config: reference)
-    assert [days.prepared(tmp_path, 1, 1.0, LoopConfig()) for _ in range(2)] == ["fit 1", "fit 1"]
-    assert days.prepared(tmp_path, 1, 1.0, LoopConfig(seed=1)) == "fit 2"
-    assert days.prepared(tmp_path, 0, 1.0, LoopConfig()) == "fit 3"  # other days
+    assert [days.prepared(tmp_path, 1, days.USUAL, LoopConfig()) for _ in range(2)] == ["fit 1", "fit 1"]
+    assert days.prepared(tmp_path, 1, days.USUAL, LoopConfig(seed=1)) == "fit 2"
+    assert days.prepared(tmp_path, 0, days.USUAL, LoopConfig()) == "fit 3"  # other days
     monkeypatch.setattr(days, "code_hashes", lambda: {"sysid": "changed"})
-    assert days.prepared(tmp_path, 0, 1.0, LoopConfig()) == "fit 4"
+    assert days.prepared(tmp_path, 0, days.USUAL, LoopConfig()) == "fit 4"
 
 
 def test_a_process_makes_only_the_sets_of_its_own_nulls(tmp_path, monkeypatch):
     made, judged = [], []
-    monkeypatch.setattr(undeclared, "prepared", lambda work, number, noise, config: made.append(number) or number)
+    monkeypatch.setattr(undeclared, "prepared", lambda work, number, driven, config: made.append(number) or number)
 
     def judge(job, ready, *_):
         judged.append((job.reference, ready))

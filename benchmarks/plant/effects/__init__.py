@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from benchmarks.plant.base import Effect
+from benchmarks.plant.chair import Chair
 from benchmarks.plant.effects import actuation, command, force, outside, sensing, world
 
 
@@ -72,3 +73,10 @@ EFFECTS: dict[str, Entry] = {
     "command_dropouts": Entry(command.CommandDropouts, 0.08, "-", known=False),
     "carpet_nap": Entry(outside.CarpetNap, 15.0, "N", known=False),
 }
+
+
+def in_proportion(name: str, size: float, chair: Chair) -> float:
+    """A size of an effect on the usual chair, for a vehicle of another mass and other drives."""
+    usual = Chair()
+    mass, torque = chair.nominal.mass / usual.nominal.mass, chair.torque_limit / usual.torque_limit
+    return size * {"N": mass, "kg": mass, "N s^2/m^2": mass, "N m": torque}.get(EFFECTS[name].unit, 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.plant.base import TICK, Effect
-from benchmarks.plant.chair import NOMINAL_RADIUS
 
 
 class CommandDelay(Effect):
@@ -23,7 +22,7 @@ class CommandDeadZone(Effect):
         out = target.copy()
         for side in (0, 1):
             awake = False
-            for k, speed in enumerate(np.abs(target[:, side]) * NOMINAL_RADIUS):
+            for k, speed in enumerate(np.abs(target[:, side]) * self.chair.nominal.radius):
                 awake = speed > self.size / 2 if awake else speed > self.size
                 if not awake:
                     out[k, side] = 0.0
@@ -34,7 +33,7 @@ class AccelerationLimit(Effect):
     """Each wheel's target changes by at most 1 / s when it speeds up, and 1.5 / s when it slows down."""
 
     def target(self, target: np.ndarray) -> np.ndarray:
-        step = TICK / self.size / NOMINAL_RADIUS
+        step = TICK / self.size / self.chair.nominal.radius
         out = np.empty_like(target)
         for side in (0, 1):
             value = 0.0

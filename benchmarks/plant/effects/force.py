@@ -6,9 +6,8 @@ import math
 from dataclasses import replace
 
 from benchmarks.plant.base import TICK, Effect, Load, Moment
-from benchmarks.plant.chair import GRAVITY, NOMINAL_WHEELBASE, Chair
+from benchmarks.plant.chair import FRONT_Y, GRAVITY, Chair
 
-FRONT_Y = 0.19  # m, of the front wheels
 FRONT_SPACING = 12  # rollers on a front wheel
 
 
@@ -43,15 +42,16 @@ class OmniRollerFriction(Effect):
 
     def start(self) -> None:
         self.path = self.random.uniform(0.0, 1.0, 2)
-        self.weight = self.chair.mass * GRAVITY * self.chair.com[0] / NOMINAL_WHEELBASE / 2
+        self.weight = self.chair.mass * GRAVITY * self.chair.com[0] / self.chair.nominal.wheelbase / 2
 
     def load(self, moment: Moment, load: Load) -> None:
-        sliding = moment.side + NOMINAL_WHEELBASE * moment.omega
+        wheelbase = self.chair.nominal.wheelbase
+        sliding = moment.side + wheelbase * moment.omega
         for side, y in enumerate((FRONT_Y, -FRONT_Y)):
             self.path[side] += (moment.v - y * moment.omega) * TICK
             ripple = 1 + 0.5 * math.cos(FRONT_SPACING * self.path[side] / 0.1)
             force = -self.size * self.weight * ripple * sliding / math.hypot(sliding, 0.01)
-            load.push(0.0, force, NOMINAL_WHEELBASE, y)
+            load.push(0.0, force, wheelbase, y)
 
 
 class CasterKick(Effect):
@@ -66,12 +66,13 @@ class CasterKick(Effect):
         self.angle = list(self.random.uniform(-0.3, 0.3, 2))
 
     def load(self, moment: Moment, load: Load) -> None:
+        wheelbase = self.chair.nominal.wheelbase
         for side, y in enumerate((FRONT_Y, -FRONT_Y)):
-            along, across = moment.v - y * moment.omega, moment.side + NOMINAL_WHEELBASE * moment.omega
+            along, across = moment.v - y * moment.omega, moment.side + wheelbase * moment.omega
             sin, cos = math.sin(self.angle[side]), math.cos(self.angle[side])
             slide = across * cos - along * sin
             force = -self.size * slide / (abs(slide) + 0.03)
-            load.push(-sin * force, cos * force, NOMINAL_WHEELBASE, y)
+            load.push(-sin * force, cos * force, wheelbase, y)
             self.angle[side] += (slide / self.trail - moment.omega) * TICK
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from benchmarks.plant.base import TICK, Effect, Load, Moment
-from benchmarks.plant.chair import NOMINAL_TRACK
 
 
 class WheelRipple(Effect):
@@ -24,7 +23,7 @@ class SoftPatch(Effect):
 
     def load(self, moment: Moment, load: Load) -> None:
         for sign in (1, -1):
-            y = sign * NOMINAL_TRACK / 2
+            y = sign * self.chair.nominal.track / 2
             x = moment.x - y * math.sin(moment.yaw)
             depth = 1 / (1 + math.exp(-(0.4 - abs(x - 0.9)) / 0.03))
             speed = moment.v - y * moment.omega

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import NOMINAL_RADIUS, NOMINAL_TRACK, Chair
+from benchmarks.plant.chair import Chair
 
 
 class WheelRadiusDifference(Effect):
@@ -14,8 +14,8 @@ class WheelRadiusDifference(Effect):
 
     @staticmethod
     def change(chair: Chair, size: float) -> Chair:
-        left, right = chair.radius
-        return replace(chair, radius=(left + NOMINAL_RADIUS * size / 2, right - NOMINAL_RADIUS * size / 2))
+        (left, right), more = chair.radius, chair.nominal.radius * size / 2
+        return replace(chair, radius=(left + more, right - more))
 
 
 class TrackWidth(Effect):
@@ -23,7 +23,7 @@ class TrackWidth(Effect):
 
     @staticmethod
     def change(chair: Chair, size: float) -> Chair:
-        return replace(chair, track=chair.track + NOMINAL_TRACK * size)
+        return replace(chair, track=chair.track + chair.nominal.track * size)
 
 
 class PayloadShift(Effect):

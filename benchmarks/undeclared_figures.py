@@ -1,0 +1,206 @@
+"""What the verdicts of the closed loop on logs of the contact plant come to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from benchmarks.plant.effects import EFFECTS
+from benchmarks.undeclared_plant import RECORDED, power_sizes
+from benchmarks.undeclared_reference import USUAL, Driven
+from sysid.report import write_report
+from sysid.statistics import upper_rate
+
+CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
+SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
+    "command_scale": ("command_scale.linear", 1.0, 1.0),
+    "drive_gain_difference": ("drive_gain_difference.difference", 0.0, 1.0),
+    "wheel_radius_difference": ("wheel_radius_difference.difference", 0.0, 1.0),
+    "track_width": ("track_width.error", 0.0, 1.0),
+    "payload_shift": ("payload_shift.mass", 0.0, 1.0),
+    "quadratic_drag": ("quadratic_drag.coefficient", 0.0, 1.0),
+    "side_force": ("side_force.sideways", 0.0, 1.0),
+    "slope": ("slope.along_x", 0.0, 1.0),
+    "sensor_delay": ("sensor_delay.delay", 0.0, 1.0),
+}
+
+
+def figures(work: Path, driven: Driven = USUAL) -> None:
+    """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
+    cases = list(read_cases(work))
+    found = {**of_nulls([one for truth, one in cases if not truth])}
+    for scale in sorted({one["scale"] for _, one in cases if one["stage"] == "scaled"}):
+        inside = [(next(iter(truth)), one) for truth, one in cases
+                  if one["stage"] == "scaled" and one["scale"] == scale]
+        found.update(of_singles(inside, f"_{scale:g}x"))
+    found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
+    found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"],
+                             own_classes(work)))
+    found.update(of_parameters([(truth, one) for truth, one in cases if one["stage"] != "left_out"]))
+    ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
+    if ratios:
+        found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
+    seconds = [one["seconds"] for _, one in cases if one["stage"] in ("scaled", "pair")]
+    if seconds:
+        found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
+    found.update(of_speed(work))
+    found = {name + driven.tag: one for name, one in found.items()}
+    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
+    sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
+             for name, size in power_sizes(work).items()} if driven == USUAL else recorded.get("sizes", {})
+    path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
+    content = {**json.loads(path.read_text()), "sizes": sizes}
+    judged = {_kind(truth, one["stage"]) for truth, one in cases}  # others may have been judged in another folder
+    kept = [row for row in recorded.get("confusion", [])
+            if _kind(row["truth"], row["stage"]) not in judged or driven_of(row) != driven]
+    content["confusion"] = kept + [
+        {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": driven.noise,
+         "vehicle": driven.vehicle, "verdict": one["verdict"],
+         "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
+         "explained": one["share"]} for truth, one in cases]
+    write_report(path, content)
+
+
+def driven_of(row: Mapping[str, Any]) -> Driven:
+    """What a recorded row is of; rows of before there were other vehicles and noise levels do not tell."""
+    return Driven(row.get("noise", 1.0), row.get("vehicle", "chair"))
+
+
+def _kind(truth: Mapping[str, float], stage: str) -> tuple[str, ...]:
+    """What is judged in one folder: all logs of a stage, or all with which the size of one effect is looked for."""
+    return (stage, *truth) if stage == "base" else (stage,)
+
+
+Case = tuple[dict[str, float], dict[str, Any]]
+"""What was in a log, and what was said of it."""
+
+
+def read_cases(work: Path) -> Iterable[Case]:
+    """All logs that have a verdict."""
+    for path in sorted((work / "verdicts").glob("*.json")):
+        yield json.loads((work / "truth" / path.name).read_text()), json.loads(path.read_text())
+
+
+def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """False alarms and whether p-values are uniform."""
+    from scipy import stats
+
+    if not nulls:
+        return {}
+    false = sum(one["verdict"] != "none" for one in nulls)
+    sets = len({one.get("reference", 0) for one in nulls})
+    return {
+        "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
+        "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share"),
+        "null_ks_p": figure([float(stats.kstest([one["p_value"] for one in nulls], "uniform").pvalue)],
+                            f"of {len(nulls)} logs over {sets} sets of reference days")}
+
+
+def said(truth: str, one: dict[str, Any]) -> bool:
+    """Whether a verdict names an effect or a class with it."""
+    return any(truth in effect["class"] for effect in one["effects"])
+
+
+def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[str, Any]:
+    """Right and wrong names of logs with one effect each."""
+    known = [(name, one) for name, one in inside if EFFECTS[name].known]
+    beyond = [one for name, one in inside if not EFFECTS[name].known]
+    found = {}
+    if known:
+        about = f"share of {len(known)} logs"
+        right = [said(name, one) for name, one in known]
+        wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
+        found[f"class_accuracy{tag}"] = figure([float(np.mean(right))], about)
+        right_ones = [one for (_, one), ok in zip(known, right, strict=True) if ok]
+        if right_ones:
+            found[f"warned_right{tag}"] = figure([float(np.mean([warned(one) for one in right_ones]))],
+                                                 f"share of {len(right_ones)} right names that come with a warning")
+        found[f"wrong_name{tag}"] = figure([float(np.mean(wrong))], about)
+        found[f"noticed{tag}"] = figure([float(np.mean([one["verdict"] != "none" for _, one in known]))], about)
+        sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]
+        if sizes:
+            found[f"mean_class_size{tag}"] = figure([float(np.mean(sizes))], "effects")
+    if beyond:
+        found[f"out_of_catalogue{tag}"] = figure(
+            [float(np.mean([one["verdict"] == "unexplained" for one in beyond]))],
+            f"share of {len(beyond)} logs that are said to be unexplained")
+    return found
+
+
+def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
+    """Both named, and no wrong one, of logs with two effects."""
+    if not pairs:
+        return {}
+    both = [all(said(name, one) for name in truth) for truth, one in pairs]
+    clean = [all(set(effect["class"]) & set(truth) for effect in one["effects"]) for truth, one in pairs]
+    return {"pair_both": figure([float(np.mean(both))], f"share of {len(pairs)} logs"),
+            "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
+
+
+def warned(one: dict[str, Any]) -> bool:
+    """Whether a name comes with a warning (`sysid.loop.trust.warnings`); one is that more is left than days differ
+    by, which verdicts of before others were kept tell too."""
+    return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
+
+
+def own_classes(work: Path) -> dict[str, set[str]]:
+    """Effect -> what its log at four times the size is named as where the catalogue has it, judged here or recorded."""
+    rows = json.loads(RECORDED.read_text()).get("confusion", []) if RECORDED.exists() else []
+    rows += [{"truth": truth, **one, "classes": [e["class"] for e in one["effects"]]}
+             for truth, one in read_cases(work)]
+    return {name: {member for members in row["classes"] for member in members} for row in rows
+            for name in row["truth"]
+            if (row["stage"], row["scale"], driven_of(row)) == ("scaled", 4.0, USUAL)}
+
+
+def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, set[str]]) -> dict[str, Any]:
+    """What is said of an effect that the catalogue lacks: wrong where it is named after one outside its class, without
+    a warning. Its class is that of the file, and that with which the same log is named by the whole catalogue (`own`).
+    """
+    if not inside:
+        return {}
+    [*_, alike] = json.loads(CLASSES.read_text())["sensors"].values()
+    outside = [one["verdict"] == "named" and not any(
+        ({*alike["classes"][name]} | own.get(name, set())) & set(effect["class"]) for effect in one["effects"])
+        for name, one in inside]
+    wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
+    about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
+    return {"left_out_wrong": figure([float(np.mean(wrong))], about),
+            "left_out_outside_class": figure([float(np.mean(outside))], about),
+            "left_out_unexplained": figure([float(np.mean([one["verdict"] == "unexplained" for _, one in inside]))],
+                                           about)}
+
+
+def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
+    """Intervals that cover the size driven, and relative errors, where plant and catalogue write an effect alike."""
+    inside, errors = [], []
+    for truth, one in cases:
+        for effect in one["effects"]:
+            if effect["name"] in truth and effect["name"] in SAME:
+                parameter, neutral, unit = SAME[effect["name"]]
+                driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
+                inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))
+                errors.append(abs(seen["value"] - driven) / abs(driven - neutral))
+    if not inside:
+        return {}
+    return {"interval_coverage": figure([float(np.mean(inside))], f"share of {len(inside)} 95 % intervals"),
+            "parameter_error": figure(errors, "of the size")}
+
+
+def of_speed(work: Path) -> dict[str, Any]:
+    """Seconds of the whole command, with linear nulls only and with refitted ones."""
+    found = {}
+    for path in work.glob("speed_*.json"):
+        one = json.loads(path.read_text())
+        about = "linear nulls" if one["nulls"] is None else f"{one['nulls']['count']} refitted nulls"
+        name = "cpu_quick_seconds" if one["nulls"] is None else "cpu_seconds"
+        found[name] = figure([one["seconds"]], f"s, the whole command with {about}, compilations included")
+        if one["nulls"] is not None:
+            found["refitted_null_alarms"] = figure([float(one["nulls"]["false_alarms"])],
+                                                   f"of {one['nulls']['count']} simulated days of one log")
+    return found
