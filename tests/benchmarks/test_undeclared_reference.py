@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from benchmarks import undeclared  # noqa: E402
+from benchmarks import undeclared, undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
 from benchmarks import undeclared_reference as days  # noqa: E402
 from sysid.close_loop import LoopConfig  # noqa: E402
@@ -89,4 +89,4 @@ def test_a_process_makes_only_the_sets_of_its_own_nulls(tmp_path, monkeypatch):
 
 def test_the_uniformity_of_nulls_says_over_how_many_sets_it_was_seen():
     nulls = [{"verdict": "none", "p_value": (i + 0.5) / 40, "reference": i % 4} for i in range(40)]
-    assert contact.of_nulls(nulls)["null_ks_p"]["unit"] == "of 40 logs over 4 sets of reference days"
+    assert undeclared_figures.of_nulls(nulls)["null_ks_p"]["unit"] == "of 40 logs over 4 sets of reference days"
