@@ -88,7 +88,7 @@ class TorqueDrive(Effect):
         rate = self.rate(done.error, wanted, crossing)
         after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
         foreseen = motion.spin + motion.dt * (by_mode(wanted, response) + load)
-        yielding = Yielding(foreseen, half / motion.dt * self.kp * jnp.ones(2), wanted - torque, -self.limit - torque,
+        yielding = Yielding(foreseen, self.kp / 2 * jnp.ones(2), wanted - torque, -self.limit - torque,
                             self.limit - torque, jnp.ones(2))
         return after, replace(drive, torque=drive.torque + torque, yielding=yielding)
 
