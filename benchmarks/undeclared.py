@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -59,8 +59,9 @@ class Benchmark:
     """Logs of each effect and multiple."""
     noise: float = 1.0
     """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
-    vehicle: str = "chair"
-    """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own."""
+    vehicle: Literal["chair", "scooter", "robot"] = "chair"
+    """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
+    are of the chair."""
     pairs: int = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False

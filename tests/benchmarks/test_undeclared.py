@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -11,6 +12,8 @@ pytest.importorskip("mujoco")
 
 from benchmarks import undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
+from benchmarks.plant.chair import VEHICLES  # noqa: E402
+from benchmarks.undeclared import Benchmark  # noqa: E402
 from benchmarks.undeclared_reference import Driven  # noqa: E402
 
 LIMIT = 4.0
@@ -131,6 +134,11 @@ def test_another_vehicle_has_figures_of_its_own_and_sizes_in_proportion(tmp_path
     sizes = contact.power_sizes(tmp_path / "empty", robot)
     assert sizes["wind"] == pytest.approx(recorded["sizes"]["wind"]["value"] * 21 / 54)
     assert sizes["command_delay"] == recorded["sizes"]["command_delay"]["value"]
+
+
+@pytest.mark.quick
+def test_every_vehicle_of_the_plant_can_be_asked_for():
+    assert set(get_args(get_type_hints(Benchmark)["vehicle"])) == set(VEHICLES)
 
 
 @pytest.mark.quick
