@@ -17,6 +17,9 @@ from benchmarks.undeclared import Benchmark  # noqa: E402
 from benchmarks.undeclared_reference import Driven  # noqa: E402
 
 LIMIT = 4.0
+NOTHING = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
+           "seconds": 1.0}
+"""Verdict on a log with nothing in it."""
 
 
 def write(work, name, number, size, found):
@@ -87,9 +90,7 @@ def judged(work, label, verdict, truth):
 @pytest.mark.quick
 def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
     recorded = json.loads(results.read_text())
-    verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
-               "seconds": 1.0}
-    judged(tmp_path, "null_000", verdict, {})
+    judged(tmp_path, "null_000", NOTHING, {})
     undeclared_figures.figures(tmp_path)
     after = json.loads(results.read_text())
     others = [row for row in recorded["confusion"] if row["stage"] != "null"]
@@ -120,9 +121,7 @@ def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, resul
 @pytest.mark.quick
 def test_another_vehicle_has_figures_of_its_own_and_sizes_in_proportion(tmp_path, results):
     recorded = json.loads(results.read_text())
-    verdict = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
-               "seconds": 1.0}
-    judged(tmp_path, "null_000", verdict, {})
+    judged(tmp_path, "null_000", NOTHING, {})
     robot = Driven(vehicle="robot")
     undeclared_figures.figures(tmp_path, robot)
     after = json.loads(results.read_text())

@@ -44,8 +44,8 @@ def signal(force=(0.0, 0.0), torque=(0.0, 0.0)):
     return Drive(jnp.zeros(2), jnp.asarray(force, jnp.float32), jnp.asarray(torque, jnp.float32))
 
 
-def over_time(target, force, torque):
-    """Drive over time, leaves (T, 2), whose torque yields within 30 N m."""
+def yielding(target, force, torque):
+    """Drive, leaves (..., 2), whose torque yields within 30 N m."""
     about = Yielding(*(jnp.full_like(torque, value) for value in (0.1, 2.0, 0.0, -30.0, 30.0, 1.0)))
     return Drive(target, force, torque, about)
 

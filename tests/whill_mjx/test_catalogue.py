@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_in_hand import chair, motion_at, over_time, path, quick, run
+from effects_in_hand import chair, motion_at, path, quick, run, yielding
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import place_of
@@ -62,7 +62,7 @@ def test_every_effect_vanishes_to_the_last_bit_at_its_neutral_value(name):
         case "command":
             np.testing.assert_array_equal(run(effect, wave, motion), wave)
         case "actuation":
-            inputs = over_time(wave, 300 * wave, 40 * wave[:, ::-1])
+            inputs = yielding(wave, 300 * wave, 40 * wave[:, ::-1])
             jax.tree.map(np.testing.assert_array_equal, run(effect, inputs, motion), inputs)
         case "sensing":
             readings = path(0.5 + wave[:, 0], wave[:, 1])
@@ -126,7 +126,7 @@ def wide_inputs():
     held = jnp.array([[2.1, 0.3], [0.026, 1.0], [-2.1, 0.05], [1.1, -0.05], [0.4, 0.9]])
     commands = jnp.repeat(jnp.concatenate([held, -0.98 * held]), 6, axis=0)
     wave = jnp.stack([jnp.sin(0.31 * t + 0.1), 0.7 * jnp.cos(0.27 * t)], axis=1)
-    inputs = {"command": commands, "actuation": over_time(wave, 150 * wave, 20 * wave), "force": t, "world": t,
+    inputs = {"command": commands, "actuation": yielding(wave, 150 * wave, 20 * wave), "force": t, "world": t,
               "sensing": path(v, omega)}  # fmt: skip
     return model, motions, inputs
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_in_hand import over_time
+from effects_in_hand import yielding
 
 from whill_mjx.effects import (
     EFFECTS,
@@ -243,7 +243,7 @@ def test_a_torque_yields_to_a_wheel_that_turns_faster_than_foreseen_and_stays_wi
 )
 def test_what_weakens_a_torque_weakens_how_it_yields(name, fields, share):
     effect, motion = make_effect(name, **fields), motion_at()
-    drive = jax.tree.map(lambda leaf: leaf[0], over_time(jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.full((1, 2), 8.0)))
+    drive = yielding(jnp.zeros(2), jnp.zeros(2), jnp.full(2, 8.0))
     _, after = effect.actuation(effect.init(), drive, motion)
     expected = after.torque / drive.torque if share is None else np.full(2, share)
     np.testing.assert_allclose(after.yielding.factor, expected, atol=0.01)

@@ -1,0 +1,160 @@
+"""Parts of the closed loop on hand-made residuals: agreement, hypotheses, wander, whitening."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.loop.agreement import disagreement, foretold
+from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.loop.classes import imitation
+from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives
+from sysid.loop.evidence import Columns, signature_columns
+from sysid.loop.found import Candidate, Thresholds
+from sysid.loop.noise import fit_roughness, fit_whitener
+from sysid.loop.refit import Refit, Refitter
+from sysid.loop.search import _own
+from sysid.loop.wander import _pooled
+from whill_mjx.presets import preset
+
+
+@pytest.mark.quick
+def test_a_day_that_does_not_excite_an_effect_says_little_of_how_it_wanders():
+    rng = np.random.default_rng(0)
+    columns = [Columns(0, 1.0, (0,))]
+    alike = [[(np.array([q]), np.array([[100.0]]))] for q in rng.normal(0.0, 0.3, 40)]
+    usual = float(np.sqrt(_pooled(columns, alike).covariance[0][0, 0]))
+    assert usual == pytest.approx(0.3, rel=0.3)
+    blind = [*alike[:6], [(np.array([5.0]), np.array([[0.1]]))]]  # 5 is 1.6 times its noise
+    assert np.sqrt(_pooled(columns, blind).covariance[0][0, 0]) < 2 * usual
+    loud = [*alike[:6], [(np.array([5.0]), np.array([[100.0]]))]]  # here it is 50 times its noise
+    assert np.sqrt(_pooled(columns, loud).covariance[0][0, 0]) > 4 * usual
+
+
+def joint_fit(sizes, trials=3, bins=400):
+    """A linear fit of one base parameter and one coordinate of size 1, each manoeuvre with a size of its own."""
+    rng = np.random.default_rng(1)
+    columns = rng.standard_normal((trials * len(sizes), bins, 2))
+    truth = np.repeat(sizes, trials)
+    data = columns[..., 1] * truth[:, None] + rng.standard_normal(columns.shape[:2])
+    q = np.linalg.lstsq(columns.reshape(-1, 2), data.reshape(-1), rcond=None)[0]
+    residual = data - columns @ q
+    groups = [range(trials * k, trials * (k + 1)) for k in range(len(sizes))]
+    fit = Refit((), q[:1], q[1:], float(np.square(residual).sum()), residual, columns, q)
+    gain = float(np.square(data - columns[..., 0] * q[0]).sum()) - fit.cost
+    return fit, groups, gain
+
+
+@pytest.mark.quick
+def test_manoeuvres_agree_on_a_real_effect_and_foretell_one_another():
+    fit, groups, gain = joint_fit((1.0, 1.0, 1.0, 1.0))
+    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) < 0.05
+    told = foretold(fit, slice(0, 1), groups, np.eye(1))
+    assert told.min() > 0
+    assert told.sum() == pytest.approx(gain, rel=0.1)
+
+
+@pytest.mark.quick
+def test_manoeuvres_disagree_on_an_effect_that_only_one_of_them_asks_for():
+    fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
+    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) == pytest.approx(3**0.5, rel=0.1)
+    assert foretold(fit, slice(0, 1), groups, np.eye(1)).sum() < 0.3 * gain
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("sizes", "own"), [((1.0, 1.0, 1.0, 1.0), True), ((4.0, 0.0, 0.0, 0.0), False)])
+def test_a_small_second_effect_is_one_that_manoeuvres_agree_on(sizes, own):
+    fit, groups, gain = joint_fit(sizes)
+    one = Candidate(SimpleNamespace(key="second"), gain, 0.0, 0.6, fit)
+    refitter = SimpleNamespace(precision=np.eye(1))
+    assert _own(one, SimpleNamespace(rounds=[[]]), 0.5, refitter, groups, Thresholds()) is own
+
+
+@pytest.mark.quick
+def test_every_hypothesis_vanishes_at_zero():
+    spec, params = preset("whill_cr_physical")
+    found = hypotheses(spec, params)
+    full = with_catalogue(params, found)
+    base = base_values(full)
+    for one in found:
+        values = one.values(np.zeros(len(one.axes)), base)
+        for axis in one.axes:
+            if axis.form != "moment":
+                assert values[axis.parameter] == base[axis.parameter], one.key
+
+
+@pytest.mark.quick
+def test_keys_are_unique():
+    spec, params = preset("whill_cr_physical")
+    keys = [one.key for one in hypotheses(spec, params)]
+    assert len(keys) == len(set(keys))
+
+
+@pytest.mark.quick
+def test_what_only_acts_through_another_axis_has_a_column_of_that_alone():
+    """The motion is a (1 + b): at a = 2, b = 2 the second axis adds a, and nothing of what a does by itself."""
+    one = Hypothesis("some", (Axis("some.a", 1.0), Axis("some.b", 1.0, dependent=True)))
+
+    def simulate(sets):
+        return (sets[:, 0] * (1 + sets[:, 1]))[:, None, None, None]
+
+    columns, listed = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
+                                        np.zeros((1, 1, 1)))
+    [at] = [columns[0, 0, 0, list(each.index)] for each in listed if each.level == 2.0]
+    np.testing.assert_allclose(at, [1.0, 2.0])
+
+
+@pytest.mark.quick
+def test_a_form_that_an_effect_may_take_does_not_hide_what_it_looks_like():
+    """Two effects change the motion alike; one of them may also do something that the other cannot."""
+    plain = Hypothesis("plain", (Axis("plain.a", 1.0),))
+    formed = Hypothesis("formed", (Axis("formed.a", 1.0), Axis("formed.b", 1.0, dependent=True)))
+    motion = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 3.0]])  # (n, columns)
+    evidence = SimpleNamespace(base_size=0, products=(motion.T @ motion)[None], precision=np.zeros((0, 0)),
+                               columns=(Columns(0, 2.0, (0,)), Columns(1, 2.0, (1, 2))))
+    np.testing.assert_allclose(imitation(evidence, (plain, formed)), 1.0)
+
+
+@pytest.mark.quick
+def test_two_effects_that_move_one_parameter_add_up():
+    scrub = Hypothesis("scrub", (Axis("scrub.torque", 2.0), Axis("track.error", 0.01, form="along", dependent=True)))
+    track = Hypothesis("track", (Axis("track.error", 0.1, signed=True),))
+    space = SimpleNamespace(to_values=lambda u: u)
+    refitter = SimpleNamespace(values=np.array([1.0, 0.5]), base_index=[], names=["scrub.torque", "track.error"],
+                               reference=SimpleNamespace(space=space))
+    both = Refitter.values_at(refitter, (track, scrub), np.zeros(0), np.array([1.0, 3.0, 2.0]))
+    np.testing.assert_allclose(both, [1.0 + 2 * 3, 0.5 + 0.1 + 0.01 * 3 * 2])
+
+
+@pytest.mark.quick
+def test_replicates_are_driven_round_by_round_of_a_session():
+    """Only where the supply drains does it matter when a drive began; a drive without a number keeps its time."""
+    trials = [SimpleNamespace(name=name) for name in ("turn_1", "turn_3", "long")]
+    drives = SimpleNamespace(names=(DRAIN, SESSION), trials=trials)
+    drained, fresh = (Drives._in_session(drives, np.array([[drain, 7.0]] * 3), np.arange(3)) for drain in (1e-3, 0.0))
+    np.testing.assert_allclose(drained[:, 1], [0.5 * ROUND, 2.5 * ROUND, 7.0])
+    np.testing.assert_allclose(fresh[:, 1], 7.0)
+
+
+@pytest.mark.quick
+def test_whitener_makes_autocorrelated_noise_white():
+    random = np.random.default_rng(0)
+    noise = np.zeros((40, 200, 2))
+    for k in range(1, 200):
+        noise[:, k] = 0.9 * noise[:, k - 1] + random.standard_normal((40, 2)) @ np.array([[1.0, 0.5], [0.0, 0.2]])
+    mask = np.ones_like(noise)
+    white = fit_whitener(noise, mask).apply(noise, mask)[:, 20:]
+    assert abs(white.std() - 1) < 0.05
+    assert abs(np.mean(white[:, 1:, 0] * white[:, :-1, 0])) < 0.03
+    assert abs(np.mean(white[..., 0] * white[..., 1])) < 0.03
+
+
+@pytest.mark.quick
+def test_a_channel_that_was_not_measured_is_no_rougher():
+    series = np.random.default_rng(0).standard_normal((3, 100, 2))
+    mask = np.ones_like(series)
+    mask[..., 1] = 0
+    level = np.repeat([[0] * 50 + [3] * 50], 3, axis=0)
+    factors = fit_roughness(series * np.where(level == 3, 4.0, 1.0)[..., None] * mask, mask, level)
+    assert np.allclose(factors[:, 1], 1.0)
+    assert 3 < factors[3, 0] < 5 and factors[0, 0] == 1
