@@ -24,7 +24,7 @@ import tyro
 from whill_mjx.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.env import make_env
 from whill_mjx.evaluation import NEAR_M, Course, Episodes, episode_keys, summarise
-from whill_mjx.policy_file import PolicyFile, load_policy
+from whill_mjx.policy_file import RUN_FILE, PolicyFile, load_policy
 from whill_mjx.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
 from whill_mjx.task import TASKS, Task, make_task
 
@@ -137,19 +137,19 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
 def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     """The task as the policy was trained on it, with the options' changes.
 
-    Limits and action repeat are the policy's own; other fields come from the config.json of the run that lies beside
-    the policy, where there is one for the same task.
+    Limits and action repeat are the policy's own; other fields come from the run's own note beside the policy, where
+    there is one for the same task.
     """
     name = options.task or (policy.task if policy else "obstacle_course")
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r} (known: {', '.join(TASKS)}). Give one with --task.")
     known: dict[str, Any] = {field.name: field.default for field in fields(TASKS[name])}
     changes: dict[str, Any] = {}
-    config = policy.path.parent / "config.json" if policy else None
-    if policy and config and config.is_file() and policy.task == name:
-        saved = json.loads(config.read_text()).get("preset", {}).get("task", {})
+    run = policy.path.parent / RUN_FILE if policy else None
+    if policy and run and run.is_file() and policy.task == name:
+        saved = json.loads(run.read_text())["preset"]["task"]
         changes = {field: tuple(v) if isinstance(v, list) else v for field, v in saved.items() if field in known}
-        say(f"task: fields from {config}")
+        say(f"task: fields from {run}")
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}

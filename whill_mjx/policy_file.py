@@ -15,6 +15,8 @@ import numpy as np
 
 SCHEMA, KIND = 1, "micromobility-policy"
 RUNTIMES = ("jax", "onnxruntime")
+RUN_FILE = "run.json"
+"""In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
 EXPORT_AGAIN = "Export the policy again"
 
 

@@ -27,6 +27,7 @@ from whill_mjx.devices import choose_devices, join
 from whill_mjx.drivers import planner_driver, random_driver
 from whill_mjx.evaluation import Course, episode_keys
 from whill_mjx.final import evaluate_drivers, write_report
+from whill_mjx.policy_file import RUN_FILE
 from whill_mjx.ppo_run import train_ppo
 from whill_mjx.rollouts import rollout
 from whill_mjx.safe import Step, find_safety
@@ -125,7 +126,7 @@ def main(options: TrainOptions) -> dict[str, Any]:
     options.out.mkdir(parents=True, exist_ok=True)
     vehicle = options.out / "vehicle.toml"
     if parallel.is_first_process():
-        write_json(options.out / "config.json", {"command": _plain(options), "preset": _plain(preset)})
+        write_json(options.out / RUN_FILE, {"command": _plain(options), "preset": _plain(preset)})
         prepare_vehicle(options)
     parallel.agree(True)  # the others wait for the vehicle file
     result = train_policy(options, preset, vehicle) if options.learner == "dreamer" else train_baseline(

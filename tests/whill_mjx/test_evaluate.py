@@ -246,12 +246,12 @@ def test_a_displaced_camera_is_where_the_condition_puts_it():
 
 @pytest.mark.quick
 def test_task_fields_come_from_the_run_the_policy_and_the_command(seeker):
-    config = seeker.parent / "config.json"
-    config.write_text(json.dumps({"preset": {"task": {"gates": 1, "gate_x": [2.0, 3.5], "v_min": -1.0}}}))
+    run = seeker.parent / "run.json"
+    run.write_text(json.dumps({"preset": {"task": {"gates": 1, "gate_x": [2.0, 3.5], "v_min": -1.0}}}))
     policy = load_policy(seeker)
     task = choose_task(EvaluateOptions(str(seeker), set=("goal_x=5.0",)), policy)
     assert (task.gates, task.gate_x, task.goal_x, task.v_min, task.action_repeat) == (1, (2.0, 3.5), 5.0, 0.0, 2)
-    config.unlink()
+    run.unlink()
     with pytest.raises(ValueError, match="no field 'gate'"):
         choose_task(EvaluateOptions(str(seeker), set=("gate=1",)), policy)
     with pytest.raises(ValueError, match="is no int"):

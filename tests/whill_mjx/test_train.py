@@ -14,9 +14,11 @@ import pytest
 
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
+from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.intervals import wilson_interval
+from whill_mjx.policy_file import load_policy
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
-from whill_mjx.task import Corridor, ObstacleCourse
+from whill_mjx.task import Corridor, ObstacleCourse, make_task
 from whill_mjx.train import Stopper, TrainOptions, choose_preset, keep_best, main, prepare_vehicle, read_best
 from whill_mjx.training import find_preset, functional_env, with_repeat
 
@@ -35,8 +37,8 @@ def test_a_run_leaves_everything_a_user_needs(run):
     options, evaluation = run
     left = {path.name for path in options.out.iterdir()}
     assert left >= {
-        "config.json", "vehicle.toml", "metrics.jsonl", "reward_curve.png", "drives.png", "camera.mp4", "drives.npz",
-        "evaluation.json", "checkpoints", "policy", "best", "best.json", "failures.png", "failures.mp4",
+        "run.json", "config.json", "vehicle.toml", "metrics.jsonl", "reward_curve.png", "drives.png", "camera.mp4",
+        "drives.npz", "evaluation.json", "checkpoints", "policy", "best", "best.json", "failures.png", "failures.mp4",
     }  # fmt: skip
     assert {"policy.json", "policy.onnx", "weights.npz", "vehicle.toml"} <= {
         path.name for path in (options.out / "policy").iterdir()
@@ -49,6 +51,14 @@ def test_a_run_leaves_everything_a_user_needs(run):
             low, high = figures[f"{name}_interval_95"]
             assert low <= figures[name] <= high
         assert figures["success"] + figures["collision"] + figures["timeout"] + figures["diverged"] == pytest.approx(1)
+
+
+def test_an_evaluation_takes_the_task_from_the_run_of_its_policy(run):
+    options, _ = run
+    trained = find_preset("smoke", "obstacle_course").task
+    task = choose_task(EvaluateOptions(str(options.out / "policy")), load_policy(options.out / "policy"))
+    assert trained.gates != make_task("obstacle_course").gates  # else nothing would be told
+    assert task == dataclasses.replace(trained, layout="randomised")
 
 
 def test_the_same_command_again_goes_on_from_the_end_and_gives_the_same_policy(run):
