@@ -63,7 +63,7 @@ def test_every_effect_of_the_catalogue_says_what_would_contradict_it():
     assert all(one.by in {*SPLITS, *QUIET} for each in FALSIFIERS.values() for one in each)
 
 
-def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600):
+def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
     """A linear fit of one base parameter and one effect whose size is another one in the second half of every trial;
     `weight` is how much each half shows of it."""
     rng = np.random.default_rng(2)
@@ -78,7 +78,7 @@ def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600):
     parts = np.stack([effect * q[1] * ~half, effect * q[1] * half], axis=-1)
     refitter = SimpleNamespace(precision=np.eye(1), reference=SimpleNamespace(u=np.zeros(1)))
     size, covariance = sizes_in_parts(fit, slice(0, 1), parts, refitter, [[2 * k, 2 * k + 1] for k in range(3)])
-    return size, covariance, falsifiers._same("slope", SIGN, size, covariance, 8, 0.003)
+    return size, covariance, falsifiers._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
 
 
 def test_an_effect_with_one_size_stands_its_split():
@@ -95,6 +95,12 @@ def test_an_effect_that_turns_around_or_is_gone_in_one_part_is_contradicted():
 
 def test_an_effect_whose_law_differs_by_a_factor_of_two_is_not_contradicted():
     assert fitted((1.0, 0.5))[2].outcome == "holds"
+
+
+def test_what_is_half_as_large_late_in_a_drive_is_no_effect_without_the_time_in_its_law():
+    [lasting] = [one for one in FALSIFIERS["dry_friction"] if one.by == "time in the drive"]
+    assert fitted((1.0, 0.5), prediction=lasting)[2].outcome == "falsified"
+    assert fitted((1.0, 0.9), prediction=lasting)[2].outcome == "holds"
 
 
 def test_drives_that_show_an_effect_in_one_part_only_contradict_nothing():
