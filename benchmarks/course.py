@@ -27,7 +27,7 @@ from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
-from whill_mjx.train import TrainOptions, main, mean_figures
+from whill_mjx.train import TrainOptions, main, mean_figures, write_json
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
@@ -46,17 +46,21 @@ def run(options: argparse.Namespace) -> None:
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip
+    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed}
+    if options.beside:
+        note["together"] = 1 + options.beside
+    write_json(options.out / "course.json", {**note, **result})
+    if not (options.out / "policy").exists():
+        print("no proofs of sight: there is no policy file, for what exports it is not installed here", flush=True)
+        return
     told = evaluation_command.main(
         evaluation_command.EvaluateOptions(
             str(options.out / "policy"), out=options.out / "sight", episodes=options.episodes, layout=options.layout,
             blind=BLIND, videos=0,
         )
     )  # fmt: skip
-    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed,
-            "sight": {kind: told["drivers"][f"policy {kind}"]["success"] for kind in BLIND}}
-    if options.beside:
-        note["together"] = 1 + options.beside
-    (options.out / "course.json").write_text(json.dumps({**note, **result}, indent=1) + "\n")
+    note["sight"] = {kind: told["drivers"][f"policy {kind}"]["success"] for kind in BLIND}
+    write_json(options.out / "course.json", {**note, **result})
 
 
 def together(options: argparse.Namespace) -> None:
@@ -124,7 +128,7 @@ def _of_seed(line: dict[str, Any], seed: int) -> dict[str, Any]:
 
 def collect(options: argparse.Namespace) -> None:
     """Merge finished runs into course.json and draw their curves."""
-    runs = sorted((load_run(path) for path in options.runs), key=lambda one: one["seed"])
+    runs = sorted((load_run(path, options.device) for path in options.runs), key=lambda one: one["seed"])
     figures: dict[str, Any] = {}
     corridor = [one for one in runs if is_corridor(one)]
     for preset in ("cpu", "paper"):
@@ -181,9 +185,21 @@ def _changes(config: dict[str, Any], size: str) -> dict[str, Any]:
     return {field: value for field, value in config.items() if field in usual and value != usual[field]}
 
 
-def load_run(path: Path) -> dict[str, Any]:
-    """Result of one run with its metrics."""
-    content = json.loads((path / "course.json").read_text())
+def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
+    """Result of one run with its metrics.
+
+    Of a training without a note it is what the main command left: with the preset paper, on `device`, beside others.
+
+    Raises:
+        ValueError: there is no note, and no device is told.
+    """
+    if (path / "course.json").exists():
+        content = json.loads((path / "course.json").read_text())
+    elif device is None:
+        raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
+    else:
+        left = json.loads((path / "evaluation.json").read_text())
+        content = {"device": device, "preset": "paper", "layout": left["task"]["layout"], "together": 2, **left}
     content["metrics"] = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
     return content
 
@@ -361,6 +377,7 @@ def parse() -> argparse.Namespace:
     side.set_defaults(call=together)
     several = commands.add_parser("collect")
     several.add_argument("--runs", type=Path, nargs="+", required=True)
+    several.add_argument("--device", help="on which runs without a note of it were made")
     several.set_defaults(call=collect)
     tried = commands.add_parser("ablation")
     tried.add_argument("--runs", type=Path, nargs="+", required=True)

@@ -10,7 +10,8 @@ The variants of `--tries`, each against the program as it is:
 - scan_gradients: the scan over time is differentiated as it is, so that every step adds to the weights' gradients;
 - unhoisted: besides, the action's and the tokens' share of the products, the masks and the casts are inside the scan;
 - no_command_buffers, command_buffers_while: no CUDA graphs, and graphs that hold whole loops;
-- deterministic, no_autotune: flags of XLA, as the reference learner sets the first and to see what the second is worth.
+- deterministic, no_autotune: flags of XLA, as the reference learner sets the first and to see what the second is worth;
+- fused_posterior: the forward pass of the observing scan as one kernel (`benchmarks.learner_fused`), against that scan.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
-from benchmarks import harness, learner_profile
+from benchmarks import harness, learner_fused, learner_profile
 from benchmarks.learner_updates import Updates
 from dreamer import distributions, recurrence, rssm
 from dreamer.config import DreamerConfig
@@ -53,7 +54,8 @@ FLAGS = {
 """Tries that need a process of their own, for XLA reads its flags once."""
 UNROLLS = (1, 2, 4, 8)
 FORMS = ("scan_gradients", "unhoisted")
-TRIES = (*(f"unroll{count}" for count in UNROLLS), *FORMS, *FLAGS)
+FUSED = "fused_posterior"
+TRIES = (*(f"unroll{count}" for count in UNROLLS), *FORMS, *FLAGS, FUSED)
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit-s", type=float, default=float("inf"), help="begin no further variant after so long")
     parser.add_argument("--skip-base", action="store_true", help="do not time the update as it is")
     parser.add_argument("--one-profile", action="store_true", help=argparse.SUPPRESS)  # in a process of its own
+    parser.add_argument("--one-fused", action="store_true", help=argparse.SUPPRESS)  # likewise: it could hang
     parser.add_argument("--json", action="store_true", help=argparse.SUPPRESS)
 
 
@@ -94,11 +97,15 @@ def run(name: str, config: DreamerConfig, args: argparse.Namespace, keep: Callab
     label = label_of(name, args.batch_size)
     if args.one_profile:
         keep(learner_profile.measure(config, label, args.per_block))
+    if args.one_fused:
+        keep(learner_fused.measure(config, label, args.blocks))
     if args.profile:
         keep(in_process("profile", args, NO_GRAPHS, ["--one-profile"]))
     tries = TRIES if args.tries == [] else args.tries or ()
     for figures in time_variants(list(variants(name, label, config, args, tries)), args, until):
         keep(figures)
+    if FUSED in tries and not skipped(FUSED, until):
+        keep(in_process(FUSED, args, "", ["--one-fused"]))
     for one in (one for one in tries if one in FLAGS):
         if skipped(one, until):
             continue
@@ -120,7 +127,7 @@ def variants(
     for one in tries:
         if one in FORMS:
             yield Variant(f"{label}_{one}", config, form=one)
-        elif one not in FLAGS:
+        elif one.startswith("unroll"):
             unrolled = dataclasses.replace(config, scan_unroll=int(one.removeprefix("unroll")))
             yield Variant(f"{label}_{one}", unrolled)
 
@@ -186,7 +193,7 @@ def in_process(name: str, args: argparse.Namespace, flags: str, more: list[str])
     given = {"--preset": args.preset, "--batch-size": args.batch_size, "--unroll": args.unroll, "--dtype": args.dtype,
              "--blocks": args.blocks, "--per-block": args.per_block}
     command = [sys.executable, "-m", "benchmarks.learner", "--dry", "--json", *more]
-    command += ["--skip-base"] if "--one-profile" in more else []
+    command += ["--skip-base"] if any(one.startswith("--one-") for one in more) else []
     command += [word for option, value in given.items() if value is not None for word in (option, str(value))]
     on_cpu = jax.devices()[0].platform == "cpu"
     flags = "" if on_cpu else flags  # a CPU knows none of them; there the process repeats the program as it is

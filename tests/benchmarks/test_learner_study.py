@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from types import SimpleNamespace
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import learner, learner_profile, learner_study
+from benchmarks import learner, learner_fused, learner_profile, learner_study
 from benchmarks.learner_profile import Event
 from dreamer import rssm
 from dreamer.config import preset
@@ -25,17 +27,23 @@ PROGRAM = """HloModule jit_block
 """
 
 
+def sequences(config, batch):
+    """Parameters, the state before, and sequences that hold an episode's start."""
+    params = jax.jit(lambda key: rssm.init(config, 6, 2, key))(jax.random.PRNGKey(0))
+    keys = jax.random.split(jax.random.PRNGKey(1), 3)
+    start = jax.tree.map(lambda x: x + 0.3, rssm.initial(config, batch))
+    return params, start, (
+        jax.random.normal(keys[0], (5, batch, 2)), jax.random.normal(keys[1], (5, batch, 6)),
+        jnp.zeros((5, batch), bool).at[2, 0].set(True), jax.random.uniform(keys[2], (5, batch, config.stoch)))
+
+
 def observed(form):
-    """States, probabilities and gradients of sequences that hold an episode's start."""
-    params = jax.jit(lambda key: rssm.init(CONFIG, 6, 2, key))(jax.random.PRNGKey(0))
-    keys = jax.random.split(jax.random.PRNGKey(1), 4)
-    start = jax.tree.map(lambda x: x + 0.3, rssm.initial(CONFIG, 2))
-    args = (jax.random.normal(keys[0], (5, 2, 2)), jax.random.normal(keys[1], (5, 2, 6)),
-            jnp.zeros((5, 2), bool).at[2, 0].set(True), jax.random.uniform(keys[2], (5, 2, CONFIG.stoch)))
+    """States, probabilities and gradients."""
+    params, start, args = sequences(CONFIG, 2)
 
     def total(params):
         states, probs = rssm.observe(CONFIG, params, start, *args)
-        weight = jax.random.normal(keys[3], probs.shape)
+        weight = jax.random.normal(jax.random.PRNGKey(2), probs.shape)
         return jnp.sum(weight * probs) + jnp.sum(jnp.square(states.features())), (states, probs)
 
     with learner_study.in_form(form):
@@ -52,6 +60,26 @@ def test_every_form_of_the_observing_scan_gives_the_same_states_and_gradients(fo
     for one, other in zip(jax.tree.leaves(as_it_is), jax.tree.leaves(observed(form)), strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-5)
     assert rssm.observe is not learner_study.plain_observe
+
+
+def test_the_fused_kernel_gives_the_states_of_the_scan():
+    config = preset("cpu", deter=64, hidden=16, stoch=2, classes=16, blocks=2, batch_size=16)
+    params, start, args = sequences(config, 16)
+    params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.PRNGKey(x.size), x.shape), params)
+    scanned = rssm.observe(config, params, start, *args)
+    alone = partial(learner_fused.fused_scan, learner_fused.Layout(alone=True))
+    with mock.patch.object(rssm, "scan_products", alone):
+        fused = rssm.observe(config, params, start, *args)
+    for one, other in zip(jax.tree.leaves(scanned), jax.tree.leaves(fused), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_widths_that_the_fused_kernel_cannot_have_are_refused():
+    config = preset("cpu", deter=48, hidden=16, stoch=2, classes=16, blocks=2, batch_size=16)
+    params, start, args = sequences(config, 16)
+    with mock.patch.object(rssm, "scan_products", partial(learner_fused.fused_scan, learner_fused.Layout(alone=True))):
+        with pytest.raises(ValueError, match="deter is 48"):
+            rssm.observe(config, params, start, *args)
 
 
 def test_an_instruction_counts_for_the_outermost_part_that_asked_for_it():
