@@ -85,9 +85,10 @@ class Meter:
             "updates_per_env_step": updates / max(steps, 1),
             "episodes": episodes,
         }
-        goals, goal_sum = sums.pop("update/goal_frames", 0.0), sums.pop("update/goal_reward_sum", 0.0)
+        goals = sums.pop("update/goal_frames", 0.0)
+        predicted, true = (sums.pop(f"update/goal_reward_{name}sum", 0.0) for name in ("", "true_"))
         if goals:
-            line["goal_reward_predicted"] = goal_sum / goals
+            line |= {"goal_reward_predicted": predicted / goals, "goal_reward_true": true / goals}
         for name, value in sums.items():
             count = episodes if name.startswith("episode/") else updates
             if count:

@@ -108,6 +108,7 @@ def loss(
         "kl": jnp.mean(dist.categorical_kl(post, prior)),
         "post_entropy": jnp.mean(jnp.sum(-post * jnp.log(post), (-2, -1))),
         "goal_reward_sum": parallel.total(jnp.sum(goal * predicted)),
+        "goal_reward_true_sum": parallel.total(jnp.sum(goal * batch.reward)),
         "goal_frames": parallel.total(jnp.sum(goal)),
     }
     return losses, latent, metrics

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from flax import struct
 
 from dreamer.config import DreamerConfig, preset
 from dreamer.spaces import Discrete
+from dreamer.train import train
 from dreamer.types import FunctionalEnv, Transition
 
 SHAPE = (16, 16, 3)
@@ -24,6 +26,11 @@ def tiny_config(**overrides: Any) -> DreamerConfig:
         value_layers=1, policy_layers=1,
     )
     return preset("cpu", **{**sizes, **overrides})
+
+
+def train_without_end(config: DreamerConfig, out: Path) -> None:
+    """Train in the corridor with a checkpoint after every iteration, until somebody ends it."""
+    train(corridor_env(4), config, out, 10**6, 0, progress=False, log_every_s=0.0, checkpoint_every_s=0.0)
 
 
 @struct.dataclass

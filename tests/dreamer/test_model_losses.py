@@ -1,6 +1,7 @@
 """Which part of a replayed step each loss of the world model reads, and the gates of its recurrence."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +69,23 @@ def test_a_first_step_forgets_state_and_action_of_its_own_sequence_alone(losses_
     assert np.any(begun[2, 0] != plain[2, 0])
     other = dataclasses.replace(batch, prev_action=batch.prev_action.at[2, 0].set(0.3).at[:2, 0].set(-0.4))
     np.testing.assert_array_equal(losses_of(other, is_first=(2, 0))[1][2:, 0], begun[2:, 0])
+
+
+def test_an_update_in_bf16_keeps_parameters_and_moments_in_float32_and_loses_what_float32_does(batch):
+    def updated(dtype):
+        config = tiny_config(compute_dtype=dtype)
+        begun = agent.init_agent(config, SHAPE, 2, KEY)
+        start = rssm.initial(config, B)
+        return jax.jit(partial(agent.update, config))(begun, dataclasses.replace(batch, start=start), KEY)
+
+    learner, latent, metrics = updated("bfloat16")
+    _, exact_latent, exact = updated("float32")
+    assert latent.deter.dtype == latent.stoch.dtype == jnp.bfloat16 and exact_latent.deter.dtype == jnp.float32
+    kept = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert {leaf.dtype for leaf in kept} == {jnp.dtype(jnp.float32)} and all(np.isfinite(leaf).all() for leaf in kept)
+    for name in ("loss_recon", "loss_reward", "loss_continue", "loss_value"):
+        assert metrics[name].dtype == jnp.float32
+        assert float(metrics[name]) == pytest.approx(float(exact[name]), rel=0.02), name
 
 
 def test_the_losses_have_the_weights_of_the_configuration(losses_of, batch):

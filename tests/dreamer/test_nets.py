@@ -17,27 +17,33 @@ def init(config, shape=SHAPE):
 
 
 @pytest.mark.quick
-def test_size12m_has_the_parameter_count_of_the_reference():
-    params = jax.eval_shape(lambda k: agent.init_params(preset("size12m"), (64, 64, 3), 2, k), jax.random.PRNGKey(0))
-    assert sum(x.size for x in jax.tree.leaves(params)) == 10_491_078
+@pytest.mark.parametrize("size, millions", [("size1m", 0.686), ("size12m", 10.491078), ("size25m", 23.5),
+                                            ("size50m", 41.6)])
+def test_sizes_have_the_parameter_counts_of_the_reference(size, millions):
+    params = jax.eval_shape(lambda k: agent.init_params(preset(size), (64, 64, 3), 2, k), jax.random.PRNGKey(0))
+    digits = len(str(millions).partition(".")[2])
+    assert round(sum(x.size for x in jax.tree.leaves(params)) / 1e6, digits) == millions
 
 
-def test_weights_start_with_the_deviation_of_their_fan_in():
-    config = tiny_config(deter=128, hidden=64, encoder="conv", depth=4)
-    params = init(config)
-    expected = {
-        ("dyn", "in_deter"): 1 / np.sqrt(128),
-        ("dyn", "core"): 1 / np.sqrt(128 + 3 * 64 * 4),  # the full width, not that of a block
-        ("dyn", "gates"): 1 / np.sqrt(128),
-        ("enc", "conv2"): 1 / np.sqrt(5 * 5 * 12),
-    }
-    for (part, name), std in expected.items():
-        weight = np.asarray(params[part][name]["w"])
-        assert weight.std() == pytest.approx(std, rel=0.05), (part, name)
-        assert np.abs(weight).max() <= 2.0 * 1.1368 * std + 1e-6, (part, name)  # cut at two deviations, not at 2
-    assert np.asarray(params["policy"]["out"]["w"]).std() == pytest.approx(0.01 / 4, rel=0.3)
-    for name in ("reward", "value"):
-        assert not np.any(params[name]["out"]["w"]) and not np.any(params[name]["out"]["b"])
+ZERO_AT_FIRST = {("reward", "out"), ("value", "out")}
+
+
+def test_every_weight_starts_with_the_deviation_of_its_fan_in():
+    params = init(tiny_config(deter=128, hidden=64, units=64, encoder="conv", depth=4, policy_layers=2, value_layers=2))
+    weights = [(tuple(key.key for key in path[:-1]), np.asarray(leaf))
+               for path, leaf in jax.tree_util.tree_leaves_with_path(params) if path[-1].key == "w"]
+    assert len(weights) > 25
+    for name, weight in weights:
+        if name in ZERO_AT_FIRST:
+            assert not np.any(weight), name
+            continue
+        blocks = weight.ndim == 3  # their fan-in is the full width, not that of a block
+        std = 1 / np.sqrt(np.prod(weight.shape[:2] if blocks else weight.shape[:-1]))
+        std *= 0.01 if name == ("policy", "out") else 1.0
+        assert weight.std() == pytest.approx(std, rel=max(0.03, 4 / np.sqrt(2 * weight.size))), name
+        assert np.abs(weight).max() <= 2.0 * 1.1368 * std + 1e-6, name  # cut at two deviations, not at 2
+    for leaf in (params["reward"]["out"]["b"], params["value"]["out"]["b"]):
+        assert not np.any(leaf)
 
 
 @pytest.mark.quick

@@ -16,6 +16,7 @@ import pytest
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, step
 from whill_mjx.task import ObstacleCourse
+from whill_mjx.training import functional_env
 
 ROOT = Path(__file__).parents[2]
 TWO_DEVICES = """
@@ -51,6 +52,20 @@ def batch():
     env, params = make_env(ObstacleCourse(max_steps=3), height=16, width=16)
     many = make_batch(env, params, COUNT, spread=0.05)
     return many, jax.jit(many.reset), jax.jit(many.step)
+
+
+def test_the_goal_reaches_the_learner_with_its_reward_and_its_own_frame():
+    env, params = make_env(ObstacleCourse(goal_radius=20.0), height=16, width=16)  # there at once
+    learned = functional_env(make_batch(env, params, COUNT))
+    reset, advance = jax.jit(learned.reset), jax.jit(learned.step)
+    state, first = reset(jax.random.key(0))
+    state, goal = advance(state, jnp.ones((COUNT, 2)))
+    assert bool((goal.is_terminal & goal.is_last & ~goal.is_first).all())
+    assert bool(goal.metrics["success"].all()) and bool((goal.reward > 90).all())
+    seen = jax.jit(jax.vmap(lambda one: observe(env, one)))(state.env)
+    assert (np.abs(np.asarray(seen, int) - goal.obs) <= 1).mean() > 0.99
+    _, after = advance(state, jnp.ones((COUNT, 2)))
+    assert bool((after.is_first & ~after.is_terminal).all()) and not np.asarray(after.reward).any()
 
 
 def test_terminal_observation_is_kept_and_the_next_call_starts_a_new_episode(batch):
