@@ -56,7 +56,7 @@ HEADLINES = (  # file, figure, factor, what it says
     ("camera", "jnp_frames_per_s", 1e-6, "M the same in plain JAX"),
     ("environment", "control_steps_per_s_course", 1e-6, "M control steps/s of the obstacle course, image included"),
     ("learner", "updates_per_s_12m", 1.0, "DreamerV3 updates/s, size12m, batch 16 x 64"),
-    ("learner", "peer_updates_per_s_12m", 1.0, "the same of SheepRL, through torch.compile, in the same run"),
+    ("learner", "peer_updates_per_s_12m", 1.0, "the same of SheepRL, through torch.compile (another run)"),
     ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (median of 5 seeds)"),
     ("dreamer_control", "balance_image_size12m_return", 1.0,
      "of 1,000: balancing a cart-pole from pixels, 100,000 steps (median of 3 seeds)"),
