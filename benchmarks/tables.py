@@ -70,7 +70,7 @@ HEADLINES = (  # file, figure, factor, what it says
     ("undeclared", "class_accuracy_2x", 100.0, "% of undeclared effects named right, at twice a noticeable size"),
     ("undeclared", "wrong_name_2x", 100.0, "% of them named wrong; the others are said to be unexplained or not there"),
     ("undeclared", "false_alarm_upper", 100.0,
-     "% false alarms at most (95 % bound), logs with nothing in them, 28 sets of reference days"),
+     "% false alarms at most (95 % bound), logs with nothing in them"),
     ("fit", "noise_floor_ratio", 1.0, "times the sensor noise: held-out error where the truth was planted"),
     ("fit", "plant_replicate_ratio", 1.0, "times the replicate spread: held-out pose error, contact-plant logs"),
 )
