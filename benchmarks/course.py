@@ -27,7 +27,8 @@ from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
-from whill_mjx.train import TrainOptions, main, mean_figures, write_json
+from whill_mjx.dataset import write_json
+from whill_mjx.train import TrainOptions, main, mean_figures
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"

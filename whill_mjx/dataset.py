@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,6 +99,11 @@ def write_csv(path: Path, header: str, table: np.ndarray) -> None:
     """Write a table (T, C) with six decimals, whole or not at all."""
     rows = [",".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in row) for row in table]
     write_text(path, "\n".join([header, *rows]) + "\n")
+
+
+def write_json(path: Path, content: Any, allow_nan: bool = True) -> None:
+    """Write JSON, whole or not at all; ValueError for what is no finite number, if `allow_nan` is not set."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=allow_nan) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from dataclasses import dataclass, fields
@@ -21,6 +20,7 @@ import jax
 import numpy as np
 import tyro
 
+from whill_mjx.dataset import write_json
 from whill_mjx.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.env import make_env
 from whill_mjx.evaluation import NEAR_M, Course, Episodes, episode_keys, summarise
@@ -124,7 +124,7 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
         }
         pictures, videos = draw(options, task, course(), drivers[main_name], driven, main_name, results)
     evaluation["seconds"] = time.perf_counter() - began
-    write_json(options.out / "evaluation.json", evaluation)
+    write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
     if options.html:
         from whill_mjx.report import page
 
@@ -264,13 +264,6 @@ def draw(
         except ImportError as error:
             say(f"{name} is left out: {error}. Install the base package to draw it.")
     return [path for path in written if path.suffix == ".png"], [path for path in written if path.suffix == ".mp4"]
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    os.replace(temporary, path)
 
 
 def say(text: str) -> None:

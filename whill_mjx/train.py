@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
+from whill_mjx.dataset import write_json, write_text
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.drivers import planner_driver, random_driver
 from whill_mjx.evaluation import Course, episode_keys
@@ -417,18 +417,6 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")
         return None
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 def say(text: str) -> None:
