@@ -2,6 +2,7 @@
 
     python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
     python -m benchmarks.course run --task corridor --seed 0 --out runs/corridor/0
+    python -m benchmarks.course run --preset wallclock [--learner ppo] --seed 0 --out runs/wallclock/0
     python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
     python -m benchmarks.course together --change mirror=false --out runs/ablation/unmirrored
@@ -33,6 +34,8 @@ from whill_mjx.training import TRUTH, find_preset, functional_env, make_training
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
+LEARNERS = {"dreamer": "", "ppo": "_ppo"}
+"""What the names of each learner's figures end in."""
 BLIND: tuple[Literal["blank", "freeze", "replay"], ...] = ("blank", "freeze", "replay")
 
 
@@ -42,7 +45,8 @@ def run(options: argparse.Namespace) -> None:
         TrainOptions(
             out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
-            action_repeat=options.repeat, exploring_starts=options.starts,
+            action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
+            instances=options.instances, eval_every=options.eval_every,
             export="best" if options.preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
@@ -135,9 +139,17 @@ def collect(options: argparse.Namespace) -> None:
     for preset in ("cpu", "paper"):
         for layout in ("fixed", "randomised"):
             chosen = [one for one in runs if (one["preset"], one["layout"]) == (preset, layout) and one not in corridor]
-            if chosen:
-                figures |= cpu_figures(chosen) if preset == "cpu" else paper_figures(chosen, layout)
-                draw(chosen, RESULTS / f"course_{preset}_{layout}.png")
+            for learner, suffix in LEARNERS.items():
+                mine = [one for one in chosen if one.get("learner", "dreamer") == learner]
+                if mine:
+                    found = cpu_figures(mine) if preset == "cpu" else paper_figures(mine, layout)
+                    figures |= {f"{name}{suffix}": entry for name, entry in found.items()}
+                    draw(mine, RESULTS / f"course_{preset}_{layout}{suffix}.png")
+    for learner, suffix in LEARNERS.items():
+        mine = [one for one in runs if one["preset"] == "wallclock" and one.get("learner", "dreamer") == learner]
+        if mine:
+            figures |= {f"{name}{suffix}": entry for name, entry in wallclock_figures(mine).items()}
+            draw(mine, RESULTS / f"course_wallclock{suffix}.png")
     if figures:
         record("course", CLAIM, figures)
     if corridor:
@@ -218,6 +230,23 @@ def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "cpu_minutes": figure([training_s(one) / 60 for one in runs], "min", device),
         "cpu_first_sign_minutes": figure(first, "min", device),
         **{f"cpu_{name}": found for name, found in sight_figures(runs).items()},
+    }
+
+
+def wallclock_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Time until 99 % of the episodes of an evaluation inside the run succeeded, per seed that came so far; its success
+    over the worlds of the final evaluation and what the run took.
+    """
+    device = runs[0]["device"]
+    times = [next((m["wall_s"] for m in one["metrics"] if m.get("eval/success", 0.0) >= 0.99), None) for one in runs]
+    reached = [time for time in times if time is not None]
+    success = {**figure([one["policy"]["success"] for one in runs], "share", device),
+               "episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs]}  # fmt: skip
+    return {
+        **({"time_to_99_s": figure(reached, "s", device)} if reached else {}),
+        "wallclock_success": success,
+        "wallclock_training_s": figure([training_s(one) for one in runs], "s", device),
+        **{f"wallclock_{name}": entry for name, entry in sight_figures(runs).items()},
     }
 
 
@@ -354,7 +383,11 @@ def parse() -> argparse.Namespace:
     one.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
     one.add_argument("--layout", default="randomised")
     one.add_argument("--vehicle", type=Path)
+    one.add_argument("--learner", default="dreamer", choices=("dreamer", "ppo"))
+    one.add_argument("--instances", type=int, help="chairs side by side; the preset's unless given")
     one.add_argument("--steps", type=int)
+    one.add_argument("--eval-every", type=int, help="environment steps; the preset's unless given")
+    one.add_argument("--lr", type=float, help="learning rate; the preset's unless given")
     one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")

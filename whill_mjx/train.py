@@ -69,6 +69,8 @@ class TrainOptions:
     """Seed of the training."""
     steps: int | None = None
     """Environment steps to train; none takes the preset's."""
+    eval_every: int | None = None
+    """Environment steps between evaluations inside the run; none takes the preset's."""
     episodes: int = 100
     """Episodes of the final evaluation, of the policy, the planner and a random one."""
     planner: bool = True
@@ -180,6 +182,7 @@ def choose_preset(options: TrainOptions) -> Preset:
         ppo=baseline,
         total_steps=options.steps or preset.total_steps,
         instances=options.instances or preset.instances,
+        eval_every=options.eval_every or preset.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
