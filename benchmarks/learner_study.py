@@ -110,7 +110,7 @@ def run(name: str, config: DreamerConfig, args: argparse.Namespace, keep: Callab
         if skipped(one, until):
             continue
         for key, value in in_process(one, args, FLAGS[one], ["--compile-threads", "1"]).items():
-            if re.search("per_s(_|$)", key):
+            if re.search("per_s(_|$)|^compile_s", key):
                 keep({f"{key}_{one}": value})
 
 

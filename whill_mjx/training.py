@@ -81,10 +81,13 @@ def find_preset(name: str, task: str) -> Preset:
                 exploring_starts=0.5 if on_course else 0.0,
             )  # fmt: skip
         case "wallclock":
-            learner = learner_preset("size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000)
+            learner = learner_preset(
+                "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
+                horizon=100.0, return_lambda=0.98, decode_only=(TRUTH,),
+            )  # fmt: skip
             return Preset(
-                make_task(task), learner, 8_000_000, instances=2048, eval_every=100_000, eval_episodes=1000,
-                ppo=PpoConfig(rollout=32, minibatches=16), stop_success=0.99,
+                make_task(task), learner, 8_000_000, instances=2048, eval_every=500_000, eval_episodes=1000,
+                exploring_starts=0.5, ppo=PpoConfig(rollout=32, minibatches=16), stop_success=0.99,
             )  # fmt: skip
         case "cpu":
             course = make_task(task, action_repeat=5, **easy)
