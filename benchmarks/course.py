@@ -17,11 +17,12 @@ import dataclasses
 import json
 import statistics
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 
+from benchmarks.course_figures import BLIND, draw, groups, is_corridor, load_run
 from benchmarks.harness import RESULTS, device_name, figure, record
 from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
@@ -34,9 +35,6 @@ from whill_mjx.training import TRUTH, find_preset, functional_env, make_training
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
-LEARNERS = {"dreamer": "", "ppo": "_ppo"}
-"""What the names of each learner's figures end in."""
-BLIND: tuple[Literal["blank", "freeze", "replay"], ...] = ("blank", "freeze", "replay")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -134,31 +132,13 @@ def _of_seed(line: dict[str, Any], seed: int) -> dict[str, Any]:
 def collect(options: argparse.Namespace) -> None:
     """Merge finished runs into course.json and draw their curves."""
     runs = sorted((load_run(path, options.device) for path in options.runs), key=lambda one: one["seed"])
-    figures: dict[str, Any] = {}
-    corridor = [one for one in runs if is_corridor(one)]
-    for preset in ("cpu", "paper"):
-        for layout in ("fixed", "randomised"):
-            chosen = [one for one in runs if (one["preset"], one["layout"]) == (preset, layout) and one not in corridor]
-            for learner, suffix in LEARNERS.items():
-                mine = [one for one in chosen if one.get("learner", "dreamer") == learner]
-                if mine:
-                    found = cpu_figures(mine) if preset == "cpu" else paper_figures(mine, layout)
-                    figures |= {f"{name}{suffix}": entry for name, entry in found.items()}
-                    draw(mine, RESULTS / f"course_{preset}_{layout}{suffix}.png")
-    for learner, suffix in LEARNERS.items():
-        mine = [one for one in runs if one["preset"] == "wallclock" and one.get("learner", "dreamer") == learner]
-        if mine:
-            figures |= {f"{name}{suffix}": entry for name, entry in wallclock_figures(mine).items()}
-            draw(mine, RESULTS / f"course_wallclock{suffix}.png")
-    if figures:
-        record("course", CLAIM, figures)
-    if corridor:
-        found = corridor_figures(corridor)
-        record("corridor", CORRIDOR_CLAIM, found)
-        draw(corridor, RESULTS / "corridor.png")
-        figures |= {f"corridor: {name}": entry for name, entry in found.items()}
-    for name, entry in figures.items():
-        print(f"{name:40s} {entry['value']:.4g} {entry['unit']:8s} {entry['repeats']}")
+    for name, mine, figures in groups(runs):
+        draw(mine, RESULTS / f"{name}.png")
+        corridor = is_corridor(mine[0])
+        record("corridor" if corridor else "course", CORRIDOR_CLAIM if corridor else CLAIM, figures)
+        print(name)
+        for one, entry in figures.items():
+            print(f"{one:40s} {entry['value']:.4g} {entry['unit']:8s} {entry['repeats']}")
 
 
 def ablation(options: argparse.Namespace) -> None:
@@ -196,147 +176,6 @@ def _changes(config: dict[str, Any], size: str) -> dict[str, Any]:
     """Settings of a run that are not those of a size."""
     usual = json.loads(json.dumps(dataclasses.asdict(learner_preset(size))))
     return {field: value for field, value in config.items() if field in usual and value != usual[field]}
-
-
-def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
-    """Result of one run with its metrics.
-
-    Of a training without a note it is what the main command left: with the preset paper, on `device`, beside others.
-
-    Raises:
-        ValueError: there is no note, and no device is told.
-    """
-    if (path / "course.json").exists():
-        content = json.loads((path / "course.json").read_text())
-    elif device is None:
-        raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
-    else:
-        left = json.loads((path / "evaluation.json").read_text())
-        content = {"device": device, "preset": "paper", "layout": left["task"]["layout"], "together": 2, **left}
-    content["metrics"] = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-    return content
-
-
-def cpu_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Success of each seed over 100 episodes, against a random policy and without sight in the same worlds."""
-    device = runs[0]["device"]
-    success = [one["policy"]["success"] for one in runs]
-    gain = [one["policy"]["success_interval_95"][0] - one["random"]["success"] for one in runs]
-    first = [first_sign(one) for one in runs]
-    return {
-        "cpu_success": {**figure(success, "share", device), "episodes": runs[0]["policy"]["episodes"]},
-        "cpu_random_success": figure([one["random"]["success"] for one in runs], "share", device),
-        "cpu_lower_bound_above_random": figure(gain, "share", device),
-        "cpu_minutes": figure([training_s(one) / 60 for one in runs], "min", device),
-        "cpu_first_sign_minutes": figure(first, "min", device),
-        **{f"cpu_{name}": found for name, found in sight_figures(runs).items()},
-    }
-
-
-def wallclock_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Time until 99 % of the episodes of an evaluation inside the run succeeded, per seed that came so far; its success
-    over the worlds of the final evaluation and what the run took.
-    """
-    device = runs[0]["device"]
-    times = [next((m["wall_s"] for m in one["metrics"] if m.get("eval/success", 0.0) >= 0.99), None) for one in runs]
-    reached = [time for time in times if time is not None]
-    success = {**figure([one["policy"]["success"] for one in runs], "share", device),
-               "episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs]}  # fmt: skip
-    return {
-        **({"time_to_99_s": figure(reached, "s", device)} if reached else {}),
-        "wallclock_success": success,
-        "wallclock_training_s": figure([training_s(one) for one in runs], "s", device),
-        **{f"wallclock_{name}": entry for name, entry in sight_figures(runs).items()},
-    }
-
-
-def is_corridor(run: dict[str, Any]) -> bool:
-    """Whether a run was in the corridor."""
-    return "box_x" in run["task"]
-
-
-def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Success and collisions of each seed over unseen randomised episodes, its proofs of sight and wall-clock."""
-    device = runs[0]["device"]
-    alone = [training_s(one) for one in runs if "together" not in one]
-    episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": runs[0]["env_steps"],
-                "updates": runs[0]["updates"]}  # fmt: skip
-    return {
-        "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},
-        "collisions": {**figure([one["policy"]["collision"] for one in runs], "share", device), **episodes},
-        **sight_figures(runs),
-        **({"wallclock_s": figure(alone, "s", device)} if alone else {}),
-    }
-
-
-def sight_figures(runs: list[dict[str, Any]], suffix: str = "") -> dict[str, Any]:
-    """Success of each seed without sight: the best of the three kinds, and each kind."""
-    seeing = [one for one in runs if "sight" in one]
-    if not seeing:
-        return {}
-    device = seeing[0]["device"]
-    kinds = {f"blinded_{kind}_success{suffix}": figure([one["sight"][kind] for one in seeing], "share", device)
-             for kind in BLIND}
-    best = [max(one["sight"].values()) for one in seeing]
-    return {f"blinded_success{suffix}": figure(best, "share", device), **kinds}
-
-
-def training_s(run: dict[str, Any]) -> float:
-    """Seconds of training, compilation and evaluations inside the run included."""
-    return run["metrics"][-1]["wall_s"]
-
-
-def first_sign(run: dict[str, Any]) -> float:
-    """Minutes until an evaluation inside the run first succeeded in 30 % more episodes than a random policy."""
-    threshold = run["random"]["success"] + 0.3
-    times = (m["wall_s"] / 60 for m in run["metrics"] if m.get("eval/success", 0) > threshold)
-    return next(times, training_s(run) / 60)  # never: the whole run
-
-
-def paper_figures(runs: list[dict[str, Any]], layout: str) -> dict[str, Any]:
-    """Evaluation return from 18,000 control steps on, arrival time and wall-clock, per seed."""
-    device = runs[0]["device"]
-    late = [[m for m in one["metrics"] if m["env_steps"] >= 17_900 and "eval/return" in m] for one in runs]
-    returns = [statistics.median(m["eval/return"] for m in ms) for ms in late]
-    arrivals = [m["eval/arrival_s"] for ms in late for m in ms if "eval/arrival_s" in m]
-    suffix = "" if layout == "randomised" else "_fixed"
-    arrival = {f"arrival_s_at_18000{suffix}": figure(arrivals, "s", device)} if arrivals else {}  # none: never arrived
-    alone = [training_s(one) for one in runs if "together" not in one]
-    return {
-        **arrival,
-        f"return_at_18000_median{suffix}": figure(returns, "-", device),
-        f"return_at_18000_worst{suffix}": {**figure(returns, "-", device), "value": min(returns)},
-        f"success_at_22000{suffix}": figure([one["policy"]["success"] for one in runs], "share", device),
-        **sight_figures(runs, suffix),
-        **({f"wallclock_s{suffix}": figure(alone, "s", device)} if alone else {}),
-    }
-
-
-def draw(runs: list[dict[str, Any]], path: Path) -> None:
-    """Evaluation return and success of every seed."""
-    try:
-        import matplotlib
-    except ImportError:
-        return
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure_, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 6), layout="constrained")
-    for one in runs:
-        repeat = one["task"]["action_repeat"]
-        points = [(m["env_steps"] * repeat, m["eval/return"], m["eval/success"]) for m in one["metrics"]
-                  if "eval/return" in m]
-        steps, returns, success = zip(*points, strict=True)
-        axes[0].plot(steps, returns, "o-", markersize=3, label=f"seed {one['seed']}")
-        axes[1].plot(steps, success, "o-", markersize=3)
-    axes[0].set_ylabel("evaluation return")
-    axes[1].set_ylabel("evaluation success")
-    axes[1].set_xlabel("control steps (0.1 s), summed over instances")
-    axes[0].legend(fontsize=8)
-    for one_axes in axes:
-        one_axes.grid(alpha=0.3)
-    figure_.savefig(path, dpi=130)
-    plt.close(figure_)
 
 
 def planner(options: argparse.Namespace) -> None:

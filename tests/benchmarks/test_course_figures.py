@@ -1,0 +1,66 @@
+"""Which figures `benchmarks.course` makes of finished and of stopped trainings."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks.course_figures import groups, load_run
+
+COURSE, CORRIDOR = {"action_repeat": 1}, {"action_repeat": 1, "box_x": 2.5}
+
+
+def write_run(path, successes, preset="wallclock", learner="ppo", task=COURSE, note=None):
+    """A run's folder as it was left with these evaluations, one a minute and 1000 steps."""
+    path.mkdir(parents=True)
+    lines = [{"env_steps": 1000 * n, "updates": n, "wall_s": 60.0 * n, "eval/success": share,
+              "eval/return": 200 * share, "eval/collision": 1 - share} for n, share in enumerate(successes, 1)]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [{"env_steps": 1}, *lines]))
+    command = {"preset": preset, "layout": "randomised", "seed": 3, "learner": learner}
+    (path / "run.json").write_text(json.dumps({"command": command, "preset": {"task": task, "eval_episodes": 1000}}))
+    if note is not None:
+        (path / "course.json").write_text(json.dumps({**command, "device": "X", "task": task, **note}))
+    return path
+
+
+@pytest.mark.quick
+def test_the_time_to_99_percent_is_that_of_the_first_such_evaluation(tmp_path):
+    note = {"policy": {"success": 0.97, "episodes": 500}, "env_steps": 4000}
+    run = load_run(write_run(tmp_path / "0", [0.5, 0.99, 0.98, 1.0], note=note))
+    [(name, [_], figures)] = groups([run])
+    assert name == "course_wallclock_randomised_ppo"
+    assert figures["time_to_99_s_ppo"]["value"] == 120.0
+    assert figures["wallclock_success_ppo"]["value"] == 0.97  # of the final evaluation, not of one inside the run
+    assert figures["wallclock_training_s_ppo"]["value"] == 240.0
+
+
+@pytest.mark.quick
+def test_a_run_that_never_reached_99_percent_has_no_time_to_it(tmp_path):
+    [(_, _, figures)] = groups([load_run(write_run(tmp_path / "0", [0.5, 0.98], learner="dreamer"), "X")])
+    assert "time_to_99_s_stopped" not in figures
+    success = figures["wallclock_success_stopped"]
+    assert (success["value"], success["episodes"], success["env_steps"]) == (0.98, 1000, [2000])
+
+
+@pytest.mark.quick
+def test_learners_worlds_and_stopped_runs_are_told_apart(tmp_path):
+    note = {"policy": {"success": 1.0, "collision": 0.0, "episodes": 500}, "env_steps": 2000, "updates": 2}
+    whole = load_run(write_run(tmp_path / "0", [1.0], note=note))
+    stopped = load_run(write_run(tmp_path / "1", [1.0]), "X")
+    corridor = load_run(write_run(tmp_path / "2", [0.9], "paper", "dreamer", CORRIDOR), "X")
+    found = {name: figures for name, _, figures in groups([whole, stopped, corridor])}
+    baseline = "course_wallclock_randomised_ppo"
+    assert set(found) == {baseline, f"{baseline}_stopped", "corridor_stopped"}
+    assert found["corridor_stopped"]["collisions_stopped"]["value"] == pytest.approx(0.1)
+
+
+@pytest.mark.quick
+def test_runs_that_cannot_be_recorded_are_refused(tmp_path):
+    path = write_run(tmp_path / "0", [0.5], "paper", "dreamer")
+    with pytest.raises(ValueError, match=r"has no course.json.*--device"):
+        load_run(path)
+    with pytest.raises(ValueError, match=r"seed 3 of the preset paper was stopped.*ablation"):
+        list(groups([load_run(path, "X")]))
+    with pytest.raises(ValueError, match="stopped before its first evaluation"):
+        load_run(write_run(tmp_path / "1", []), "X")
