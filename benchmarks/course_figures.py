@@ -119,8 +119,8 @@ def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Success and collisions of each seed over unseen randomised episodes, its proofs of sight and wall-clock."""
     device = runs[0]["device"]
     alone = [training_s(one) for one in runs if "together" not in one]
-    episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": runs[0]["env_steps"],
-                "updates": runs[0]["updates"]}  # fmt: skip
+    episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs],
+                "updates": [one["updates"] for one in runs]}  # fmt: skip
     return {
         "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},
         "collisions": {**figure([one["policy"]["collision"] for one in runs], "share", device), **episodes},
