@@ -28,7 +28,7 @@ train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 15
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30
 
 test-quick: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick

@@ -82,7 +82,7 @@ def test_what_devices_send_each_other_is_read_from_the_program():
 
 def test_a_block_on_two_devices_makes_the_updates_that_it_counts():
     flags = "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}"}
     command = [sys.executable, "-c", TWO_DEVICES]
     answer = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr[-3000:]

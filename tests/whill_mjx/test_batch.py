@@ -117,7 +117,7 @@ def test_the_same_key_gives_the_same_worlds(batch):
 
 def test_devices_step_their_own_instances_and_give_what_one_device_gives():
     flags = "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}"}
     command = [sys.executable, "-c", TWO_DEVICES]
     answer = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr[-3000:]
