@@ -101,10 +101,12 @@ def wallclock_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     times = [next((m["wall_s"] for m in one["metrics"] if m.get("eval/success", 0.0) >= 0.99), None) for one in runs]
     reached = [time for time in times if time is not None]
     success = {**figure([one["policy"]["success"] for one in runs], "share", device),
-               "episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs]}  # fmt: skip
+               "episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs],
+               "evaluations": [evaluations(one) for one in runs]}  # fmt: skip
     return {
         **({"time_to_99_s": figure(reached, "s", device)} if reached else {}),
         "wallclock_success": success,
+        "wallclock_return": figure([one["policy"]["return"] for one in runs], "-", device),
         "wallclock_training_s": figure([training_s(one) for one in runs], "s", device),
         **{f"wallclock_{name}": entry for name, entry in sight_figures(runs).items()},
     }
@@ -120,7 +122,8 @@ def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     device = runs[0]["device"]
     alone = [training_s(one) for one in runs if "together" not in one]
     episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs],
-                "updates": [one["updates"] for one in runs]}  # fmt: skip
+                "updates": [one["updates"] for one in runs],
+                "evaluations": [evaluations(one) for one in runs]}  # fmt: skip
     return {
         "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},
         "collisions": {**figure([one["policy"]["collision"] for one in runs], "share", device), **episodes},
@@ -139,6 +142,13 @@ def sight_figures(runs: list[dict[str, Any]], suffix: str = "") -> dict[str, Any
              for kind in BLIND}
     best = [max(one["sight"].values()) for one in seeing]
     return {f"blinded_success{suffix}": figure(best, "share", device), **kinds}
+
+
+def evaluations(run: dict[str, Any]) -> list[dict[str, float]]:
+    """The evaluations inside a run: steps, seconds since its start, success and, where any arrived, when."""
+    names = {"env_steps": "env_steps", "wall_s": "wall_s", "eval/success": "success", "eval/arrival_s": "arrival_s"}
+    return [{short: line[name] for name, short in names.items() if name in line}
+            for line in run["metrics"] if "eval/success" in line]  # fmt: skip
 
 
 def training_s(run: dict[str, Any]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections.abc import Iterable
@@ -104,6 +105,11 @@ def write_csv(path: Path, header: str, table: np.ndarray) -> None:
 def write_json(path: Path, content: Any, allow_nan: bool = True) -> None:
     """Write JSON, whole or not at all; ValueError for what is no finite number, if `allow_nan` is not set."""
     write_text(path, json.dumps(content, indent=1, allow_nan=allow_nan) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """A dataclass as JSON data; what JSON does not know becomes its text."""
+    return json.loads(json.dumps(dataclasses.asdict(value), default=str))
 
 
 def write_text(path: Path, text: str) -> None:

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 import tyro
 
-from whill_mjx.dataset import write_json
+from whill_mjx.dataset import plain, write_json
 from whill_mjx.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.env import make_env
 from whill_mjx.evaluation import NEAR_M, Course, Episodes, episode_keys, summarise
@@ -116,8 +116,8 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
         evaluation = {
             "policy": options.policy,
             "sha256": policy.sha256 if policy else None,
-            "task": {"name": getattr(task, "name", ""), **_plain(task)},
-            "options": _plain(options),
+            "task": {"name": getattr(task, "name", ""), **plain(task)},
+            "options": plain(options),
             "device": f"{jax.devices()[0].platform}: {jax.devices()[0].device_kind}",
             "drivers": summaries,
             "sweeps": [result.plain() for result in results],
@@ -279,11 +279,6 @@ def _named(text: str) -> tuple[str, str]:
     if not equals or not name or not value:
         raise ValueError(f"{text!r} is not NAME=VALUE. Write it so (a baseline may also be one of {SCRIPTED}).")
     return name, value
-
-
-def _plain(value: Any) -> Any:
-    """A dataclass as JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(value), default=str))
 
 
 if __name__ == "__main__":

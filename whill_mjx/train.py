@@ -22,7 +22,7 @@ from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
-from whill_mjx.dataset import write_json, write_text
+from whill_mjx.dataset import plain, write_json, write_text
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.drivers import planner_driver, random_driver
 from whill_mjx.evaluation import Course, episode_keys
@@ -128,7 +128,7 @@ def main(options: TrainOptions) -> dict[str, Any]:
     options.out.mkdir(parents=True, exist_ok=True)
     vehicle = options.out / "vehicle.toml"
     if parallel.is_first_process():
-        write_json(options.out / RUN_FILE, {"command": _plain(options), "preset": _plain(preset)})
+        write_json(options.out / RUN_FILE, {"command": plain(options), "preset": plain(preset)})
         prepare_vehicle(options)
     parallel.agree(True)  # the others wait for the vehicle file
     result = train_policy(options, preset, vehicle) if options.learner == "dreamer" else train_baseline(
@@ -396,7 +396,7 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
         )
     except ImportError as error:
         say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
-    return {"task": _plain(preset.task), "learner": options.learner, "seed": options.seed,
+    return {"task": plain(preset.task), "learner": options.learner, "seed": options.seed,
             "env_steps": result.env_steps, "updates": result.updates, **summary}
 
 
@@ -425,11 +425,6 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
 def say(text: str) -> None:
     """Tell the user how far the run is."""
     print(text, file=sys.stderr, flush=True)
-
-
-def _plain(value: Any) -> Any:
-    """A dataclass as JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(value), default=str))
 
 
 if __name__ == "__main__":

@@ -26,13 +26,15 @@ def write_run(path, successes, preset="wallclock", learner="ppo", task=COURSE, n
 
 @pytest.mark.quick
 def test_the_time_to_99_percent_is_that_of_the_first_such_evaluation(tmp_path):
-    note = {"policy": {"success": 0.97, "episodes": 500}, "env_steps": 4000}
+    note = {"policy": {"success": 0.97, "return": 210.0, "episodes": 500}, "env_steps": 4000}
     run = load_run(write_run(tmp_path / "0", [0.5, 0.99, 0.98, 1.0], note=note))
     [(name, [_], figures)] = groups([run])
     assert name == "course_wallclock_randomised_ppo"
     assert figures["time_to_99_s_ppo"]["value"] == 120.0
     assert figures["wallclock_success_ppo"]["value"] == 0.97  # of the final evaluation, not of one inside the run
     assert figures["wallclock_training_s_ppo"]["value"] == 240.0
+    second = figures["wallclock_success_ppo"]["evaluations"][0][1]
+    assert second == {"env_steps": 2000, "wall_s": 120.0, "success": 0.99}
 
 
 @pytest.mark.quick
@@ -45,7 +47,7 @@ def test_a_run_that_never_reached_99_percent_has_no_time_to_it(tmp_path):
 
 @pytest.mark.quick
 def test_learners_worlds_and_stopped_runs_are_told_apart(tmp_path):
-    note = {"policy": {"success": 1.0, "collision": 0.0, "episodes": 500}, "env_steps": 2000, "updates": 2}
+    note = {"policy": {"success": 1.0, "return": 220.0, "episodes": 500}, "env_steps": 2000}
     whole = load_run(write_run(tmp_path / "0", [1.0], note=note))
     stopped = load_run(write_run(tmp_path / "1", [1.0]), "X")
     corridor = load_run(write_run(tmp_path / "2", [0.9], "paper", "dreamer", CORRIDOR), "X")
