@@ -8,7 +8,6 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import time
