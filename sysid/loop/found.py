@@ -36,6 +36,8 @@ class Thresholds:
     """Least further share of the excess that it explains."""
     own: float = 0.3
     """Least share of what the effects before it left that a smaller one must explain."""
+    rest: float = 0.9
+    """The same from which no more is asked of one that is needed beside them: what mends their form leaves a rest."""
     agree: float = 0.6
     """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
     of it, at which it is there for its own sake."""

@@ -69,7 +69,7 @@ def search(
         taken_on = likely[0]
         if found.accepted:
             for one in likely:
-                one.own = _own(one, found, explained(current), refitter, evidence.groups, thresholds)
+                one.own = _own(one, found, explained(current), explained, refitter, evidence.groups, thresholds)
                 if one.own:
                     taken_on = one
                     break
@@ -175,18 +175,21 @@ def pair_round(
 
 
 def _own(
-    one: Candidate, found: Search, share: float, refitter: Refitter, groups: Sequence[Sequence[int]],
-    thresholds: Thresholds,
+    one: Candidate, found: Search, share: float, explained: Callable[[Refit], float], refitter: Refitter,
+    groups: Sequence[Sequence[int]], thresholds: Thresholds,
 ) -> bool:
     """Whether a further effect is there for its own sake, however small it is beside the first.
 
-    What mends the form of another effect depends on it: each manoeuvre asks for a size of its own, or alone it is of
-    another size, or gains far more or less. `share` is what the effects before it explain.
+    What mends the form of another effect leaves a rest, for it is no part of that form; and it depends on it: each
+    manoeuvre asks for a size of its own, or alone it is of another size, or gains far more or less. `share` is what the
+    effects before it explain.
     """
     q, left = one.refit.split[-1], 1 - share
     part = slice(len(one.refit.q) - len(q), len(one.refit.q))
     if one.share - share < thresholds.little * left:
         return False
+    if one.share - share >= thresholds.rest * left:  # as long as it does not stand for those before it too
+        return one.share - explained(_alone(one, found, refitter)) >= thresholds.step
     differ = disagreement(one.refit, part, groups, refitter.precision)
     inside = beside(one.refit.products(refitter.precision), len(q))
     size = float(q @ inside @ q)
@@ -198,12 +201,18 @@ def _own(
             return True
     if one.share - share < thresholds.own * left or differ > thresholds.differ:
         return False
-    alone = next((other.refit for other in found.rounds[0] if other.hypothesis.key == one.hypothesis.key), None)
-    if alone is None:
-        [alone] = refitter.fit_all([Start((one.hypothesis,), found.base.u, q)], POLISH)
+    alone = _alone(one, found, refitter)
     change = alone.q - q
     return (float(change @ inside @ change) <= thresholds.agree**2 * size
             and _within((found.base.cost - alone.cost) / one.gain, thresholds.alone))
+
+
+def _alone(one: Candidate, found: Search, refitter: Refitter) -> Refit:
+    """The fit of an effect without those before it."""
+    alone = next((other.refit for other in found.rounds[0] if other.hypothesis.key == one.hypothesis.key), None)
+    if alone is None:
+        [alone] = refitter.fit_all([Start((one.hypothesis,), found.base.u, one.refit.split[-1])], POLISH)
+    return alone
 
 
 def _most_apart(fit: Refit, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:

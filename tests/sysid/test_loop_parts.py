@@ -67,7 +67,22 @@ def test_a_small_second_effect_is_one_that_manoeuvres_agree_on(sizes, own):
     fit, groups, gain = joint_fit(sizes)
     one = Candidate(SimpleNamespace(key="second"), gain, 0.0, 0.6, fit)
     refitter = SimpleNamespace(precision=np.eye(1))
-    assert _own(one, SimpleNamespace(rounds=[[]]), 0.5, refitter, groups, Thresholds()) is own
+    assert _own(one, SimpleNamespace(rounds=[[]]), 0.5, None, refitter, groups, Thresholds()) is own
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("share", "alone", "own"), [
+    (0.99, 0.3, True),  # all that the first left, and the first is needed beside it
+    (0.85, 0.3, False),  # manoeuvres do not agree, and a rest stays
+    (0.99, 0.9, False),  # it stands for the first too
+])  # fmt: skip
+def test_a_second_effect_that_leaves_nothing_is_there_though_manoeuvres_differ_on_its_size(share, alone, own):
+    fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
+    one = Candidate(SimpleNamespace(key="second"), gain, 0.0, share, fit)
+    by_itself = Candidate(SimpleNamespace(key="second"), gain, 0.0, alone, fit)
+    found = SimpleNamespace(rounds=[[by_itself]], base=fit)
+    refitter = SimpleNamespace(precision=np.eye(1))
+    assert _own(one, found, 0.5, lambda refit: alone, refitter, groups, Thresholds()) is own
 
 
 @pytest.mark.quick
