@@ -30,7 +30,7 @@ from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
 from whill_mjx.dataset import write_json
-from whill_mjx.train import TrainOptions, main, mean_figures
+from whill_mjx.train import TrainOptions, main, mean_figures, preset_name
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
 CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
@@ -39,17 +39,18 @@ CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; 
 
 def run(options: argparse.Namespace) -> None:
     """One training of the main command with its proofs of sight; notes device and settings beside its results."""
+    preset = preset_name(options.preset)
     result = main(
         TrainOptions(
-            out=options.out, vehicle=options.vehicle, task=options.task, preset=options.preset, layout=options.layout,
+            out=options.out, vehicle=options.vehicle, task=options.task, preset=preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
             action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
             instances=options.instances, eval_every=options.eval_every,
-            export="best" if options.preset == "cpu" else "last",
+            export="best" if preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
         )
     )  # fmt: skip
-    note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": options.seed}
+    note = {"device": device_name(), "preset": preset, "layout": options.layout, "seed": options.seed}
     if options.beside:
         note["together"] = 1 + options.beside
     write_json(options.out / "course.json", {**note, **result})

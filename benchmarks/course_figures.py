@@ -30,18 +30,18 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
         return {**json.loads((path / "course.json").read_text()), "metrics": metrics}
     if device is None:
         raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
-    content: dict[str, Any] = {"device": device, "preset": "paper", "together": 2, "metrics": metrics}
+    begun = json.loads((path / "run.json").read_text())
+    told = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
+    content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **told}
     if (path / "evaluation.json").exists():
-        left = json.loads((path / "evaluation.json").read_text())
-        return {**content, "layout": left["task"]["layout"], **left}
+        return {**content, **json.loads((path / "evaluation.json").read_text())}
     evaluated = [line for line in metrics if "eval/success" in line]
     if not evaluated:
         raise ValueError(f"{path}: was stopped before its first evaluation. Give its command again, or leave it out.")
-    begun, last = json.loads((path / "run.json").read_text()), evaluated[-1]
-    told = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
+    last = evaluated[-1]
     policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
     return {
-        **content, **told, "stopped": True, "task": begun["preset"]["task"], "env_steps": last["env_steps"],
+        **content, "stopped": True, "task": begun["preset"]["task"], "env_steps": last["env_steps"],
         "updates": last["updates"], "policy": {**policy, "episodes": begun["preset"]["eval_episodes"]},
     }  # fmt: skip
 
@@ -53,7 +53,7 @@ def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any
     _stopped.
 
     Raises:
-        ValueError: a run of the course that has to be whole was stopped.
+        ValueError: a run of the course that has to be whole was stopped, or its preset has no figures.
     """
     kinds: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for one in runs:
@@ -71,8 +71,10 @@ def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any
             )
         elif preset == "paper":
             found = paper_figures(mine, layout)
+        elif preset in ("cpu", "wallclock"):
+            found = cpu_figures(mine) if preset == "cpu" else wallclock_figures(mine)
         else:
-            found = {"cpu": cpu_figures, "wallclock": wallclock_figures}[preset](mine)
+            raise ValueError(f"seed {mine[0]['seed']}: trainings of the preset {preset} have no figures. Leave it out.")
         group = f"corridor{ending}" if world == "corridor" else f"course_{preset}_{layout}{ending}"
         yield group, mine, {f"{name}{ending}": entry for name, entry in found.items()}
 

@@ -157,10 +157,16 @@ def main(options: TrainOptions) -> dict[str, Any]:
     return evaluation
 
 
+def preset_name(name: str) -> str:
+    """The name of a preset, "auto" being that of the device."""
+    if name != "auto":
+        return name
+    return "cpu" if jax.devices()[0].platform == "cpu" else "paper"
+
+
 def choose_preset(options: TrainOptions) -> Preset:
     """The preset with the options' changes put in."""
-    on_cpu = jax.devices()[0].platform == "cpu"
-    name = options.preset if options.preset != "auto" else ("cpu" if on_cpu else "paper")
+    name = preset_name(options.preset)
     preset = find_preset(name, options.task)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)

@@ -58,11 +58,24 @@ def test_learners_worlds_and_stopped_runs_are_told_apart(tmp_path):
 
 
 @pytest.mark.quick
+def test_a_finished_run_without_a_note_is_that_of_its_final_evaluation(tmp_path):
+    path = write_run(tmp_path / "0", [0.5, 1.0])
+    left = {"policy": {"success": 0.8, "return": 190.0, "episodes": 100}, "env_steps": 2000, "task": COURSE, "seed": 3}
+    (path / "evaluation.json").write_text(json.dumps(left))
+    [(name, _, figures)] = groups([load_run(path, "X")])
+    assert name == "course_wallclock_randomised_ppo"
+    assert (figures["wallclock_success_ppo"]["value"], figures["wallclock_success_ppo"]["device"]) == (0.8, "X")
+
+
+@pytest.mark.quick
 def test_runs_that_cannot_be_recorded_are_refused(tmp_path):
     path = write_run(tmp_path / "0", [0.5], "paper", "dreamer")
     with pytest.raises(ValueError, match=r"has no course.json.*--device"):
         load_run(path)
     with pytest.raises(ValueError, match=r"seed 3 of the preset paper was stopped.*ablation"):
         list(groups([load_run(path, "X")]))
+    note = {"policy": {"success": 0.0}, "env_steps": 1}
+    with pytest.raises(ValueError, match="seed 3: trainings of the preset smoke have no figures"):
+        list(groups([load_run(write_run(tmp_path / "2", [0.5], "smoke", note=note))]))
     with pytest.raises(ValueError, match="stopped before its first evaluation"):
         load_run(write_run(tmp_path / "1", []), "X")
