@@ -33,7 +33,7 @@ from whill_mjx.dataset import write_json
 from whill_mjx.train import TrainOptions, main, mean_figures, preset_name
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
-CLAIM = "DreamerV3 from 64x64 RGB on the obstacle course; every seed listed in repeats"
+CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
 
 

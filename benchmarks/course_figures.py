@@ -32,6 +32,7 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
         raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
     begun = json.loads((path / "run.json").read_text())
     told = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
+    told["exploring_starts"] = begun["preset"]["exploring_starts"]
     content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **told}
     if (path / "evaluation.json").exists():
         return {**content, **json.loads((path / "evaluation.json").read_text())}
@@ -47,7 +48,7 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
 
 
 def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]], dict[str, Any]]]:
-    """Trainings that differ in their seed alone: a name for them, these, and their figures.
+    """Trainings of one preset, layout and learner: a name for them, these, and their figures.
 
     Figures of other presets, layouts and learners than the usual have other names; those of stopped runs end in
     _stopped.
@@ -104,6 +105,8 @@ def wallclock_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     reached = [time for time in times if time is not None]
     success = {**figure([one["policy"]["success"] for one in runs], "share", device),
                "episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs],
+               "seeds": [one["seed"] for one in runs],
+               "exploring_starts": [one.get("exploring_starts") for one in runs],
                "evaluations": [evaluations(one) for one in runs]}  # fmt: skip
     return {
         **({"time_to_99_s": figure(reached, "s", device)} if reached else {}),
@@ -199,7 +202,9 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
         points = [(m["env_steps"] * repeat, m["eval/return"], m["eval/success"]) for m in one["metrics"]
                   if "eval/return" in m]
         steps, returns, success = zip(*points, strict=True)
-        axes[0].plot(steps, returns, "o-", markersize=3, label=f"seed {one['seed']}")
+        starts = one.get("exploring_starts")
+        label = f"seed {one['seed']}" + ("" if starts is None else f", exploring starts {starts:g}")
+        axes[0].plot(steps, returns, "o-", markersize=3, label=label)
         axes[1].plot(steps, success, "o-", markersize=3)
     axes[0].set_ylabel("evaluation return")
     axes[1].set_ylabel("evaluation success")

@@ -71,9 +71,17 @@ def record(stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Pa
 def provenance() -> dict[str, Any]:
     """Command, versions, commit and date of what is running."""
     versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
-    arguments = [os.path.relpath(word) if os.path.isabs(word) else word for word in sys.argv[1:]]
-    return {"command": " ".join(["python", "-m", _module_name(), *arguments]), "versions": versions,
+    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "versions": versions,
             "commit": _commit(), "date": datetime.date.today().isoformat()}
+
+
+def told(word: str) -> str:
+    """An argument as results tell it: of an absolute path what lies inside the tree, else the name alone, since where a
+    machine keeps it says nothing."""
+    if not os.path.isabs(word):
+        return word
+    path, root = Path(os.path.abspath(word)), RESULTS.parent.parent
+    return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
 
 
 def _module_name() -> str:

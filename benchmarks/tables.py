@@ -58,8 +58,6 @@ HEADLINES = (  # file, figure, factor, what it says
     ("learner", "updates_per_s_12m", 1.0, "DreamerV3 updates/s, size12m, batch 16 x 64"),
     ("learner", "peer_updates_per_s_12m", 1.0, "the same of SheepRL, through torch.compile (another run)"),
     ("course", "success_at_22000", 100.0, "% success in new worlds after the paper's 22,000 steps (median of 5 seeds)"),
-    ("course", "time_to_99_s_ppo_stopped", 1.0,
-     "s, compilation included, until PPO with 2,048 chairs succeeded in 99 % of 1,000 new worlds (two runs)"),
     ("dreamer_control", "balance_image_size12m_return", 1.0,
      "of 1,000: balancing a cart-pole from pixels, 100,000 steps (median of 3 seeds)"),
     ("course", "cpu_success", 100.0, "% success on the easier course of two CPU cores (median of 3 seeds)"),

@@ -18,7 +18,8 @@ def write_run(path, successes, preset="wallclock", learner="ppo", task=COURSE, n
               "eval/return": 200 * share, "eval/collision": 1 - share} for n, share in enumerate(successes, 1)]
     (path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [{"env_steps": 1}, *lines]))
     command = {"preset": preset, "layout": "randomised", "seed": 3, "learner": learner}
-    (path / "run.json").write_text(json.dumps({"command": command, "preset": {"task": task, "eval_episodes": 1000}}))
+    chosen = {"task": task, "eval_episodes": 1000, "exploring_starts": 0.5}
+    (path / "run.json").write_text(json.dumps({"command": command, "preset": chosen}))
     if note is not None:
         (path / "course.json").write_text(json.dumps({**command, "device": "X", "task": task, **note}))
     return path
@@ -43,6 +44,7 @@ def test_a_run_that_never_reached_99_percent_has_no_time_to_it(tmp_path):
     assert "time_to_99_s_stopped" not in figures
     success = figures["wallclock_success_stopped"]
     assert (success["value"], success["episodes"], success["env_steps"]) == (0.98, 1000, [2000])
+    assert (success["seeds"], success["exploring_starts"]) == ([3], [0.5])
 
 
 @pytest.mark.quick
