@@ -51,6 +51,8 @@ class Benchmark:
     reference_sets: int = 1
     """Sets of reference days that these are judged against in turn; all else is judged against the first. With as many
     sets as there are processes (`part`), each makes one."""
+    own_sets: int = 0
+    """Further logs with nothing in them, each judged against a set of its own: their p-values are independent."""
     base: bool = False
     """Logs of the contact plant with one effect each, from its base size to the one that is noticed with 80 % power."""
     scales: tuple[float, ...] = ()
@@ -76,6 +78,8 @@ class Benchmark:
     """Simulated days that are refitted meanwhile."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
+    calibrate: bool = False
+    """Fit what p-values come to where nothing is missing, on half of the sets, into sysid/data/null_p.json."""
     collect: bool = False
     """Only write the figures from the verdicts that are there."""
     work: Path = Path("runs/undeclared")
@@ -93,12 +97,14 @@ def main(settings: Benchmark) -> None:
     """Run what was asked for."""
     if settings.shared:
         shared(settings)
-    if settings.nulls or settings.base or settings.scales or settings.pairs or settings.left_out:
+    if settings.nulls or settings.own_sets or settings.base or settings.scales or settings.pairs or settings.left_out:
         plant(settings)
     if settings.speed:
         contact.speed(settings.work / "plant", settings.refit_nulls)
     if settings.classes:
         look_alikes(settings)
+    if settings.calibrate:
+        undeclared_figures.calibrate(settings.work / "plant")
     if settings.collect:
         undeclared_figures.figures(settings.work / "plant", settings.driven)
 
@@ -147,6 +153,7 @@ def plant(settings: Benchmark) -> None:
 
     nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
     judge(sorted(nulls, key=lambda job: job.reference))
+    judge(contact.own_set_jobs(settings.own_sets, part))
     while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
     if settings.scales:

@@ -47,6 +47,8 @@ SURE = 4
 """Logs at up to `BESIDE`^2 times a size that must all have stood out where it does."""
 BRACKET = 1.3
 """Factor between a size that does not stand out enough and one that does at which they are close enough."""
+OWN_SET, OWN_SEED = 100, 25000
+"""Number of the first set of reference days that one log alone is judged against, and the seed of that log."""
 REACH = 100.0
 """Factor on the base size, up or down, beyond which no size is tried."""
 
@@ -88,6 +90,11 @@ def _dealt(null: int, sets: int, part: str) -> int:
     number = null % sets
     sharing = len(range(number, int(count), sets))  # processes that can have this set for their only one
     return number + sets * (null // sets % sharing) if sharing else number
+
+
+def own_set_jobs(count: int, part: str) -> list[Job]:
+    """Logs with nothing in them, each against a set of reference days that no other log is judged against."""
+    return [Job(f"null_own_{n:03d}", {}, OWN_SEED + n, reference=OWN_SET + n) for n in range(count) if mine(n, part)]
 
 
 def probe_jobs(work: Path, part: str, only: Sequence[str] = ()) -> list[Job]:

@@ -13,7 +13,8 @@
     by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
                       (`sysid.loop.changes`)
     worse             those of these rows whose error surely grew
-    missing           p-value of "nothing is missing"; that of the scan of pairs; squared residual in excess of the
+    missing           p-value of "nothing is missing", against reference days calibrated (`sysid.loop.calibrated`), and
+                      `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
                       noise, as a share of it, before and after; share of it explained; of simulated days that were
                       refitted (`--refit-nulls`, else null) count, calibrated p-value, false alarms and the upper 95 %
                       bound of their rate
@@ -45,6 +46,7 @@ import numpy as np
 
 from sysid.log import Trial
 from sysid.loop.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
+from sysid.loop.calibrated import calibrated
 from sysid.loop.catalogue import Hypothesis, base_values
 from sysid.loop.changes import by_manoeuvre, worse
 from sysid.loop.evidence import Evidence, at_fit
@@ -100,7 +102,8 @@ def make_report(result: Result) -> dict[str, Any]:
         "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
         "by_manoeuvre": moved, "worse": worse(moved), "operating": operating(result, days),
         "contradicted": contradicted(result), "pairs": pairs_of(result),
-        "missing": {"p_value": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
+        "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
+                    "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
                     "excess_before": found.excess[0],
                     "excess_after": found.excess[1], "explained": found.share,
                     "null_refits": None if nulls is None else {

@@ -236,3 +236,18 @@ def test_the_size_of_one_effect_alone_is_looked_for_and_the_others_stay(tmp_path
         return [row for row in content["confusion"] if not (row["stage"] == "base" and "slope" in row["truth"])]
 
     assert others(after) == others(recorded)
+
+
+@pytest.mark.quick
+def test_an_effect_that_the_catalogue_has_by_another_name_is_right_by_that_name():
+    def verdict(*names):
+        return {"verdict": "named" if names else "unexplained", "effects": [{"class": list(names)}]} | (
+            {} if names else {"effects": []})
+
+    assert undeclared_figures.said("gain_fade", verdict("supply_sag"))
+    assert not undeclared_figures.said("gain_fade", verdict("traction_limit"))
+    assert not undeclared_figures.said("supply_sag", verdict("gain_fade"))
+    warned = {"excess": [1.0, 0.0], "excess_limit": 0.1}
+    found = undeclared_figures.of_singles([("gain_fade", verdict("supply_sag") | warned), ("warm_up", verdict())], "")
+    assert found["class_accuracy"]["value"] == 1.0 and found["class_accuracy"]["unit"] == "share of 1 logs"
+    assert found["out_of_catalogue"]["unit"].startswith("share of 1 logs")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from scipy import stats
 
 pytest.importorskip("mujoco")
 
@@ -12,6 +15,7 @@ from benchmarks import undeclared, undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
 from benchmarks import undeclared_reference as days  # noqa: E402
 from sysid.close_loop import LoopConfig  # noqa: E402
+from sysid.loop import calibrated  # noqa: E402
 
 pytestmark = pytest.mark.quick
 
@@ -87,6 +91,46 @@ def test_a_process_makes_only_the_sets_of_its_own_nulls(tmp_path, monkeypatch):
     assert len(judged) == 12 and all(one == ready for one, ready in judged)
 
 
-def test_the_uniformity_of_nulls_says_over_how_many_sets_it_was_seen():
-    nulls = [{"verdict": "none", "p_value": (i + 0.5) / 40, "reference": i % 4} for i in range(40)]
-    assert undeclared_figures.of_nulls(nulls)["null_ks_p"]["unit"] == "of 40 logs over 4 sets of reference days"
+def nulls_of(p_values, sets):
+    return [{"verdict": "none", "p_value": float(p), "reference": i % sets} for i, p in enumerate(p_values)]
+
+
+def test_uniformity_is_told_of_the_sets_that_did_not_calibrate():
+    skewed = stats.beta.ppf((np.arange(200) + 0.5) / 200, *calibrated.shape())  # uniform when calibrated
+    even, odd = np.full(200, 1e-3), skewed
+    found = undeclared_figures.of_nulls(nulls_of(np.stack([even, odd], 1).ravel(), 4))
+    assert found["null_ks_p"]["unit"] == "of 200 logs over 2 sets of reference days"
+    assert found["null_ks_p"]["value"] > 0.9 > 0.05 > found["null_ks_p_uncalibrated"]["value"]
+    assert found["false_alarms"]["unit"] == "of 400 logs with nothing in them"
+
+
+def test_calibration_finds_the_distribution_that_p_values_follow(tmp_path, monkeypatch):
+    monkeypatch.setattr(undeclared_figures, "FILE", tmp_path / "null_p.json")
+    monkeypatch.setattr(calibrated, "FILE", tmp_path / "null_p.json")
+    for folder in ("verdicts", "truth"):
+        (tmp_path / folder).mkdir()
+    drawn = np.random.default_rng(5).beta(0.6, 0.8, 600)
+    for i, one in enumerate(nulls_of(drawn, 6)):
+        (tmp_path / "truth" / f"null_{i}.json").write_text("{}")
+        (tmp_path / "verdicts" / f"null_{i}.json").write_text(json.dumps(one))
+    undeclared_figures.calibrate(tmp_path)
+    calibrated.shape.cache_clear()
+    try:
+        assert calibrated.shape() == pytest.approx((0.6, 0.8), rel=0.2)
+        assert stats.kstest([calibrated.calibrated(p) for p in drawn[1::2]], "uniform").pvalue > 0.05
+        assert stats.kstest(drawn[1::2], "uniform").pvalue < 1e-3
+    finally:
+        calibrated.shape.cache_clear()
+
+
+def test_calibration_asks_for_enough_logs(tmp_path):
+    with pytest.raises(SystemExit, match="0 logs with nothing in them, judged against sets 0, 2, 4 .*; 30 are needed"):
+        undeclared_figures.calibrate(tmp_path)
+
+
+def test_logs_with_sets_of_their_own_share_neither_set_nor_seed_with_others():
+    own, dealt = contact.own_set_jobs(60, "1/1"), contact.null_jobs(200, "1/1", 44)
+    assert len({job.reference for job in own}) == len({job.seed for job in own}) == 60
+    assert not {job.reference for job in own} & {job.reference for job in dealt}
+    assert not {job.seed for job in own} & {job.seed for job in dealt}
+    assert [job for part in ("1/2", "2/2") for job in contact.own_set_jobs(4, part)] == [own[0], own[2], own[1], own[3]]

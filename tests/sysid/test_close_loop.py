@@ -221,6 +221,7 @@ def test_the_report_says_what_a_named_effect_stood(sloping):
     assert "holds" in {one["outcome"] for one in evidence["falsifiers"]}  # it changes sign with the heading
     assert evidence["left_out_total"] > 0 and evidence["heterogeneity"]["manoeuvres"] >= 2
     assert not report["contradicted"] and report["missing"]["p_pairs"] < 0.01
+    assert 0 <= report["missing"]["p_search"] < report["missing"]["p_value"] < 0.05
     [power] = report["operating"]["power"]
     assert power["sizes"][-1]["noticed"] > 0.9
     assert report["operating"]["false_alarms"]["rate"] < 0.1

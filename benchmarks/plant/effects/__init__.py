@@ -26,6 +26,8 @@ class Entry:
     """Another law than in the catalogue, or not in it."""
     known: bool = True
     """The catalogue has an effect of this name."""
+    covered: str = ""
+    """Where it has none of this name: its effect that does the same by another law, so that naming it is right."""
     signed: bool = False
     """Sizes below zero make sense."""
     most: float = math.inf
@@ -67,7 +69,7 @@ EFFECTS: dict[str, Entry] = {
     "wheel_ripple": Entry(outside.WheelRipple, 1.0, "N m", known=False),
     "soft_patch": Entry(outside.SoftPatch, 12.0, "N", known=False),
     "warm_up": Entry(outside.WarmUp, 2.0, "N m", known=False),
-    "gain_fade": Entry(actuation.GainFade, 0.2, "-", known=False, most=0.7),
+    "gain_fade": Entry(actuation.GainFade, 0.2, "-", known=False, covered="supply_sag", most=0.7),
     "rest_friction": Entry(outside.RestFriction, 1.5, "N m", known=False),
     "command_coupling": Entry(command.CommandCoupling, 0.04, "-", known=False),
     "command_dropouts": Entry(command.CommandDropouts, 0.08, "-", known=False),
