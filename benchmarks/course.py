@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
             action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
             instances=options.instances, eval_every=options.eval_every,
             export="best" if preset == "cpu" else "last",
-            episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s,
+            episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
         )
     )  # fmt: skip
     note = {"device": device_name(), "preset": preset, "layout": options.layout, "seed": options.seed}
@@ -233,6 +233,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
     one.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
     one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
+    one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
     one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
     one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
     one.set_defaults(call=run)

@@ -44,10 +44,10 @@ from sysid.loop.refit import Refitter
 from sysid.loop.search import search
 from sysid.loop.unexplained import best_gain
 from sysid.loop.wander import Wander, estimate
-from sysid.models import with_effects
+from sysid.models import measured_effects, with_effects
 from sysid.result import Progress
 from sysid.rollout import PathReplay, Plant, vehicle_plant
-from sysid.space import FIXED, make_space
+from sysid.space import FIXED, make_space, searched
 from whill_mjx.config import VehicleConfig
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset_params
@@ -279,15 +279,21 @@ def vehicle_after(result: Result) -> Any:
     return type(moved)(moved.body, tuple(effect for effect in moved.effects if effect.name in kept))
 
 
-def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
+def refit_poses(result: Result, vehicle: Any, iterations: int = 12, beside: bool = True) -> Any:
     """A vehicle refitted to whole poses and speeds, as `sysid.fit` does, from where the search left it.
 
     The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
-    refit may move base parameters and the accepted effects' own, and nothing else.
+    refit may move base parameters and the accepted effects' own, and with `beside` what every fit to poses has besides
+    (`measured_effects`): the search takes their part for the wander of days.
     """
     from sysid.loop.poses import fit_poses
+
+    extra = measured_effects(vehicle, result.log.spec, result.log.training) if beside else ()
+    vehicle = with_effects(vehicle, extra)
     have = describe(vehicle)
     names = list(result.reference.space.names)
+    names += [name for name in searched(vehicle) if name not in names and name not in result.config.held
+              and (name.partition(".")[0] in extra or extra and name == "body.com_z")]
     if result.search.verdict == "named":
         moved = [axis.parameter for one in result.search.final.hypotheses for axis in one.axes]
         names += [name for name in dict.fromkeys(moved) if name in have and name not in names

@@ -23,6 +23,7 @@ from sysid.models import (
     get_parameters,
     load_model,
     make_replay,
+    measured_effects,
     model_space,
     save_model,
     set_parameters,
@@ -39,7 +40,6 @@ from sysid.series import collect, save
 from sysid.space import Space, make_space, searched
 from whill_mjx.config import VehicleConfig
 from whill_mjx.presets import preset_params
-from whill_mjx.specs import VehicleSpec
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
@@ -226,20 +226,6 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
     objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
     return Problem(plant, params, space, objective, intervals, model)
-
-
-def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
-    """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
-
-    Passive wheels resist sideways with their speed, and their axle may pivot: then the driven wheels alone carry what a
-    turn shifts, and brake by it. Soft springs let a vehicle nod, and its wheels turn with that. Readings of the
-    odometry have an age of their own, which shows against an outside pose.
-    """
-    if not any(effect.name == "slip_traction" for effect in params.effects):
-        return ()
-    rolling = ("suspension",) if spec.drive == "skid" else ("axle_pivot", "lateral_damping", "suspension")
-    both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
-    return (*rolling, "sensor_delay") if both else rolling
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:

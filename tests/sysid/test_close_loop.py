@@ -280,7 +280,13 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
         return np.mean([score(trial, prediction)["ground_truth"].trajectory for trial, prediction in pairs])
 
     before = vehicle_before(plain)
-    assert error(refit_poses(plain, before, iterations=4)) < error(before)
+    alone = refit_poses(plain, before, iterations=4, beside=False)
+    assert error(alone) < error(before)
+    beside = refit_poses(plain, before, iterations=4)
+    added = {one.name for one in beside.effects} - {one.name for one in before.effects}
+    assert added == {"axle_pivot", "lateral_damping", "suspension", "sensor_delay"}
+    assert error(beside) < error(alone) and float(beside.body.com_z) != float(before.body.com_z)
+    assert {one.name for one in alone.effects} == {one.name for one in before.effects}
 
 
 def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, sloping):
