@@ -11,6 +11,7 @@ import pytest
 from jax import lax
 
 from dreamer.export import PolicyContract, export_policy, flatten_weights
+from dreamer.network import Network, parity, to_onnx
 
 CONTRACT = PolicyContract(action_low=(0.0, -0.6), action_high=(0.3, 0.6), task="corridor", height=16, width=16)
 DETER, GROUPS, STOCH, CLASSES, HIDDEN, PATCH = 32, 4, 4, 4, 16, 8
@@ -256,3 +257,17 @@ def test_rounding_that_a_recurrent_state_amplifies_is_noted_and_not_refused(tmp_
     path = export_policy(tmp_path / "p", step, {"h": np.zeros((), np.float32)}, {}, CONTRACT, check_steps=150)
     parity = json.loads((path / "policy.json").read_text())["parity"]
     assert parity["max_abs_action_difference"] < 1e-5 < parity["max_abs_action_drift"]
+
+
+def test_a_gpu_that_rounds_by_default_is_no_reason_to_refuse():
+    """The file is compared with JAX at full float32; TF32 and the like round to fewer bits than the check allows."""
+
+    def step(carry, obs, rounded=0.0):
+        return carry, (jnp.tanh(carry["h"]) + rounded + 0.0 * obs["image"][0, 0, 0],)
+
+    def on_a_gpu(carry, obs):
+        return step(carry, obs, 0.0 if jax.config.jax_default_matmul_precision == "highest" else 1e-3)
+
+    shapes = {"h": jax.ShapeDtypeStruct((2,), np.float32)}, {"image": jax.ShapeDtypeStruct((16, 16, 3), np.uint8)}
+    checked = parity(to_onnx(Network(step, *shapes)), Network(on_a_gpu, *shapes), 5)
+    assert checked["max_abs_action_difference"] < 1e-5
