@@ -19,8 +19,8 @@ BLIND: tuple[Literal["blank", "freeze", "replay"], ...] = ("blank", "freeze", "r
 def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     """Result of one run with its metrics.
 
-    Of a training without a note it is what the main command left, on `device`, beside others. Of one that was stopped
-    before its final evaluation (`stopped`) it is the last evaluation inside the run.
+    Of a training without a note it is what the main command left, on `device`, beside others. Of one without its final
+    evaluation it is the last evaluation inside the run; it counts as `stopped` where steps were left.
 
     Raises:
         ValueError: there is no note, and no device is told; or there was no evaluation.
@@ -41,8 +41,9 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
         raise ValueError(f"{path}: was stopped before its first evaluation. Give its command again, or leave it out.")
     last = evaluated[-1]
     policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
+    left = begun["preset"].get("total_steps", float("inf")) - last["env_steps"]
     return {
-        **content, "stopped": True, "task": begun["preset"]["task"], "env_steps": last["env_steps"],
+        **content, **({"stopped": True} if left > 0 else {}), "task": begun["preset"]["task"], "env_steps": last["env_steps"],
         "updates": last["updates"], "policy": {**policy, "episodes": begun["preset"]["eval_episodes"]},
     }  # fmt: skip
 

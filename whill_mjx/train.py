@@ -142,6 +142,7 @@ def main(options: TrainOptions) -> dict[str, Any]:
     if options.export == "best" and best is not None:
         chosen, other, name = best, result, "policy_last"
     evaluation = evaluate_policy(options, preset, vehicle, chosen)
+    write_json(options.out / "evaluation.json", evaluation)  # kept, whatever becomes of the export
     policy = export(options, preset, vehicle, chosen, options.out / "policy")
     if other is not None:
         export(options, preset, vehicle, other, options.out / name)

@@ -11,14 +11,14 @@ from benchmarks.course_figures import groups, load_run
 COURSE, CORRIDOR = {"action_repeat": 1}, {"action_repeat": 1, "box_x": 2.5}
 
 
-def write_run(path, successes, preset="wallclock", learner="ppo", task=COURSE, note=None):
+def write_run(path, successes, preset="wallclock", learner="ppo", task=COURSE, note=None, planned=8000):
     """A run's folder as it was left with these evaluations, one a minute and 1000 steps."""
     path.mkdir(parents=True)
     lines = [{"env_steps": 1000 * n, "updates": n, "wall_s": 60.0 * n, "eval/success": share,
               "eval/return": 200 * share, "eval/collision": 1 - share} for n, share in enumerate(successes, 1)]
     (path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [{"env_steps": 1}, *lines]))
     command = {"preset": preset, "layout": "randomised", "seed": 3, "learner": learner}
-    chosen = {"task": task, "eval_episodes": 1000, "exploring_starts": 0.5}
+    chosen = {"task": task, "eval_episodes": 1000, "exploring_starts": 0.5, "total_steps": planned}
     (path / "run.json").write_text(json.dumps({"command": command, "preset": chosen}))
     if note is not None:
         (path / "course.json").write_text(json.dumps({**command, "device": "X", "task": task, **note}))
@@ -81,3 +81,13 @@ def test_runs_that_cannot_be_recorded_are_refused(tmp_path):
         list(groups([load_run(write_run(tmp_path / "2", [0.5], "smoke", note=note))]))
     with pytest.raises(ValueError, match="stopped before its first evaluation"):
         load_run(write_run(tmp_path / "1", []), "X")
+
+
+@pytest.mark.quick
+def test_a_training_to_its_last_step_without_its_final_evaluation_is_no_stopped_one(tmp_path):
+    successes = [0.5] * 17 + [0.9, 1.0]
+    run = load_run(write_run(tmp_path / "0", successes, "paper", "dreamer", planned=19_000), "X")
+    [(name, _, figures)] = groups([run])
+    assert name == "course_paper_randomised"
+    assert figures["return_at_18000_median"]["value"] == pytest.approx(190.0)
+    assert figures["success_at_22000"]["value"] == 1.0
