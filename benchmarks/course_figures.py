@@ -43,7 +43,8 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
     left = begun["preset"].get("total_steps", float("inf")) - last["env_steps"]
     return {
-        **content, **({"stopped": True} if left > 0 else {}), "task": begun["preset"]["task"], "env_steps": last["env_steps"],
+        **content, **({"stopped": True} if left > 0 else {}), "task": begun["preset"]["task"],
+        "env_steps": last["env_steps"],
         "updates": last["updates"], "policy": {**policy, "episodes": begun["preset"]["eval_episodes"]},
     }  # fmt: skip
 

@@ -19,6 +19,8 @@ from sysid.statistics import upper_rate
 
 LEAST = 30
 """Logs with nothing in them on which p-values are calibrated at least."""
+OF_ALL_SIZES = ("mean_class_size", "out_of_catalogue")
+"""Figures of logs with one effect that are also taken over all its sizes together."""
 CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
 SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
     "command_scale": ("command_scale.linear", 1.0, 1.0),
@@ -37,10 +39,10 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
     cases = list(read_cases(work))
     found = {**of_nulls([one for truth, one in cases if not truth])}
-    for scale in sorted({one["scale"] for _, one in cases if one["stage"] == "scaled"}):
-        inside = [(next(iter(truth)), one) for truth, one in cases
-                  if one["stage"] == "scaled" and one["scale"] == scale]
-        found.update(of_singles(inside, f"_{scale:g}x"))
+    singles = [(next(iter(truth)), one) for truth, one in cases if one["stage"] == "scaled"]
+    for scale in sorted({one["scale"] for _, one in singles}):
+        found.update(of_singles([(name, one) for name, one in singles if one["scale"] == scale], f"_{scale:g}x"))
+    found.update({name: one for name, one in of_singles(singles, "").items() if name in OF_ALL_SIZES})
     found.update(of_pairs([(truth, one) for truth, one in cases if one["stage"] == "pair"]))
     found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"],
                              own_classes(work)))
