@@ -234,7 +234,7 @@ def is_false(loop: dict[str, Any], fastest: float) -> bool:
         elif one["name"] in SCALES:
             wrong = max(min(size, abs(size - 1)) for size in sizes.values()) > LARGEST
         elif one["name"] in DEAD:
-            wrong = sizes["linear"] > LARGEST * fastest
+            wrong = max(sizes.get("linear", 0.0), sizes.get("wheel", 0.0)) > LARGEST * fastest
         else:
             wrong = True
         if wrong:

@@ -54,10 +54,7 @@ def search(
         found.reason = "nothing stands out of the noise and the day-to-day spread"
         return found
     current = base
-    mended = False
-    for number in range(thresholds.rounds + 1):
-        if len(found.accepted) == thresholds.rounds:
-            break
+    for number in range(thresholds.rounds):
         scans = [far, (first.gain, first.worth, first.q)] if number == 0 else [
             rescan(evidence, hypotheses, current, refitter, wander)]
         candidates = refitted(refitter, current, evidence, hypotheses, wander, first, scans, thresholds, similar,
@@ -74,10 +71,7 @@ def search(
                     taken_on = one
                     break
             if not taken_on.own and taken_on.gain < thresholds.second * found.accepted[0].gain:
-                if mended or taken_on.share - explained(current) < thresholds.own * (1 - explained(current)):
-                    break
-                mended, current = True, taken_on.refit  # it may hide what comes after; it is named by no one
-                continue
+                break  # it mends the form of what was found before, and so would what comes after it
         found.accepted.append(taken_on)
         found.classes.append(_class_of(taken_on, candidates, hypotheses, similar, thresholds))
         current = taken_on.refit

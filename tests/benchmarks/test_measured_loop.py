@@ -29,6 +29,8 @@ def verdict(name, **parameters):
     (verdict("command_scale", linear=0.97, angular=1.08), False),
     (verdict("wheel_radius_difference", difference=-0.01, common=0.15), True),
     (verdict("command_dead_zone", linear=0.02, angular=0.0), True),
+    (verdict("command_dead_zone", wheel=0.009, release=1.0), False),
+    (verdict("command_dead_zone", wheel=0.02, release=1.0), True),
     (verdict("slope", along_x=0.001, along_y=0.0), True),
 ])
 def test_a_verdict_on_a_nearly_ideal_robot_is_false_where_it_cannot_have_the_effect(loop, false):
