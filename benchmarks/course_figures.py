@@ -27,7 +27,9 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     """
     metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
     if (path / "course.json").exists():
-        return {**json.loads((path / "course.json").read_text()), "metrics": metrics}
+        told = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
+        starts = {"exploring_starts": told["exploring_starts"]} if "exploring_starts" in told else {}
+        return {**starts, **json.loads((path / "course.json").read_text()), "metrics": metrics}
     if device is None:
         raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
     begun = json.loads((path / "run.json").read_text())

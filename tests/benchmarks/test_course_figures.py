@@ -32,6 +32,7 @@ def test_the_time_to_99_percent_is_that_of_the_first_such_evaluation(tmp_path):
     [(name, [_], figures)] = groups([run])
     assert name == "course_wallclock_randomised_ppo"
     assert figures["time_to_99_s_ppo"]["value"] == 120.0
+    assert figures["wallclock_success_ppo"]["exploring_starts"] == [0.5]
     assert figures["wallclock_success_ppo"]["value"] == 0.97  # of the final evaluation, not of one inside the run
     assert figures["wallclock_training_s_ppo"]["value"] == 240.0
     second = figures["wallclock_success_ppo"]["evaluations"][0][1]
