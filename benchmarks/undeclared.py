@@ -4,11 +4,12 @@
     python -m benchmarks.undeclared --nulls 200 --base --scales 2 4 --pairs 10
 
     for i in $(seq 44); do python -m benchmarks.undeclared --nulls 200 --reference-sets 44 --part $i/44 & done; wait
+    for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
     python -m benchmarks.undeclared --collect
 
-The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the third does so in processes
-that share a folder. Verdicts are kept in `runs/undeclared` and a run that was stopped goes on where it was; the figures
-are written at the end from all verdicts there.
+The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes that
+share a folder, each with a part of its own or with whatever is left. Verdicts are kept in `runs/undeclared` and a run that
+was stopped goes on where it was; the figures are written at the end from all verdicts there.
 """
 
 from __future__ import annotations
@@ -84,6 +85,9 @@ class Benchmark:
     """Only write the figures from the verdicts that are there."""
     work: Path = Path("runs/undeclared")
     """Folder for logs and verdicts."""
+    share: bool = False
+    """Judge what no other process has taken yet; any number of them may run. What a killed one had taken stays in
+    WORK/plant/claims and is left out until it is removed there."""
     part: str = "1/1"
     """I/N: only every N-th log or effect from the I-th on, for several processes; `collect` then writes the figures."""
 
@@ -143,6 +147,8 @@ def plant(settings: Benchmark) -> None:
         for number, job in enumerate(listed):
             if (work / "verdicts" / f"{job.label}.json").exists():
                 continue
+            if settings.share and not contact.claimed(work, job.label):
+                continue
             if job.reference not in ready:
                 ready.clear()  # one at a time: each has its compiled replay
                 ready[job.reference] = prepared(work, job.reference, driven, config)
@@ -162,7 +168,7 @@ def plant(settings: Benchmark) -> None:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:
         judge(contact.pair_jobs(work, settings.pairs, part, driven))
-    if part == "1/1":
+    if part == "1/1" and not settings.share:
         undeclared_figures.figures(work, driven)
 
 

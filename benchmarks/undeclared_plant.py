@@ -78,6 +78,16 @@ def mine(number: int, part: str) -> bool:
     return number % count == first - 1
 
 
+def claimed(work: Path, label: str) -> bool:
+    """Whether this process is the first of all that share the folder to take a log."""
+    (work / "claims").mkdir(parents=True, exist_ok=True)
+    try:
+        os.close(os.open(work / "claims" / label, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        return False
+    return True
+
+
 def null_jobs(nulls: int, part: str, sets: int = 1) -> list[Job]:
     """Logs with nothing in them, dealt over sets of reference days."""
     return [Job(f"null_{n:03d}", {}, 20000 + n, reference=n % sets) for n in range(nulls)

@@ -134,3 +134,18 @@ def test_logs_with_sets_of_their_own_share_neither_set_nor_seed_with_others():
     assert not {job.reference for job in own} & {job.reference for job in dealt}
     assert not {job.seed for job in own} & {job.seed for job in dealt}
     assert [job for part in ("1/2", "2/2") for job in contact.own_set_jobs(4, part)] == [own[0], own[2], own[1], own[3]]
+
+
+def test_processes_that_share_a_folder_judge_every_log_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(undeclared, "prepared", lambda work, number, driven, config: number)
+    judged = []
+
+    def judge(job, *_):
+        judged.append(job.label)
+        if len(judged) == 3:  # another process comes in between
+            undeclared.plant(undeclared.Benchmark(own_sets=8, share=True, work=tmp_path))
+        return {"verdict": "none", "effects": [], "share": 0.0, "p_value": 0.5, "seconds": 0.0}
+
+    monkeypatch.setattr(contact, "judge", judge)
+    undeclared.plant(undeclared.Benchmark(own_sets=8, share=True, work=tmp_path))
+    assert sorted(judged) == [job.label for job in contact.own_set_jobs(8, "1/1")]
