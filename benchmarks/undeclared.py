@@ -7,9 +7,9 @@
     for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
     python -m benchmarks.undeclared --collect
 
-The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes that
-share a folder, each with a part of its own or with whatever is left. Verdicts are kept in `runs/undeclared` and a run that
-was stopped goes on where it was; the figures are written at the end from all verdicts there.
+The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes
+that share a folder, each with a part of its own or with whatever is left. Verdicts are kept in `runs/undeclared` and a
+run that was stopped goes on where it was; the figures are written at the end from all verdicts there.
 """
 
 from __future__ import annotations
