@@ -54,13 +54,18 @@ def figure(repeats: list[float], unit: str, device: str | None = None) -> dict[s
     return {"value": value, "unit": unit, "device": device or device_name(), "repeats": list(repeats)}
 
 
-def record(stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS) -> Path:
-    """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept."""
+def record(
+    stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS, replacing: str | None = None
+) -> Path:
+    """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept, but for
+    those that begin with `replacing`: they are of an earlier run which had others."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}.json"
     old = json.loads(path.read_text()) if path.exists() else {}
     stamp = provenance()
-    merged = {**old.get("figures", {}), **{name: {**value, **stamp} for name, value in figures.items()}}
+    kept = {name: one for name, one in old.get("figures", {}).items()
+            if replacing is None or not name.startswith(replacing)}  # fmt: skip
+    merged = {**kept, **{name: {**value, **stamp} for name, value in figures.items()}}
     content = {"claim": claim, **stamp, "figures": merged}
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(content, indent=1) + "\n")

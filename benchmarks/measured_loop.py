@@ -199,7 +199,7 @@ def ladder(settings: Benchmark) -> None:
     figures["drive_gain_over_fitted_base"] = figures["ladder_gain_all_position"]
     show(figures)
     tell(loops)
-    record("measured", CLAIM, figures)
+    record("measured", CLAIM, figures, replacing="ladder_")
 
 
 def change(settings: Benchmark) -> None:
