@@ -284,8 +284,8 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12, beside: bool
 
     The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
     refit may move base parameters and the accepted effects' own, and with `beside` what every fit to poses has besides
-    (`measured_effects`): the search takes their part for the wander of days. Drives that stand alone, without a reference,
-    would only be fitted closer by them: on a measured robot the errors of drives left out grew by 4 %.
+    (`measured_effects`): the search takes their part for the wander of days. Drives without a reference would only be
+    fitted closer by them: on a measured robot the errors of drives left out grew by 3 %.
     """
     from sysid.loop.poses import fit_poses
 
