@@ -43,9 +43,9 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     for scale in sorted({one["scale"] for _, one in singles}):
         found.update(of_singles([(name, one) for name, one in singles if one["scale"] == scale], f"_{scale:g}x"))
     found.update({name: one for name, one in of_singles(singles, "").items() if name in OF_ALL_SIZES})
-    pairs, sizes = [(truth, one) for truth, one in cases if one["stage"] == "pair"], power_sizes(work, driven)
+    pairs, least = [(truth, one) for truth, one in cases if one["stage"] == "pair"], power_sizes(work, driven)
     found.update(of_pairs(pairs))
-    large = [(truth, one) for truth, one in pairs if all(truth[name] >= 2 * sizes.get(name, 0.0) for name in truth)]
+    large = [(truth, one) for truth, one in pairs if all(truth[name] >= 2 * least.get(name, 0.0) for name in truth)]
     found.update({f"{name}_2x": one for name, one in of_pairs(large).items()})
     found.update(of_left_out([(next(iter(truth)), one) for truth, one in cases if one["stage"] == "left_out"],
                              own_classes(work)))

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from dreamer import checkpoint, parallel, spaces
+from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
@@ -425,7 +425,7 @@ def write_prediction(options: TrainOptions, preset: Preset, vehicle: Path, param
     @jax.jit
     def foretell(params: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         seen = video.play(env, preset.learner, params, key, steps)
-        return spaces.image_of(seen["obs"]), video.predict(preset.learner, params, seen, context, key)
+        return seen["obs"], video.predict(preset.learner, params, seen, context, key)
 
     truth, foretold = foretell(params, jax.random.key(FINAL_SEED + options.seed))
     pictures = video.frames(np.asarray(truth), np.asarray(foretold), context)
