@@ -108,10 +108,14 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for name, p_of in (("null_ks_p", calibrated), ("null_ks_p_uncalibrated", float)):
         if apart:
             p_values = [p_of(one["p_value"]) for one in apart]
-            sets = len({one.get("reference", 0) for one in apart})
             found[name] = figure([float(stats.kstest(p_values, "uniform").pvalue)],
-                                 f"of {len(apart)} logs over {sets} sets of reference days")
+                                 f"of {len(apart)} logs over {sets_of(apart)} sets of reference days")
     return found
+
+
+def sets_of(nulls: Sequence[dict[str, Any]]) -> int:
+    """How many sets of reference days these logs are judged against."""
+    return len({one.get("reference", 0) for one in nulls})
 
 
 def calibrates(null: dict[str, Any]) -> bool:
@@ -129,7 +133,7 @@ def calibrate(work: Path) -> None:
                          f"reference days; {LEAST} are needed. Drive more with --nulls and --reference-sets.")
     values = np.clip([one["p_value"] for one in nulls], 1e-4, 1 - 1e-3)  # what is smaller tells of tails
     a, b, _, _ = stats.beta.fit(values, floc=0, fscale=1)
-    sets = len({one.get("reference", 0) for one in nulls})
+    sets = sets_of(nulls)
     content = {"a": float(a), "b": float(b), "logs": len(nulls), "sets": sets, **provenance()}
     write_report(FILE, content)
     print(f"Beta({a:.3f}, {b:.3f}) from {len(nulls)} logs over {sets} sets")
@@ -142,8 +146,8 @@ def said(truth: str, one: dict[str, Any]) -> bool:
 
 def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[str, Any]:
     """Right and wrong names of logs with one effect each."""
-    known = [(name, one) for name, one in inside if EFFECTS[name].known or EFFECTS[name].covered]
-    beyond = [one for name, one in inside if not (EFFECTS[name].known or EFFECTS[name].covered)]
+    known = [(name, one) for name, one in inside if EFFECTS[name].can_be_named]
+    beyond = [one for name, one in inside if not EFFECTS[name].can_be_named]
     found = {}
     if known:
         about = f"share of {len(known)} logs"

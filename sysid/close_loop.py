@@ -279,18 +279,17 @@ def vehicle_after(result: Result) -> Any:
     return type(moved)(moved.body, tuple(effect for effect in moved.effects if effect.name in kept))
 
 
-def refit_poses(result: Result, vehicle: Any, iterations: int = 12, beside: bool = True) -> Any:
+def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     """A vehicle refitted to whole poses and speeds, as `sysid.fit` does, from where the search left it.
 
     The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
-    refit may move base parameters and the accepted effects' own, and with `beside` what every fit to poses has besides
-    (`measured_effects`): the search takes their part for the wander of days. Drives without a reference would only be
+    refit may move base parameters and the accepted effects' own, and against a reference what every fit to poses has
+    besides (`measured_effects`): the search takes their part for the wander of days. Drives without one would only be
     fitted closer by them: on a measured robot the errors of drives left out grew by 3 %.
     """
     from sysid.loop.poses import fit_poses
 
-    beside = beside and result.reference.known
-    extra = measured_effects(vehicle, result.log.spec, result.log.training) if beside else ()
+    extra = measured_effects(vehicle, result.log.spec, result.log.training) if result.reference.known else ()
     vehicle = with_effects(vehicle, extra)
     have = describe(vehicle)
     names = list(result.reference.space.names)

@@ -29,6 +29,7 @@ from whill_mjx.evaluation import Course, episode_keys
 from whill_mjx.final import evaluate_drivers, write_report
 from whill_mjx.policy_file import RUN_FILE
 from whill_mjx.ppo_run import train_ppo
+from whill_mjx.prediction import write_prediction
 from whill_mjx.rollouts import rollout
 from whill_mjx.safe import Step, find_safety
 from whill_mjx.training import (
@@ -45,7 +46,6 @@ from whill_mjx.training import (
 
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
-SEEN, FORETOLD = 5, 40  # control periods of a prediction that are shown to the model, and that are not
 
 
 @dataclass(frozen=True)
@@ -406,30 +406,12 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
         say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
     if options.videos and options.learner == "dreamer" and preset.learner.representation == "reconstruct":
         try:
-            write_prediction(options, preset, vehicle, result.params)
+            key = jax.random.key(FINAL_SEED + options.seed)
+            write_prediction(options.out / "prediction.gif", preset, vehicle, result.params, options.videos, key)
         except ImportError as error:
             say(f"prediction.gif is left out: {error}. Install the base package to draw it.")
     return {"task": plain(preset.task), "learner": options.learner, "seed": options.seed,
             "env_steps": result.env_steps, "updates": result.updates, **summary}
-
-
-def write_prediction(options: TrainOptions, preset: Preset, vehicle: Path, params: Any) -> Path:
-    """RUN/prediction.gif: drives as the camera sees them, above what the world model foretells from their first half
-    second and later actions alone, above the difference."""
-    from dreamer import video
-
-    periods = preset.task.action_repeat
-    context, steps = max(2, SEEN // periods), max(8, (SEEN + FORETOLD) // periods)
-    env = functional_env(make_training_env(preset.task, vehicle, options.videos), preset.safety, shaped=False)
-
-    @jax.jit
-    def foretell(params: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        seen = video.play(env, preset.learner, params, key, steps)
-        return seen["obs"], video.predict(preset.learner, params, seen, context, key)
-
-    truth, foretold = foretell(params, jax.random.key(FINAL_SEED + options.seed))
-    pictures = video.frames(np.asarray(truth), np.asarray(foretold), context)
-    return video.write(options.out / "prediction.gif", pictures, rate_hz=10.0 / periods)
 
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:

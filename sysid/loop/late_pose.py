@@ -77,14 +77,11 @@ def fitted(result: Result, delay: float) -> np.ndarray:
     """Values (all,) of the base model fitted to whole poses that are late by `delay` [s]."""
     import jax.numpy as jnp
 
-    from sysid.close_loop import drives_of, refit_poses, vehicle_before
+    from sysid.close_loop import drives_of
     from whill_mjx.parameters import set_values
 
     names, reference = list(result.names), result.reference
-    before = vehicle_before(result)
-    if result.config.poses:
-        before = refit_poses(result, before, beside=False)
-    drives, values = drives_of(result, result.log.training, before)
+    drives, values = drives_of(result, result.log.training, result.before)
     values = with_values(values, names, {PARAMETER: delay})
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))

@@ -280,7 +280,8 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
         return np.mean([score(trial, prediction)["ground_truth"].trajectory for trial, prediction in pairs])
 
     before = vehicle_before(plain)
-    alone = refit_poses(plain, before, iterations=4, beside=False)
+    unknown = replace(plain, prepared=replace(plain.prepared, reference=replace(plain.reference, known=False)))
+    alone = refit_poses(unknown, before, iterations=4)
     assert error(alone) < error(before)
     beside = refit_poses(plain, before, iterations=4)
     added = {one.name for one in beside.effects} - {one.name for one in before.effects}

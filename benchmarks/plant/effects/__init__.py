@@ -34,6 +34,11 @@ class Entry:
     """Size beyond which the chair no longer drives its manoeuvres: stalled motors, ice, a play that shakes it."""
 
     @property
+    def can_be_named(self) -> bool:
+        """Whether the catalogue has it, by this name or another one."""
+        return self.known or bool(self.covered)
+
+    @property
     def form(self) -> str:
         """Functional form in words and symbols; s is the size."""
         return (self.make.__doc__ or "").split("\n")[0].replace(" Not catalogued.", "")
