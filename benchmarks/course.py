@@ -30,7 +30,8 @@ from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
 from whill_mjx.dataset import write_json
-from whill_mjx.train import TrainOptions, main, mean_figures, preset_name
+from whill_mjx.inside import mean_figures
+from whill_mjx.train import TrainOptions, main, preset_name
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"

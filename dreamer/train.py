@@ -7,11 +7,13 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -104,6 +106,7 @@ def train(
     seed: int | Sequence[int],
     *,
     eval_fn: EvalFn | None = None,
+    eval_ahead: Callable[[Params], Any] | None = None,
     eval_every: int = 10_000,
     checkpoint_every_s: float = 600.0,
     log_every_s: float = 5.0,
@@ -131,6 +134,8 @@ def train(
         seed: of everything random. Several make one program of as many runs: steps then count those of one run,
             figures are means over the runs, and parameters have a seed axis in front.
         eval_fn: (params, env_steps) -> figures, logged as eval/...
+        eval_ahead: called once in a thread, with the parameters at the start, while the run's own program is compiled:
+            the same evaluation, say, which then is compiled too when it is due. Not with several devices.
         eval_every: control steps between evaluations; one more happens at the end.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
         log_every_s: time between log lines [s].
@@ -167,6 +172,9 @@ def train(
             return compile_iteration(env, config, state, mesh, step)
         return seeds.compile_iterations(env, config, state, step)
 
+    ready = None
+    if eval_ahead is not None and mesh is None and env_steps < total_steps:
+        ready = _in_thread(eval_ahead, state.agent.acting)
     iterate = compiled(train_iteration if counted else pretrain.pretrain_iteration)
     bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
     meter, saved_at = Meter(), time.monotonic()
@@ -179,6 +187,8 @@ def train(
         figures = meter.read(config)
         line |= done | (figures if counted else {f"pretrain/{name}": value for name, value in figures.items()})
         if evaluated and eval_fn is not None:
+            if ready is not None:
+                wait([ready])
             # Several processes evaluate side by side, each on its own device.
             params = state.agent.acting if jax.process_count() == 1 else jax.device_get(state.agent.acting)
             line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, env_steps).items()}
@@ -226,6 +236,14 @@ def train(
         log.close()
     updates = int(state.agent.updates) if counted else 0
     return TrainResult(out, state.agent, env_steps, updates, wall_s(), log.last)
+
+
+def _in_thread(call: Callable[[Params], Any], params: Params) -> Future:
+    """A call beside what follows, with a copy of the parameters, which may be donated meanwhile."""
+    threads = ThreadPoolExecutor(1)
+    started = threads.submit(call, jax.tree.map(jnp.copy, params))
+    threads.shutdown(wait=False)
+    return started
 
 
 def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: float) -> Path:

@@ -14,7 +14,7 @@ DOORS = {
     "whill_mjx/train.py": {"dreamer", "sysid"},  # the training command
     "bridge/simulate.py": {"whill_mjx"},  # the simulator behind the topics
 }
-PARTS = {"whill_mjx/training.py": {"dreamer"}, "whill_mjx/prediction.py": {"dreamer"}}  # of the training command
+PARTS = {f"whill_mjx/{name}.py": {"dreamer"} for name in ("training", "inside", "prediction")}  # of the first
 
 pytestmark = pytest.mark.quick
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from whill_mjx.ppo import PpoConfig, init_state, iterate
 
@@ -23,6 +25,7 @@ def train_ppo(
     eval_every: int = 10_000,
     stop: Callable[[dict[str, float]], bool] | None = None,
     say: Callable[[str], None] = lambda text: None,
+    eval_ahead: bool = False,
 ) -> tuple[Any, int, int, float]:
     """Train until `total_steps` environment steps, summed over instances, are done, or until `stop` says so.
 
@@ -38,6 +41,8 @@ def train_ppo(
         eval_every: environment steps between evaluations; one more happens at the end.
         stop: called with every line that holds an evaluation; True ends the run.
         say: told each evaluation.
+        eval_ahead: call `eval_fn` once in a thread at the start, so that it is compiled beside the run's own program.
+            Not with several devices.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
@@ -46,6 +51,10 @@ def train_ppo(
     began, each = time.monotonic(), env.num_envs * config.rollout
     iterations = -(-total_steps // each)
     state = jax.jit(lambda: init_state(env, config, iterations, seed))()
+    threads = ThreadPoolExecutor(1)
+    params = jax.tree.map(jnp.copy, state.params)  # the run's own are donated
+    ready = [threads.submit(eval_fn, params, 0)] if eval_ahead and eval_fn is not None else []
+    threads.shutdown(wait=False)
     run = jax.jit(lambda state: iterate(env, config, iterations, state), donate_argnums=0)
     evaluated_at = 0
     with (out / "metrics.jsonl").open("w") as file:
@@ -59,6 +68,7 @@ def train_ppo(
             line = _line(jax.device_get(metrics), env_steps, iteration * config.epochs * config.minibatches)
             line["wall_s"] = time.monotonic() - began
             if eval_fn is not None:
+                wait(ready)
                 line |= {f"eval/{name}": value for name, value in eval_fn(state.params, env_steps).items()}
             file.write(json.dumps(line) + "\n")
             file.flush()

@@ -8,7 +8,6 @@ A run that was interrupted goes on where it stopped when the same command is giv
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 import time
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import numpy as np
 
 from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
@@ -27,6 +25,7 @@ from whill_mjx.devices import choose_devices, join
 from whill_mjx.drivers import planner_driver, random_driver
 from whill_mjx.evaluation import Course, episode_keys
 from whill_mjx.final import evaluate_drivers, write_report
+from whill_mjx.inside import Evaluate, Stopper, keep_best, mean_figures, read_best, say
 from whill_mjx.policy_file import RUN_FILE
 from whill_mjx.ppo_run import train_ppo
 from whill_mjx.prediction import write_prediction
@@ -238,7 +237,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
         preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts
     )
     held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
-    evaluate = keep_best(options.out, preset, evaluation_of(held_out, preset, options.seed))
+    evaluate = evaluation_of(held_out, preset, options.seed)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
         functional_env(batch, preset.safety, targets=TRUTH in preset.learner.decode_only),
@@ -246,7 +245,8 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
         options.out,
         stopper.total_steps(preset.total_steps),
         options.seed,
-        eval_fn=evaluate,
+        eval_fn=keep_best(options.out, preset, evaluate),
+        eval_ahead=lambda params: evaluate(params, 0),
         eval_every=preset.eval_every,
         checkpoint_every_s=options.checkpoint_every_s,
         stop=stopper,
@@ -258,10 +258,10 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
 
 def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
     """Train the model-free baseline with as many environment steps."""
+    devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=choose_devices(options.devices),
-        exploring_starts=preset.exploring_starts,
-    )  # fmt: skip
+        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts
+    )
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt
@@ -278,11 +278,11 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trai
 
     return Trained(*train_ppo(
         functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
-        preset.eval_every, Stopper(options.out, preset.stop_success), say,
+        preset.eval_every, Stopper(options.out, preset.stop_success), say, eval_ahead=not devices,
     ))  # fmt: skip
 
 
-def evaluation_of(batch: BatchEnv, preset: Preset, seed: int):
+def evaluation_of(batch: BatchEnv, preset: Preset, seed: int) -> Evaluate:
     """(params, steps) -> figures of one episode in every instance of `batch`; always the same worlds."""
     from dreamer.train import evaluate
 
@@ -294,45 +294,6 @@ def evaluation_of(batch: BatchEnv, preset: Preset, seed: int):
     return run
 
 
-def mean_figures(episodes: dict[str, np.ndarray]) -> dict[str, float]:
-    """Means of an evaluation inside the run."""
-    success = np.asarray(episodes["success"]) > 0.5
-    figures = {name: float(np.mean(episodes[name])) for name in ("return", "success", "collision", "timeout")}
-    if success.any():
-        figures["arrival_s"] = float(np.mean(np.asarray(episodes["time_s"])[success]))
-    return figures
-
-
-def keep_best(out: Path, preset: Preset, evaluate: Any):
-    """The evaluation, which now also saves the parameters in RUN/best when they are the best so far.
-
-    The best has the highest share of successes, and among equals the highest return. These episodes are not those of
-    the final evaluation, so choosing by them does not flatter it.
-    """
-
-    def run(params: Any, env_steps: int) -> dict[str, float]:
-        figures = evaluate(params, env_steps)
-        before = read_best(out)
-        # A run that goes on from an older checkpoint comes by the same steps again.
-        if before is None or _rank(figures) > _rank(before) or before["env_steps"] == env_steps:
-            checkpoint.save(out / "best", {"params": params}, preset.learner, env_steps)
-            if parallel.is_first_process():
-                write_json(out / "best.json", {"env_steps": env_steps, **figures})
-        return figures
-
-    return run
-
-
-def _rank(figures: dict[str, float]) -> tuple[float, float]:
-    return figures["success"], figures["return"]
-
-
-def read_best(out: Path) -> dict[str, float] | None:
-    """RUN/best.json, if there is one."""
-    path = out / "best.json"
-    return json.loads(path.read_text()) if path.is_file() else None
-
-
 def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Trained | None:
     """The best parameters, if they are not those at the end of the run."""
     best = read_best(options.out)
@@ -341,35 +302,6 @@ def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Train
     path = options.out / "best" / f"{int(best['env_steps']):012d}"
     state, _ = checkpoint.load(path, {"params": result.params}, preset.learner)
     return Trained(state["params"], int(best["env_steps"]), result.updates, result.wall_s)
-
-
-class Stopper:
-    """Ends a run after two good evaluations in a row, or when there is a file RUN/stop."""
-
-    def __init__(self, out: Path, success: float | None):
-        self._out, self._success, self._good = out, success, 0
-
-    def total_steps(self, planned: int) -> int:
-        """Steps to train: those at which an earlier start has ended for its success, if it asked the same."""
-        path = self._out / "stopped.json"
-        if self._success is None or not path.is_file():
-            return planned
-        told = json.loads(path.read_text())
-        return min(planned, int(told["env_steps"])) if told["success"] == self._success else planned
-
-    def __call__(self, line: dict[str, float]) -> bool:
-        """Whether the run ends after this line."""
-        if parallel.agree((self._out / "stop").exists()):
-            say(f"stopped, since {self._out / 'stop'} exists; remove it to go on.")
-            return True
-        reached = self._success is not None and line.get("eval/success", 0.0) >= self._success
-        self._good = self._good + 1 if reached else 0
-        if self._good < 2:
-            return False
-        if parallel.is_first_process():
-            write_json(self._out / "stopped.json", {"env_steps": line["env_steps"], "success": self._success})
-        say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
-        return True
 
 
 def make_course(preset: Preset, vehicle: Path) -> Course:
@@ -434,11 +366,6 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")
         return None
-
-
-def say(text: str) -> None:
-    """Tell the user how far the run is."""
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -96,6 +96,26 @@ def test_an_average_follows_the_parameters_and_learning_does_not_notice():
     assert state.agent.acting is state.agent.average
 
 
+def test_an_evaluation_made_ahead_is_compiled_when_it_is_due_and_leaves_the_run_as_it_was(tmp_path):
+    env, config = corridor_env(2), tiny_config()
+    traced, ahead, due = [], [], []
+
+    @jax.jit
+    def size(params):
+        traced.append(1)
+        return sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(params))
+
+    quiet = dict(eval_every=32, progress=False, log_every_s=1e9)
+    plain = train(env, config, tmp_path / "plain", 64, 0, **quiet)
+    run = train(env, config, tmp_path / "ahead", 64, 0, **quiet,
+                eval_fn=lambda params, _: due.append(float(size(params))) or {},
+                eval_ahead=lambda params: ahead.append(float(size(params))))
+    assert len(traced) == len(ahead) == 1 and len(due) == 2
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(run.agent), jax.device_get(plain.agent))
+    train(env, config, tmp_path / "ahead", 64, 0, **quiet, eval_fn=lambda *_: {}, eval_ahead=ahead.append)
+    assert len(ahead) == 1  # nothing is left to train
+
+
 def test_evaluations_take_the_average(tmp_path):
     seen = []
     config = dataclasses.replace(CONFIG, average_rate=0.25)

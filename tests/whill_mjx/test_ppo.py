@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import jax
@@ -23,6 +24,7 @@ from whill_mjx.ppo import (
     push,
     track,
 )
+from whill_mjx.ppo_run import train_ppo
 
 TINY = PpoConfig(stack=2, width=32, channels=(8, 8, 8), rollout=16, epochs=4, minibatches=4, lr=3e-3)
 
@@ -159,3 +161,22 @@ def test_minibatches_that_do_not_divide_a_rollout_are_refused():
         init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 1, 0)
     with pytest.raises(ValueError, match="epochs"):
         PpoConfig(epochs=0)
+
+
+def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
+    env, traced, asked = half_lit_env(4), [], []
+
+    @jax.jit
+    def spread(params):
+        traced.append(1)
+        return jnp.std(jax.tree.leaves(params)[-1])
+
+    def evaluate(params, env_steps):
+        asked.append(env_steps)
+        return {"spread": float(spread(params))}
+
+    each = 4 * TINY.rollout
+    train_ppo(env, TINY, tmp_path, 2 * each, 0, evaluate, each, eval_ahead=True)
+    assert len(traced) == 1 and asked == [0, each, 2 * each]
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)

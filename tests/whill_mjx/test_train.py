@@ -15,11 +15,12 @@ import pytest
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluate import EvaluateOptions, choose_task
+from whill_mjx.inside import Stopper, keep_best, read_best
 from whill_mjx.intervals import wilson_interval
 from whill_mjx.policy_file import load_policy
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.task import Corridor, ObstacleCourse, make_task
-from whill_mjx.train import Stopper, TrainOptions, choose_preset, keep_best, main, prepare_vehicle, read_best
+from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle
 from whill_mjx.training import find_preset, functional_env, with_repeat
 
 
