@@ -150,7 +150,7 @@ def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ..
             axis("caster_kick.trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0),
             axis("caster_kick.sharpness", 2.0, dependent=True)),
         one("traction_limit", axis("slip_traction.mu", -0.15, form="factor"), **shift),
-        one("rolling_resistance_speed", axis("rolling_resistance_speed.mu_1", 0.004 / speed)),
+        one("rolling_resistance_speed", axis("rolling_resistance_speed.mu_1", 0.004 / speed, limit=25.0)),
         one("quadratic_drag", axis("quadratic_drag.coefficient", force / speed**2)),
         one("side_force", axis("side_force.sideways", force, signed=True, open=pushed_anywhere(spec))),
         one("slope", axis("slope.along_x", 0.005, signed=True), axis("slope.along_y", 0.005, signed=True)),

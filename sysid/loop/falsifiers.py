@@ -10,7 +10,7 @@ Two kinds of prediction are tested after the refit:
             beside base parameters and other effects. It is contradicted where the weaker part is surely less than
             `least` of the stronger one; drives that would not show with 80 % power what else it could be tell nothing
     absent  where the effect does nothing, no more may be left, beyond what a day leaves there anyway, than `LEFT` of
-            what the effect gains
+            what it gains, together with other effects that were found: they may act there, in another form
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LASTING = 2 / 3
 """The same share of early and late in a drive. No law of the catalogue has the time in it, so that its size must not
 change; what warms up or wears off meanwhile does not go to zero."""
 LEFT = 1.0
-"""Largest share of an effect's gain that may be left where it does nothing: with more it is not what stands out."""
+"""Largest share of what effects gain that may be left where one does nothing: with more it is not what stands out."""
 SETTLED = 1.5
 """Time after the last change of the command from which it counts as constant [s]."""
 STRAIGHT = 0.02
@@ -56,6 +56,7 @@ class Course:
     turn: np.ndarray  # (B, K) m/s, yaw rate times half the track
     omega: np.ndarray  # (B, K) rad/s
     heading: np.ndarray  # (B, K) rad, in the room
+    asked: np.ndarray  # (B, K) m/s, yaw rate that is commanded times half the track
     step: np.ndarray  # (B, K) m/s, size of the command's last change
     rising: np.ndarray  # (B, K) whether that change went away from rest: 1, or -1; 0 before any
     since: np.ndarray  # (B, K) s since that change
@@ -88,7 +89,7 @@ class Tested:
     outcome: str
     """holds, falsified, or untold: the drives would not have shown the opposite."""
     sizes: tuple[float, ...]
-    """same: size in each part over that of the joint fit. absent: what is left there over the effect's gain."""
+    """same: size in each part over that of the joint fit. absent: what is left there over what all effects gain."""
     error: float
     """Standard error of the difference that is tested."""
     p: float
@@ -113,6 +114,7 @@ SPLITS: Mapping[str, Callable[[Course, np.ndarray], np.ndarray]] = {
     "yaw rate": lambda course, energy: side(np.abs(course.omega), energy),
     "direction of travel": lambda course, energy: way(course.v, MOVING),
     "direction of turning": lambda course, energy: way(course.turn, MOVING),
+    "command to turn": lambda course, energy: np.where(np.abs(course.asked) < MOVING, -1.0, 1.0),
     "heading along x": lambda course, energy: np.sign(np.cos(course.heading)),
     "heading along y": lambda course, energy: np.sign(np.sin(course.heading)),
     "size of the step": lambda course, energy: side(course.step, energy),
@@ -136,6 +138,7 @@ _SPEED = Falsifier("grows with the speed as its law says", "speed")
 _RATE = Falsifier("grows with the yaw rate as its law says", "yaw rate")
 _TRAVEL = Falsifier("is the same forward and backward", "direction of travel", -1.0)
 _TURN = Falsifier("is the same in turns to the left and to the right", "direction of turning", -1.0)
+_COMMAND = Falsifier("is the same whether the command is to drive straight on or to turn", "command to turn")
 _TIME = Falsifier("is the same early and late in a drive", "time in the drive", least=LASTING)
 _ROOM_X = Falsifier("changes sign with the heading: it is fixed in the room", "heading along x", -1.0)
 _ROOM_Y = Falsifier("changes sign with the heading: it is fixed in the room", "heading along y", -1.0)
@@ -144,7 +147,7 @@ _BODY_Y = Falsifier("keeps its side whatever the heading: it turns with the vehi
 
 FALSIFIERS: Mapping[str, tuple[Falsifier, ...]] = {
     "command_delay": (_STEP, _EDGES, _SETTLED),
-    "command_dead_zone": (_TRAVEL, _TURN, _TIME),
+    "command_dead_zone": (_TRAVEL, _TURN, _COMMAND, _TIME),
     "acceleration_limit": (Falsifier("lasts in proportion to the command's step", "size of the step"), _SETTLED, _TIME),
     "jerk_limit": (Falsifier("lasts as the root of the command's step", "size of the step"), _SETTLED, _TIME),
     "command_scale": (_SPEED, _TRAVEL, _TIME),
@@ -264,16 +267,22 @@ def _absent(
     """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
     count = float(quiet.sum())
     left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    q = fit.q[part]
-    last = [*range(len(fit.u) + part.start), *range(len(fit.u) + part.stop, len(fit.u) + len(fit.q)),
-            *range(len(fit.u) + part.start, len(fit.u) + part.stop)]
-    gain = max(float(q @ beside(fit.products(precision)[np.ix_(last, last)], len(q)) @ q), 1e-9)
+    gains = [_gain(fit, each, precision) for each in fit.parts]
+    gain = gains[fit.parts.index(part)]
     p = float(p_excess(left / count)) if count else 1.0
-    share = left / gain
+    share = left / sum(gains)
     told = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
     outcome = "falsified" if p < alpha and share > LEFT else "holds" if told else "untold"
     return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
                   1.0 if told else 0.0)
+
+
+def _gain(fit: Refit, part: slice, precision: np.ndarray) -> float:
+    """By how much some coordinates lower the cost of a joint fit, beside all others. Linear."""
+    size, q = len(fit.u), fit.q[part]
+    mine = list(range(size + part.start, size + part.stop))
+    order = [*(i for i in range(size + len(fit.q)) if i not in mine), *mine]
+    return max(float(q @ beside(fit.products(precision)[np.ix_(order, order)], len(q)) @ q), 1e-9)
 
 
 def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> Course:
@@ -285,13 +294,13 @@ def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, trac
     start = np.array([trial.start.yaw for trial in trials])[:, None]
     heading = start + np.cumsum(omega * width, axis=1) - omega * width / 2
     rows = [_changes(trial, t, track) for trial in trials]
-    step, rising, since = (np.stack([row[k] for row in rows]) for k in range(3))
-    return Course(t, v, omega * track / 2, omega, heading, step, rising, since)
+    asked, step, rising, since = (np.stack([row[k] for row in rows]) for k in range(4))
+    return Course(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
 
 
-def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Size of the command's last change before times t (K,), 1 or -1 by whether it led away from rest, and time since.
-    """
+def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Turning that is commanded at times t (K,), size of the command's last change before, 1 or -1 by whether it led
+    away from rest, and time since."""
     command = np.stack([trial.command.v, trial.command.omega * track / 2], axis=-1)
     change = np.diff(command, axis=0, prepend=command[:1])
     size = np.linalg.norm(change, axis=-1)
@@ -300,7 +309,7 @@ def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.
     moved = np.where(size > 1e-6, np.arange(len(size)), -1)
     last = np.maximum.accumulate(moved)[held]
     known = last >= 0
-    return (np.where(known, size[last], 0.0), np.where(known, grown[last], 0.0),
+    return (command[held, 1], np.where(known, size[last], 0.0), np.where(known, grown[last], 0.0),
             np.where(known, t - trial.command.t[last], t))
 
 
@@ -314,7 +323,7 @@ def as_report(tested: Sequence[Tested]) -> list[dict[str, Any]]:
 def in_words(one: Tested) -> str:
     """A prediction that the drives contradict."""
     if one.falsifier.kind == "absent":
-        return (f"{one.effect} {one.falsifier.says}, but {one.sizes[0]:.0%} of what it gains is left there "
+        return (f"{one.effect} {one.falsifier.says}, but {one.sizes[0]:.0%} of what is gained is left there "
                 f"(p = {one.p:.1g})")
     return (f"{one.effect} {one.falsifier.says}, but split by {one.falsifier.by} its size is {one.sizes[0]:.2f} and "
             f"{one.sizes[1]:.2f} of that fitted (p = {one.p:.1g})")

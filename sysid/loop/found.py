@@ -45,6 +45,15 @@ class Thresholds:
     """Largest factor by which its gain may then change."""
     differ: float = 0.35
     """Largest disagreement of manoeuvres on its size."""
+    half: float = 0.5
+    """Least share of what the effects before it left that one must explain whose columns other forms of them do not
+    imitate (`sysid.loop.forms`)."""
+    slight: float = 0.05
+    """Least gain of such an effect, as a share of the first one's."""
+    unlike: float = 0.75
+    """Least share of its signature that such forms do not imitate."""
+    instead: float = 0.7
+    """Most that they may gain instead of it, as a share of what it gains."""
     little: float = 0.1
     """What one must explain of it that manoeuvres tell of each other."""
     foretold: float = 0.7
@@ -65,7 +74,7 @@ class Thresholds:
     """Effects refitted in a round, of each scan."""
     close: float = 0.5
     """Share of the best refit's gain from which another one is polished too."""
-    rival: float = 0.5
+    rival: float = 0.4
     """|cos| of two effects' signatures above which one is not named before the other was refitted."""
     between: float = 0.5
     """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""

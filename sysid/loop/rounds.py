@@ -68,8 +68,9 @@ def _starts(
 ) -> list[tuple[int, np.ndarray]]:
     """Hypotheses to refit and where to start.
 
-    Of each scan those that gain most, and of the last the one that stands out most. A large effect shows best in the
-    scan around the reference, a small one in that around the base refitted to these drives.
+    Of each scan those that gain most of what stands out, what gains most whether it does or not, and of the last the
+    one that stands out most. A large effect shows best in the scan around the reference, a small one in that around the
+    base refitted to these drives. What wanders from day to day stands out less than what imitates it.
     """
     left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
     order: dict[str, tuple[int, np.ndarray]] = {}
@@ -80,9 +81,10 @@ def _starts(
         if number == len(scans) - 1:
             chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
         new = 0
-        for h in chosen:
+        most = [h for h in sorted(left, key=lambda h: -gain[h])[:1] if gain[h] > 0]
+        for h in [*chosen, *most]:
             wide, start = _widest(hypotheses, h, q, standing)
-            if hypotheses[wide].key not in order and new < thresholds.candidates:
+            if hypotheses[wide].key not in order and (new < thresholds.candidates or h not in chosen):
                 order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
@@ -92,14 +94,16 @@ def _rivals(
     hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
     thresholds: Thresholds,
 ) -> list[int]:
-    """What might imitate the best fit and was not tried: it must have had its chance before another is named."""
+    """What might imitate the best fit, or be imitated by it, and was not tried: it must have had its chance before
+    another is named."""
     if not fits:
         return []
     winner = tried[int(np.argmin([fit.cost for fit in fits]))]
     done = {hypotheses[h].effect for h in tried} | taken
     out: list[int] = []
-    for h in np.argsort(-similar[winner]):
-        if similar[winner, h] > thresholds.rival and hypotheses[h].effect not in done:
+    alike = np.maximum(similar[winner], similar[:, winner])
+    for h in np.argsort(-alike):
+        if alike[h] > thresholds.rival and hypotheses[h].effect not in done:
             done.add(hypotheses[h].effect)
             out.append(int(h))
     return out[: thresholds.candidates]

@@ -12,6 +12,7 @@ from sysid.loop.agreement import beside, disagreement, foretold, interval_of_sum
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit
+from sysid.loop.forms import other_forms
 from sysid.loop.found import LARGEST, Candidate, Search, Thresholds, excess_of, explained_share
 from sysid.loop.pairs import scan_pairs
 from sysid.loop.refit import Refit, Refitter, Start, moved_last
@@ -175,8 +176,8 @@ def _own(
     """Whether a further effect is there for its own sake, however small it is beside the first.
 
     What mends the form of another effect leaves a rest, for it is no part of that form; and it depends on it: each
-    manoeuvre asks for a size of its own, or alone it is of another size, or gains far more or less. `share` is what the
-    effects before it explain.
+    manoeuvre asks for a size of its own, or alone it is of another size, or gains far more or less. Or another form of
+    that effect would do as well. `share` is what the effects before it explain.
     """
     q, left = one.refit.split[-1], 1 - share
     part = slice(len(one.refit.q) - len(q), len(one.refit.q))
@@ -185,6 +186,11 @@ def _own(
     if one.share - share >= thresholds.rest * left:  # as long as it does not stand for those before it too
         return one.share - explained(_alone(one, found, refitter)) >= thresholds.step
     differ = disagreement(one.refit, part, groups, refitter.precision)
+    if (one.share - share >= thresholds.half * left and differ <= thresholds.differ
+            and one.gain >= thresholds.slight * found.accepted[0].gain):
+        forms = other_forms(refitter, one.refit, groups)
+        if forms.own >= thresholds.unlike and forms.instead <= thresholds.instead:
+            return True
     inside = beside(one.refit.products(refitter.precision), len(q))
     size = float(q @ inside @ q)
     if differ <= thresholds.same and _within(size / one.gain, 1 / thresholds.foretold):

@@ -107,6 +107,24 @@ def test_drives_that_show_an_effect_in_one_part_only_contradict_nothing():
     assert fitted((1.0, -1.0), weight=(1.0, 1e-3))[2].outcome == "untold"
 
 
+@pytest.mark.parametrize(("other", "outcome"), [(0.0, "falsified"), (3.0, "holds")])
+def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(other, outcome):
+    """The first effect acts late only, and early twice the noise is left; the second one acts everywhere."""
+    rng = np.random.default_rng(3)
+    columns = rng.standard_normal((6, 600, 3))
+    columns[:, :300, 1] = 0.0
+    residual = rng.standard_normal((6, 600)) * np.where(np.arange(600) < 300, 2.0, 1.0)
+    effects = tuple(Hypothesis(name, (Axis(name, 1.0),)) for name in ("command_delay", "slope"))
+    q = np.array([1.0, other])
+    fit = Refit(effects, np.zeros(1), q, 0.0, residual, columns, q)
+    quiet = np.zeros((6, 600, 1), bool)
+    quiet[:, :300] = True
+    p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
+    settled = falsifiers._SETTLED
+    tested = falsifiers._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
+    assert tested.outcome == outcome
+
+
 def test_a_split_by_the_median_halves_what_counts():
     values = np.array([[0.1, 0.2, 0.3, 0.4]])
     assert side(values, np.array([[1.0, 1.0, 1.0, 1.0]])).tolist() == [[-1, -1, 1, 1]]
@@ -114,7 +132,7 @@ def test_a_split_by_the_median_halves_what_counts():
 
 
 def test_the_course_of_a_drive_knows_its_steps_and_its_heading():
-    command = Command(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.5, 0.2]), np.zeros(3))
+    command = Command(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.5, 0.2]), np.array([0.0, 0.0, 0.4]))
     told = OdometryStream(np.array([0.0, 4.0]), None, None, None, np.zeros(2), np.zeros(2))
     trial = Trial("one", "one", command, told, None, Start(yaw=np.pi))
     simulated = np.zeros((1, 16, 5))
@@ -123,7 +141,10 @@ def test_the_course_of_a_drive_knows_its_steps_and_its_heading():
     assert course.heading[0, 3] == pytest.approx(np.pi)
     assert course.heading[0, -1] == pytest.approx(np.pi + 0.4 * 2.875)
     assert course.step[0, 6] == pytest.approx(0.5) and course.rising[0, 6] == 1
-    assert course.step[0, -1] == pytest.approx(0.3) and course.rising[0, -1] == -1
+    assert course.asked[0, 4:].tolist() == [0.0] * 8 + [pytest.approx(0.1)] * 4
+    turns = SPLITS["command to turn"](course, np.ones((1, 16)))
+    assert turns[0].tolist() == [-1.0] * 12 + [1.0] * 4
+    assert course.step[0, -1] == pytest.approx(np.hypot(0.3, 0.1)) and course.rising[0, -1] == -1
     assert course.since[0, -1] == pytest.approx(0.875)
     assert not QUIET["constant command"](course)[0, 5] and QUIET["constant command"](course)[0, 11]
 

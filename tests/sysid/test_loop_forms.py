@@ -1,0 +1,117 @@
+"""A further effect, or another form of the one before it; and which effects have their chance in a round."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sysid.loop.catalogue import Axis, Hypothesis
+from sysid.loop.forms import modulated, other_forms
+from sysid.loop.found import Candidate, Thresholds
+from sysid.loop.refit import Refit
+from sysid.loop.rounds import _rivals, _starts
+from sysid.loop.search import _own
+
+pytestmark = pytest.mark.quick
+TRIALS, BINS = 6, 80
+GROUPS = [[0, 1], [2, 3], [4, 5]]
+
+
+def effect(name):
+    return Hypothesis(name, (Axis(f"{name}.size", 1.0, limit=50.0),))
+
+
+class Linear:
+    """Features that are linear in a base parameter and two effects, with white noise of size 1."""
+
+    def __init__(self, second, truth, form=0.0):
+        """`second` (B, K, 5): signature of the second effect. `form`: of the first one beyond what its law says."""
+        rng = np.random.default_rng(0)
+        self.motion = np.stack([np.cumsum(rng.standard_normal((TRIALS, BINS)), 1) / 6 for _ in range(5)], -1)
+        first = rng.standard_normal((TRIALS, BINS, 5)) * (np.arange(5) > 1)  # speeds are those of the motion
+        self.signatures = np.stack([first[::-1], first, second(self, first)], -1)
+        self.precision, self.groups = np.eye(1), GROUPS
+        self.drives = SimpleNamespace(simulate=lambda sets: np.stack([self.features(one) for one in sets]))
+        law = first * (1 + form * np.abs(self.motion[..., :1]))
+        self.data = self.features(np.array([0.0, 0.0, truth[1]])) + truth[0] * law + rng.standard_normal(first.shape)
+
+    def features(self, sizes):
+        return self.motion + self.signatures @ sizes
+
+    def white(self, series):
+        return series.reshape(TRIALS, BINS * 5, *series.shape[3:])
+
+    def values_at(self, hypotheses, u, q):
+        return np.concatenate([u, q])
+
+    def fit(self, count):
+        """The joint fit of the first `count` effects."""
+        columns = self.white(self.signatures[..., : 1 + count])
+        flat, data = columns.reshape(-1, 1 + count), self.white(self.data - self.motion)
+        sizes = np.linalg.lstsq(flat, data.reshape(-1), rcond=None)[0]
+        residual = data - columns @ sizes
+        names = tuple(effect(name) for name in ("first", "second")[:count])
+        whole = np.concatenate([sizes, np.zeros(2 - count)])
+        return Refit(names, sizes[:1], sizes[1:], float(np.square(residual).sum()), residual, columns, whole)
+
+
+def unrelated(model, first):
+    return first[:, ::-1]
+
+
+def stronger_when_fast(model, first):
+    return first * np.abs(model.motion[..., :1])
+
+
+def test_an_effect_of_its_own_is_not_imitated_by_other_forms_of_the_first():
+    model = Linear(unrelated, (3.0, 1.0))
+    forms = other_forms(model, model.fit(2), GROUPS)
+    assert forms.own > 0.95 and forms.instead < 0.05
+
+
+def test_what_grows_with_the_speed_where_the_first_effect_does_is_imitated():
+    model = Linear(stronger_when_fast, (3.0, 0.0), form=0.5)
+    fit = model.fit(2)
+    assert abs(fit.q[1]) > 1  # it explains what the law of the first leaves
+    forms = other_forms(model, fit, GROUPS)
+    assert forms.own < 0.05 and forms.instead > 0.95
+
+
+@pytest.mark.parametrize(("second", "form", "own"), [(unrelated, 0.0, True), (stronger_when_fast, 0.5, False)])
+def test_half_of_what_is_left_makes_a_second_effect_unless_another_form_of_the_first_would_do(second, form, own):
+    model = Linear(second, (3.0, 0.0 if form else 1.0), form)
+    alone, both = model.fit(1), model.fit(2)
+    one = Candidate(effect("second"), alone.cost - both.cost, 0.0, 0.8, both)
+    found = SimpleNamespace(accepted=[SimpleNamespace(gain=4 * one.gain)])
+    nothing_else = Thresholds(same=-1.0, own=2.0)
+    assert _own(one, found, 0.5, lambda fit: 0.8, model, GROUPS, nothing_else) is own
+
+
+def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():
+    rng = np.random.default_rng(0)
+    change, motion = rng.standard_normal((TRIALS, BINS, 5)), np.zeros((TRIALS, BINS, 5))
+    columns = modulated(change, motion, GROUPS)
+    assert columns.shape == (*change.shape, 7 + len(GROUPS) + 2)
+    assert not columns[..., :6].any()  # the vehicle stands still
+    np.testing.assert_allclose(columns[..., 7 : 7 + len(GROUPS)].sum(-1), change)
+
+
+def test_what_gains_most_is_refitted_though_it_does_not_stand_out():
+    """What wanders from day to day must be larger to stand out; what imitates it need not."""
+    effects = [effect(name) for name in ("traction", "payload", "slope")]
+    gain, worth = np.array([100.0, 20.0, 1.0]), np.array([1.0, 15.0, 1.0])
+    first = SimpleNamespace(p_of=lambda h, worth: 0.001 if worth > 10 else 0.5)
+    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, set(), Thresholds())
+    assert sorted(h for h, _ in chosen) == [0, 1]
+    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, {"traction"},
+                     Thresholds())
+    assert [h for h, _ in chosen] == [1]
+
+
+@pytest.mark.parametrize("imitates", [(0, 1), (1, 0)])
+def test_what_the_best_fit_imitates_has_its_chance_as_what_imitates_it(imitates):
+    effects = [effect(name) for name in ("payload", "traction", "slope")]
+    similar = np.eye(3)
+    similar[imitates] = 0.8
+    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == [1]
+    assert _rivals(effects, np.eye(3), [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == []
