@@ -32,7 +32,7 @@ from whill_mjx import evaluate as evaluation_command
 from whill_mjx.dataset import write_json
 from whill_mjx.inside import mean_figures
 from whill_mjx.train import TrainOptions, main, preset_name
-from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat
+from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat, with_settings
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
             out=options.out, vehicle=options.vehicle, task=options.task, preset=preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
             action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
-            instances=options.instances, eval_every=options.eval_every,
+            change=tuple(options.change), instances=options.instances, eval_every=options.eval_every,
             export="best" if preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
         )
@@ -78,9 +78,7 @@ def together(options: argparse.Namespace) -> None:
         preset = with_repeat(preset, options.repeat)
     task = dataclasses.replace(preset.task, layout=options.layout)
     steps = options.steps or preset.total_steps
-    changes = {name: json.loads(value) for name, value in (one.split("=", 1) for one in options.change)}
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    learner = dataclasses.replace(preset.learner, **changes)
+    learner = with_settings(preset.learner, options.change)
     rows = steps + 2 * preset.instances + learner.pretrain_steps
     learner = dataclasses.replace(learner, replay_capacity=min(learner.replay_capacity, rows))
     vehicle = options.vehicle or "whill_cr_ramp"
@@ -230,6 +228,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--eval-every", type=int, help="environment steps; the preset's unless given")
     one.add_argument("--lr", type=float, help="learning rate; the preset's unless given")
     one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
+    one.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="other settings of the learner")
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
     one.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")

@@ -41,6 +41,7 @@ from whill_mjx.training import (
     ppo_policy,
     step_driver,
     with_repeat,
+    with_settings,
 )
 
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
@@ -83,6 +84,8 @@ class TrainOptions:
     """Learning rate; none takes the preset's."""
     train_ratio: float | None = None
     """Replayed steps per environment step; none takes the preset's."""
+    change: tuple[str, ...] = ()
+    """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""
     action_repeat: int | None = None
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
@@ -182,6 +185,10 @@ def choose_preset(options: TrainOptions) -> Preset:
         learner = dataclasses.replace(learner, train_ratio=options.train_ratio, lr_decay=decay)
     if options.targets:
         learner = dataclasses.replace(learner, decode_only=(TRUTH,))
+    if options.learner == "ppo":
+        baseline = with_settings(baseline, options.change)
+    else:
+        learner = with_settings(learner, options.change)
     return dataclasses.replace(
         preset,
         task=dataclasses.replace(preset.task, layout=options.layout),

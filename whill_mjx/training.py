@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,6 +130,25 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
         total_steps=round(preset.total_steps / factor),
         eval_every=max(1, round(preset.eval_every / factor)),
     )
+
+
+def with_settings(learner: Any, settings: Sequence[str]) -> Any:
+    """The learner's configuration with some settings changed, each given as NAME=VALUE with a value as in JSON.
+
+    ValueError says what is wrong with one.
+    """
+    known = {field.name for field in dataclasses.fields(learner)}
+    changes = {}
+    for text in settings:
+        name, _, value = text.partition("=")
+        if name not in known:
+            raise ValueError(f"{text!r} changes no setting of the learner; these are: {', '.join(sorted(known))}.")
+        try:
+            found = json.loads(value)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{text!r}: give NAME=VALUE, the value as in JSON: 0.1, true or [1, 2].") from error
+        changes[name] = tuple(found) if isinstance(found, list) else found
+    return dataclasses.replace(learner, **changes)
 
 
 def to_transition(step: TimeStep) -> Transition:

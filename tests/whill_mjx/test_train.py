@@ -262,6 +262,19 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
 
 
 @pytest.mark.quick
+def test_any_setting_of_the_learner_can_be_changed_and_a_wrong_one_is_refused_by_name():
+    asked = TrainOptions(preset="cpu", change=("greedy_share=0.25", "mults=[1, 2]", "mirror=true"))
+    learner = choose_preset(asked).learner
+    assert learner.greedy_share == 0.25 and learner.mults == (1, 2) and learner.mirror is True
+    preset = choose_preset(TrainOptions(preset="cpu", learner="ppo", change=("discount=0.9",)))
+    assert preset.ppo.discount == 0.9
+    for wrong, told in (("greedy=1", "greedy_share"), ("greedy_share=a", "JSON"), ("greedy_share", "JSON"),
+                        ("greedy_share=2", "must lie in")):
+        with pytest.raises(ValueError, match=told):
+            choose_preset(TrainOptions(preset="cpu", change=(wrong,)))
+
+
+@pytest.mark.quick
 def test_targets_are_for_the_decoder_alone():
     plain, told = (choose_preset(TrainOptions(preset="cpu", targets=asked)).learner for asked in (False, True))
     assert plain.decode_only == () and told == dataclasses.replace(plain, decode_only=("truth",))
