@@ -267,10 +267,9 @@ def _absent(
     """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
     count = float(quiet.sum())
     left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    gains = [_gain(fit, each, precision) for each in fit.parts]
-    gain = gains[fit.parts.index(part)]
+    gain = _gain(fit, part, precision)
     p = float(p_excess(left / count)) if count else 1.0
-    share = left / sum(gains)
+    share = left / _gain(fit, slice(0, len(fit.q)), precision)
     told = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
     outcome = "falsified" if p < alpha and share > LEFT else "holds" if told else "untold"
     return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
