@@ -24,7 +24,7 @@ from scipy import stats
 
 from sysid.log import Trial
 from sysid.loop.agreement import beside
-from sysid.loop.refit import Refit, Refitter
+from sysid.loop.refit import Refit, Refitter, moved_last, without_each
 from sysid.metrics import command_in_force
 
 ALPHA = 0.01
@@ -210,12 +210,6 @@ def put_to_test(
     return out
 
 
-def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:
-    """All parameters of a joint fit without one effect, for each of them."""
-    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
-            for i, part in enumerate(fit.parts)]
-
-
 def sizes_in_parts(
     fit: Refit, part: slice, signatures: np.ndarray, refitter: Refitter, groups: Sequence[Sequence[int]]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -267,21 +261,19 @@ def _absent(
     """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
     count = float(quiet.sum())
     left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    gain = _gain(fit, part, precision)
+    gain = _gain(moved_last(fit, fit.parts.index(part)), part.stop - part.start, precision)
     p = float(p_excess(left / count)) if count else 1.0
-    share = left / _gain(fit, slice(0, len(fit.q)), precision)
+    share = left / _gain(fit, len(fit.q), precision)
     told = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
     outcome = "falsified" if p < alpha and share > LEFT else "holds" if told else "untold"
     return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
                   1.0 if told else 0.0)
 
 
-def _gain(fit: Refit, part: slice, precision: np.ndarray) -> float:
-    """By how much some coordinates lower the cost of a joint fit, beside all others. Linear."""
-    size, q = len(fit.u), fit.q[part]
-    mine = list(range(size + part.start, size + part.stop))
-    order = [*(i for i in range(size + len(fit.q)) if i not in mine), *mine]
-    return max(float(q @ beside(fit.products(precision)[np.ix_(order, order)], len(q)) @ q), 1e-9)
+def _gain(fit: Refit, count: int, precision: np.ndarray) -> float:
+    """By how much the last `count` coordinates lower the cost of a joint fit, beside all others. Linear."""
+    q = fit.q[-count:]
+    return max(float(q @ beside(fit.products(precision), count) @ q), 1e-9)
 
 
 def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> Course:

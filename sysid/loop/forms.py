@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.loop.refit import Refit, Refitter
+from sysid.loop.refit import Refit, Refitter, without_each
 
 USUAL = 0.5
 """Standard deviation of the sizes of such columns, as a share of the effect."""
@@ -37,26 +37,21 @@ def other_forms(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]])
     Args:
         groups: trials of each manoeuvre.
     """
-    def without(part: slice) -> np.ndarray:
-        q = fit.q.copy()
-        q[part] = 0.0
-        return refitter.values_at(fit.hypotheses, fit.u, q)
-
-    whole, *less = refitter.drives.simulate(np.stack([fit.values, *map(without, fit.parts[:-1])]))
+    whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)[:-1]]))
     bent = np.concatenate([refitter.white(modulated(whole - one, whole, groups)) for one in less], axis=-1)
     size, part = len(fit.u), fit.parts[-1]
-    mine = np.arange(size + part.start, size + part.stop)
     columns = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    others, bent = np.delete(columns, mine, axis=1), bent.reshape(len(columns), -1)
+    others, mine = np.split(columns, [size + part.start], axis=1)  # the last effect's columns are the last
+    bent = bent.reshape(len(columns), -1)
     prior = np.zeros((others.shape[1],) * 2)
     prior[:size, :size] = refitter.precision
     wide = np.pad(prior, (0, bent.shape[1]))
     wide[np.diag_indices(len(wide))] += np.repeat([0.0, USUAL**-2], [len(prior), bent.shape[1]])
-    signature = columns[:, mine] @ fit.q[part]
+    signature = mine @ fit.q[part]
     without_it = fit.residual.reshape(-1) + signature
     forms = np.concatenate([others, bent], axis=1)
     cost = left(without_it, others, prior)
-    gain = cost - left(without_it, columns, np.pad(prior, (0, len(mine))))  # the last effect's columns are the last
+    gain = cost - left(without_it, columns, np.pad(prior, (0, mine.shape[1])))
     return Forms(left(signature, forms, wide) / max(left(signature, others, prior), 1e-9),
                  (cost - left(without_it, forms, wide)) / max(gain, 1e-9))
 

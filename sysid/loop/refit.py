@@ -276,3 +276,9 @@ class Refitter:
                 break
             free &= ~out
         return step, float(2 * right @ step - step @ matrix @ step)
+
+
+def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:
+    """All parameters of a joint fit without one effect, for each of them."""
+    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
+            for i, part in enumerate(fit.parts)]

@@ -22,12 +22,13 @@ from sysid.fit import main as fit_main
 from sysid.log import load_log
 from sysid.loop.catalogue import base_values
 from sysid.loop.drives import make_drives
-from sysid.loop.falsifiers import course_of, put_to_test, without_each
+from sysid.loop.falsifiers import course_of, put_to_test
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
+from sysid.loop.refit import without_each
 from sysid.loop.report import effects, make_report, own_floor, replay, write_run
 from sysid.loop.tables import Table
 from sysid.loop.trust import beside_still_base, warnings

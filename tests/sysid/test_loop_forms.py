@@ -42,7 +42,8 @@ class Linear:
         return series.reshape(TRIALS, BINS * 5, *series.shape[3:])
 
     def values_at(self, hypotheses, u, q):
-        return np.concatenate([u, q])
+        sizes = {one.effect: size for one, size in zip(hypotheses, q, strict=True)}
+        return np.array([*u, sizes.get("first", 0.0), sizes.get("second", 0.0)])
 
     def fit(self, count):
         """The joint fit of the first `count` effects."""
