@@ -19,7 +19,8 @@ from whill_mjx.types import parameters_of
 
 SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
 ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
-CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow the cache
+CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
+ACCELERATED = 2048  # the same on an accelerator, which takes as long for one
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,8 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width)
-    paths = paths or PathReplay(plant, vehicle, min(CHUNK, 10 * len(courses.first)))
+    rows = min(CHUNK, 10 * len(courses.first)) if jax.default_backend() == "cpu" else ACCELERATED
+    paths = paths or PathReplay(plant, vehicle, rows)
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
 

@@ -8,7 +8,7 @@ drives would raise a false alarm, and calibrate its p-value without the assumpti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,7 +20,7 @@ from sysid.loop.evidence import Evidence, at_fit, white_leftover
 from sysid.loop.found import Search, Thresholds, excess_of, explained_share
 from sysid.loop.pairs import PairScan, scan_again
 from sysid.loop.reference import alike
-from sysid.loop.refit import Refitter
+from sysid.loop.refit import ITERATIONS, Refit, Refitter, Start, side_by_side
 from sysid.loop.rounds import refitted
 from sysid.loop.scan import Scan, best, drawn_away, family, tail
 from sysid.loop.search import pair_round
@@ -28,6 +28,9 @@ from sysid.loop.solver import Solver
 from sysid.loop.wander import Wander
 from sysid.result import Progress
 from sysid.statistics import upper_rate
+
+TOGETHER = 16
+"""Days whose base fits advance side by side."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,7 @@ def run(
     factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
     similar = imitation(evidence, hypotheses)
     p, alarms = np.ones(count), 0
-    for n in range(count):
-        u = np.clip(reference.u + drawn_away(factor, rng), 0.0, 1.0)
-        one = refitter.aimed(refitter.white_of(u) + _noise(refitter, rng))
-        base = one.fit((), np.zeros(0))
+    for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
         around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
         looked = best(Solver(around), hypotheses, wander)
         p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
@@ -91,6 +91,21 @@ def run(
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")
     return NullRefits(p, alarms)
+
+
+def _days(
+    refitter: Refitter, factor: np.ndarray, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Refitter, Refit]]:
+    """Simulated days, each with its base fit; `factor` (P, P) is that of the day-to-day spread. Several are replayed
+    together: alone they would leave most rows of a replay unused."""
+    reference = refitter.reference
+    start = Start((), reference.u, np.zeros(0))
+    for first in range(0, count, TOGETHER):
+        drawn = [(np.clip(reference.u + drawn_away(factor, rng), 0.0, 1.0), _noise(refitter, rng))
+                 for _ in range(min(TOGETHER, count - first))]
+        seen = refitter.white_of(np.stack([u for u, _ in drawn]))
+        days = [refitter.aimed(white + noise) for white, (_, noise) in zip(seen, drawn, strict=True)]
+        yield from zip(days, side_by_side([(day, start) for day in days], ITERATIONS), strict=True)
 
 
 def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresholds) -> Search:

@@ -21,6 +21,8 @@ REACH = 4.0
 """Standard deviations of the day-to-day spread that a base parameter may be off. What lies further is an effect."""
 STIFF = 0.25
 """Share of the day-to-day spread that a fit leaves base parameters which shall hardly move."""
+ITERATIONS = 12
+"""Of a fit, at most."""
 STEP_Q = 0.08
 """Difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small."""
 
@@ -112,10 +114,10 @@ class Refitter:
         return other
 
     def white_of(self, u: np.ndarray) -> np.ndarray:
-        """(B, n) white features of the base model with parameters u (P,)."""
-        return self.white(self.drives.simulate(self.values_at((), u, np.zeros(0))[None]))[0]
+        """(N, B, n) white features of the base model with parameters u (N, P)."""
+        return self.white(self.drives.simulate(np.stack([self.values_at((), one, np.zeros(0)) for one in u])))
 
-    def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = 12) -> Refit:
+    def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = ITERATIONS) -> Refit:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
         return self.fit_all([Start(tuple(hypotheses), self.reference.u, q)], iterations)[0]
 
@@ -125,23 +127,10 @@ class Refitter:
         return bool((fit.u <= self.low).any() or (fit.u >= self.high).any() or (np.abs(fit.q) >= limits).any())
 
     def fit_all(self, starts: Sequence[Start], iterations: int) -> list[Refit]:
-        """Fits from several starts, side by side: what they ask of the simulator at one time goes into one call."""
-        runs = [self._run(start, iterations) for start in starts]
-        asked = {number: next(run) for number, run in enumerate(runs)}
-        done: dict[int, Refit] = {}
-        while asked:
-            white = self.white(self.drives.simulate(np.concatenate(list(asked.values()))))
-            place, following = 0, {}
-            for number, sets in asked.items():
-                try:
-                    following[number] = runs[number].send(white[place : place + len(sets)])
-                except StopIteration as end:
-                    done[number] = end.value
-                place += len(sets)
-            asked = following
-        return [done[number] for number in range(len(starts))]
+        """Fits from several starts, side by side."""
+        return side_by_side([(self, start) for start in starts], iterations)
 
-    def _run(self, start: Start, iterations: int) -> Generator[np.ndarray, np.ndarray, Refit]:
+    def run(self, start: Start, iterations: int) -> Generator[np.ndarray, np.ndarray, Refit]:
         """One fit: yields parameter sets (N, all), is sent their white features (N, B, n).
 
         The coordinates' columns are renewed in every iteration, those of the base parameters only where a step did not
@@ -276,6 +265,28 @@ class Refitter:
                 break
             free &= ~out
         return step, float(2 * right @ step - step @ matrix @ step)
+
+
+def side_by_side(fits: Sequence[tuple[Refitter, Start]], iterations: int) -> list[Refit]:
+    """Fits of one vehicle to drives with the same commands (`Refitter.aimed`), each from its start: what they ask of
+    the simulator at one time goes into one call."""
+    if not fits:
+        return []
+    refitter = fits[0][0]
+    runs = [one.run(start, iterations) for one, start in fits]
+    asked = {number: next(run) for number, run in enumerate(runs)}
+    done: dict[int, Refit] = {}
+    while asked:
+        white = refitter.white(refitter.drives.simulate(np.concatenate(list(asked.values()))))
+        place, following = 0, {}
+        for number, sets in asked.items():
+            try:
+                following[number] = runs[number].send(white[place : place + len(sets)])
+            except StopIteration as end:
+                done[number] = end.value
+            place += len(sets)
+        asked = following
+    return [done[number] for number in range(len(fits))]
 
 
 def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:

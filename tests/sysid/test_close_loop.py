@@ -143,6 +143,16 @@ def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sl
     assert not weak.accepted
 
 
+def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, monkeypatch):
+    def days():
+        return run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
+                               sloping.search.scan, CONFIG.thresholds, 3).p
+
+    together = days()
+    monkeypatch.setattr("sysid.loop.null_refits.TOGETHER", 1)
+    np.testing.assert_allclose(days(), together, rtol=1e-6)
+
+
 @pytest.mark.parametrize("accepted", [True, False])
 def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(sloping, monkeypatch, accepted):
     def rounds(found, *_):
