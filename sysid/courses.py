@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.log import Trial
-from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
+from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch, on_all_cores
 
 INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
 SETS = 4  # parameter sets replayed together there: one compilation serves them all
@@ -51,7 +51,7 @@ class CourseReplay:
                         odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
-        self._replay = Replay(plant, whole, set_values)
+        self._replay, self._compiled = Replay(plant, whole, set_values), False
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
@@ -59,8 +59,9 @@ class CourseReplay:
             return self._spread(self._replay.simulate(values), motion=True)
         rows, count = int(np.clip(INSTANCES // self.courses, 1, SETS)), len(values)
         values = np.concatenate([values, np.repeat(values[-1:], -count % rows, axis=0)])
-        parts = [self._spread(self._replay.simulate(values[i : i + rows]), motion=True)
-                 for i in range(0, len(values), rows)]
+        parts = on_all_cores(lambda i: self._spread(self._replay.simulate(values[i : i + rows]), motion=True),
+                             range(0, len(values), rows), self._compiled)
+        self._compiled = True
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:

@@ -90,7 +90,7 @@ def mjcf_model(
     if room_fixed is None:
         world = host.geom_bodyid == 0
         room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
-    params = make_parameters(bounds, room_fixed=room_fixed, differences=True)
+    params = make_parameters(bounds, room_fixed=room_fixed)
     plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
                               wheel_radius=robot.wheel_radius, track=robot.track)
 

@@ -51,8 +51,6 @@ class Parameters:
     """Unit, bounds and initial value (as `neutral`) of each of `values`."""
     room_fixed: bool = struct.field(pytree_node=False, default=False)
     """Whether the motion depends on where in the room it starts."""
-    differences: bool = struct.field(pytree_node=False, default=False)
-    """Take derivatives by differences: forward mode through a contact solver means nothing."""
 
 
 @dataclass(frozen=True)
@@ -161,9 +159,11 @@ def make_replay(
         return set_parameters(params, space.names, values)
 
     if not isinstance(params, Parameters):
-        return make_courses(plant, trials, put, params)
-    courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
-    return DifferenceReplay(courses, space) if params.differences else courses, courses.measured
+        courses, measured = make_courses(plant, trials, put, params)
+    else:
+        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
+        measured = courses.measured
+    return DifferenceReplay(courses, space), measured
 
 
 def make_parameters(bounds: Mapping[str, Bounds], **fields: bool) -> Parameters:

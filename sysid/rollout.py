@@ -11,7 +11,9 @@ moved to the start pose. Its controller, delays and slip are those of a vehicle 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -289,7 +291,7 @@ class PathReplay:
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> jax.Array:
             return path_of(plant, set_values(values), command, start, warm_up)
 
-        self.rows = rows
+        self.rows, self._compiled = rows, False
         self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), static_argnums=3)
 
     def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
@@ -299,12 +301,31 @@ class PathReplay:
         values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)])
         trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
         command, start = np.asarray(batch.command), np.asarray(batch.start)
-        parts = []
-        for i in range(0, len(values), self.rows):
-            chosen = trials[i : i + self.rows]
-            parts.append(np.asarray(self._run(jnp.asarray(values[i : i + self.rows], jnp.result_type(float)),
-                                              command[chosen], start[chosen], batch.warm_up)))
+
+        def part(first: int) -> np.ndarray:
+            chosen = trials[first : first + self.rows]
+            return np.asarray(self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
+                                        command[chosen], start[chosen], batch.warm_up))
+
+        parts = on_all_cores(part, range(0, len(values), self.rows), self._compiled)
+        self._compiled = True
         return np.concatenate(parts)[:count]
+
+
+def on_all_cores(replay: Callable[[int], Any], parts: Sequence[int], compiled: bool) -> list[Any]:
+    """What `replay` gives for each of `parts`, in their order. On a processor each keeps one core busy, so as many run
+    side by side as there are cores; an accelerator takes one after the other.
+
+    Args:
+        compiled: otherwise the first goes ahead alone and compiles what the others use.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = min(cores, len(parts)) if jax.default_backend() == "cpu" else 1
+    if workers < 2:
+        return [replay(part) for part in parts]
+    ahead = [] if compiled else [replay(parts[0])]
+    with ThreadPoolExecutor(workers) as threads:
+        return [*ahead, *threads.map(replay, parts[len(ahead) :])]
 
 
 def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import threading
 import tomllib
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from sysid.log import Command, OdometryStream, PoseStream, make_trial
 from sysid.mjcf import mjcf_model
 from sysid.mjcf_file import load_robot, resolve, write_mjcf
 from sysid.models import function_model, load_model, make_parameters, model_space, set_parameters
+from sysid.rollout import on_all_cores
 from sysid.scenarios import Scenario
 from sysid.synthetic import write_dataset
 from whill_mjx.manoeuvres import command_table
@@ -235,6 +237,23 @@ def test_motors_get_a_speed_controller_of_their_own(tmp_path):
     model = mjcf_model(path, ["body.base.mass"])
     assert set(model.params.values) == {"drive.kp", "body.base.mass"}
     assert model_space(model.params).log.all()
+
+
+@pytest.mark.quick
+def test_replays_on_all_cores_come_back_in_their_order_and_the_first_compiles(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(3), raising=False)
+    threads: dict[int, str] = {}
+
+    def replay(part):
+        threads[part] = threading.current_thread().name
+        return 10 * part
+
+    for compiled in (False, True):
+        assert on_all_cores(replay, range(5), compiled) == [0, 10, 20, 30, 40]
+        assert (threads[0] == threading.current_thread().name) != compiled
+        assert threading.current_thread().name not in {threads[part] for part in range(1, 5)}
+    assert on_all_cores(replay, range(1), True) == [0]
+    assert threads[0] == threading.current_thread().name
 
 
 @pytest.mark.quick
