@@ -7,7 +7,9 @@ Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,6 +49,9 @@ QUICK_ITERATIONS = 14
 FEATURE_ITERATIONS = 20
 GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
+FLAT, ENDS = 1.6, 4
+"""Factor on the cost within which an end of a range may be worse and still be searched from, and from how many."""
+LOOK = 6  # iterations after which a search from elsewhere must be better
 
 
 @dataclass(frozen=True)
@@ -306,8 +311,12 @@ def gradient_search(
     objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
     progress: Progress | None,
 ) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
-    """LM from all starts; delays are then profiled on a grid, and LM tries another valley that is about as deep. Noise
-    scales that are mere defaults are replaced by the size of the residual and LM continues."""
+    """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
+
+    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    between looks flat from here: LM tries the ends of ranges that cost little. Delays are profiled on a grid, and LM
+    tries another valley that is about as deep.
+    """
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
         return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
@@ -317,15 +326,32 @@ def gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
+    costs, ends = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
+    near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:ENDS]
+    result = _from_elsewhere(partial(search, objective), result, ends[near], iterations)
     found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
     for name, _, costs, followed in found:
         here = result.u[space.names.index(name)]
         apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
-        other = followed[apart][costs[apart].argmin()]
         if costs[apart].min() < result.cost * (1 + VALLEY):
-            new = search(objective, other[None], iterations)
-            result = new if new.cost < result.cost else result
+            other = followed[apart][costs[apart].argmin()]
+            result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
+
+
+def _from_elsewhere(
+    search: Callable[[np.ndarray, int], FitResult], result: FitResult, starts: np.ndarray, iterations: int
+) -> FitResult:
+    """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
+    iterations, the best of them to its end where it is lower by then."""
+    if not len(starts):
+        return result
+    new = search(starts, min(LOOK, iterations))
+    spent = result.evaluations + new.evaluations
+    if new.cost < result.cost:
+        new = search(new.u[None], iterations)
+        result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations
+    return replace(result, evaluations=spent)
 
 
 def _keep_channels(trial: Trial, channels: str) -> Trial:
@@ -337,11 +363,11 @@ def _keep_channels(trial: Trial, channels: str) -> Trial:
 
 
 def expected_steps(config: FitConfig) -> int:
-    """How far the progress bar goes at most."""
+    """How far the progress bar goes, unless searches from elsewhere lead on."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
-    return first + (iterations if config.method not in GLOBAL else 0)
+    return first + (iterations + 3 * min(LOOK, iterations) if config.method not in GLOBAL else 0)
 
 
 @dataclass(frozen=True, kw_only=True)

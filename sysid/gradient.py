@@ -18,6 +18,7 @@ DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
 MAX_DAMPING = 1e4
 MAX_STEP = 0.3  # of the range, in one iteration
+APART = 0.1  # of the range, from which an end of it may lie in another valley
 HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
 
 
@@ -86,6 +87,19 @@ def fit(
     return FitResult(u=u[order[0]], cost=float(cost[order[0]]), initial_cost=initial,
                      evaluations=evaluations, starts=u[order], start_costs=cost[order], order=order,
                      history=np.array(history))
+
+
+def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (E,) and points (E, P) with one parameter of u (P,) at an end of its range, where that is far away."""
+    points = []
+    for index, here in enumerate(u):
+        for end in (0.0, 1.0):
+            if abs(end - here) > APART:
+                points.append(u.copy())
+                points[-1][index] = end
+    starts = np.array(points).reshape(-1, len(u))
+    residual = objective.residuals(starts)
+    return np.asarray(robust_cost(residual, robust) / objective.counted), starts
 
 
 def profile_delays(
