@@ -72,9 +72,9 @@ class Recorder:
         return found
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
-        """As that of the replay."""
+        """As that of the replay, by central differences: each parameter takes two more sets."""
         found = self._replay.jacobian(values)
-        self._record(values, found[0], len(values) * (1 + values.shape[1]))
+        self._record(values, found[0], len(values) * (1 + 2 * values.shape[1]))
         return found
 
     def _record(self, values: np.ndarray, found: Simulated, evaluations: int) -> None:
