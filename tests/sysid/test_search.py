@@ -9,12 +9,45 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
 
 from sysid import gradient, tpe, uncertainty
+from sysid.fit import FitConfig, gradient_search
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.objective import Noise
 from sysid.rollout import Replay, make_batch, predictions
 from sysid.space import Space
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoValleys:
+    """Cost 1 at (0.5, 0.5), where no derivative leads away, and 0.04 at (1, 1), behind a ridge."""
+
+    steep: float
+    """How much it costs that the first parameter stays behind the second."""
+    counted = 1
+    noise = Noise(np.ones(3), np.ones(5), "replicates")
+
+    def residuals(self, u):
+        behind, x = self.steep * (u[:, 0] - u[:, 1]), u[:, 1]
+        valley = 1.0 + 0.25 * np.sin(2 * np.pi * (x - 0.5)) ** 2 - 3.2 * np.maximum(x - 0.75, 0.0)
+        return np.stack([behind, valley], axis=-1)[:, None]
+
+    def jacobian(self, u):
+        sides = [self.residuals(u + sign * 1e-4 * one) for one in np.eye(2) for sign in (1, -1)]
+        return self.residuals(u), np.stack([(sides[0] - sides[1]), (sides[2] - sides[3])], axis=-1) / 2e-4
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("steep", "cost"), [(2.0, 0.04), (4.0, 1.0)])
+def test_a_search_goes_on_from_the_end_of_a_range_that_costs_little(steep, cost):
+    space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
+    valleys, start = TwoValleys(steep), np.full((1, 2), 0.5)
+    stuck = gradient.fit(valleys, space, starts=start, iterations=20)
+    assert stuck.cost == pytest.approx(1.0, abs=1e-3)
+    result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
+    assert result.cost == pytest.approx(cost, abs=1e-3)  # the steep end costs 4: not looked from
+    assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
+    np.testing.assert_array_equal(result.starts, stuck.starts)  # the report tells where the given starts ended
 
 
 def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
