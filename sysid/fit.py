@@ -51,7 +51,7 @@ GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 FLAT, ENDS = 1.6, 4
 """Factor on the cost within which an end of a range may be worse and still be searched from, and from how many."""
-LOOK = 6  # iterations after which a search from elsewhere must be better
+LOOK = 3  # iterations after which a search from elsewhere must be better
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,8 @@ class FitConfig:
     of the global search (both: at least one of them)."""
     iterations: int = 40
     """Iterations of the gradient search on poses."""
+    elsewhere: bool = True
+    """Whether the gradient search is also tried from the ends of ranges that cost little and from other delays."""
     seed: int = 0
     """Seed of both searches."""
     quick: bool = False
@@ -315,7 +317,7 @@ def gradient_search(
 
     What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. Delays are profiled on a grid, and LM
-    tries another valley that is about as deep.
+    tries another valley that is about as deep. Neither is tried without `config.elsewhere`.
     """
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
@@ -326,14 +328,15 @@ def gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
-    costs, ends = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
-    near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:ENDS]
-    result = _from_elsewhere(partial(search, objective), result, ends[near], iterations)
+    if config.elsewhere:
+        costs, ends = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
+        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:ENDS]
+        result = _from_elsewhere(partial(search, objective), result, ends[near], iterations)
     found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
     for name, _, costs, followed in found:
         here = result.u[space.names.index(name)]
         apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
-        if costs[apart].min() < result.cost * (1 + VALLEY):
+        if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
             result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]

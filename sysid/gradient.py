@@ -1,12 +1,15 @@
-"""Bounded Levenberg-Marquardt from several starts at once, with forward-mode Jacobians.
+"""Bounded Levenberg-Marquardt from several starts at once.
 
 All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
-start, of which the best is taken; starts that have converged wait. Steps are in unit coordinates; a step that leaves
-the box is cut at its wall and the parameters at a wall whose gradient points outwards are held.
+start, of which the best is taken; starts that have converged wait. A Jacobian takes two replays for each parameter, so
+a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
+steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates; a
+step that leaves the box is cut at its wall and the parameters at a wall whose gradient points outwards are held.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +22,20 @@ DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 MAX_DAMPING = 1e4
 MAX_STEP = 0.3  # of the range, in one iteration
 APART = 0.1  # of the range, from which an end of it may lie in another valley
+FOLLOWING = 3  # tries at most without a new Jacobian
+PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
+GOES_ON = 10.0  # tolerances by which a step that is not the last lowers the cost
 HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Starts that try a step."""
+
+    starts: np.ndarray  # (G,) int
+    residual: np.ndarray  # (G, B, K)
+    jacobian: np.ndarray  # (G, B, K, P)
+    exact: np.ndarray  # (G,) bool: the derivatives are of the very point
 
 
 class Residuals(Protocol):
@@ -41,7 +57,8 @@ def fit(
     Args:
         objective: residuals and Jacobians in unit coordinates of `space`.
         starts: (S, P) unit coordinates; the initial values by default.
-        tolerance: a start has converged when its cost falls by less than this share, twice in a row.
+        tolerance: a start has converged when its cost fell by less than this share twice, and not by GOES_ON times as
+            much in between: where wheels skid or torques meet their limit, costs are jagged.
         robust: Huber instead of squares.
         frozen: names that keep each start's value.
     """
@@ -51,33 +68,52 @@ def fit(
     cost = np.full(count, np.inf)
     initial, evaluations = np.inf, 0
     history: list[float] = []
-    for iteration in range(iterations):
-        going = np.flatnonzero(calm < 2)
-        residual, jacobian = objective.jacobian(u[going])
+
+    def step(at: _Points) -> _Points:
+        """Move these starts; those of them that can try again without a new Jacobian."""
+        nonlocal evaluations
+        residual, jacobian = at.residual, at.jacobian
         weight = huber_weight(residual) if robust else np.ones_like(residual)
-        cost[going] = robust_cost(residual, robust) / objective.counted
-        if iteration == 0:
-            initial = float(cost[0])
         gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
         hessian = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
         candidates = np.stack([
             np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in DAMPINGS])
-            for i, n in enumerate(going)])  # (G, D, P)
+            for i, n in enumerate(at.starts)])  # (G, D, P)
         tried = objective.residuals(candidates.reshape(-1, space.size))
-        tried = tried.reshape(len(going), len(DAMPINGS), *residual.shape[1:])
+        tried = tried.reshape(*candidates.shape[:2], *residual.shape[1:])
         costs = np.stack([robust_cost(one, robust) for one in tried]) / objective.counted
-        evaluations += len(going) * (1 + len(DAMPINGS))
-        for i, n in enumerate(going):
-            best = costs[i].argmin()
-            new = costs[i, best]
-            if new < cost[n]:
-                calm[n] = calm[n] + 1 if cost[n] - new < tolerance * cost[n] else 0
-                u[n], cost[n] = candidates[i, best], new
-                damping[n] = np.clip(damping[n] * DAMPINGS[best], 1e-7, MAX_DAMPING)
-            else:
+        evaluations += costs.size
+        best, rows = costs.argmin(-1), np.arange(len(at.starts))
+        after, moves = tried[rows, best], candidates[rows, best] - u[at.starts]
+        again = np.zeros(len(rows), bool)
+        for i, n in enumerate(at.starts):
+            fallen = cost[n] - costs[i, best[i]]
+            if fallen > 0:
+                small = fallen < tolerance * cost[n]
+                foretold = -(2 * gradient[i] + hessian[i] @ moves[i]) @ moves[i] / objective.counted
+                again[i] = not small and fallen > PROMISE * foretold
+                if at.exact[i] and (small or fallen > GOES_ON * tolerance * cost[n]):
+                    calm[n] = calm[n] + 1 if small else 0
+                u[n], cost[n] = candidates[i, best[i]], costs[i, best[i]]
+                damping[n] = np.clip(damping[n] * DAMPINGS[best[i]], 1e-7, MAX_DAMPING)
+            elif at.exact[i]:
                 # Only when even a short step down the gradient does not help is the start at its minimum.
                 calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
                 damping[n] = min(damping[n] * 100.0, MAX_DAMPING)
+                after[i], moves[i], again[i] = residual[i], 0.0, calm[n] < 2
+        learnt = _learnt(jacobian[again], (after - residual)[again], moves[again])
+        return _Points(at.starts[again], after[again], learnt, (at.exact & ~moves.any(-1))[again])
+
+    for iteration in range(iterations):
+        going = np.flatnonzero(calm < 2)
+        points = _Points(going, *objective.jacobian(u[going]), np.ones(len(going), bool))
+        cost[going] = robust_cost(points.residual, robust) / objective.counted
+        evaluations += len(going)
+        if iteration == 0:
+            initial = float(cost[0])
+        for _ in range(1 + FOLLOWING):
+            if len(points.starts):
+                points = step(points)
         history.append(float(cost.min()))
         if progress is not None:
             progress(1, f"cost {cost.min():.4g}")
@@ -166,6 +202,13 @@ def robust_cost(residual: np.ndarray, robust: bool) -> np.ndarray:
         return np.square(residual).sum((-1, -2))
     size = np.abs(residual)
     return np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2).sum((-1, -2))
+
+
+def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """Derivatives (N, B, K, P) that foretell how a move (N, P) changed residuals (N, B, K), and else as they were."""
+    missed = change - np.einsum("nbkp,np->nbk", jacobian, move)
+    direction = move / np.maximum(np.square(move).sum(-1, keepdims=True), 1e-300)
+    return jacobian + missed[..., None] * direction[:, None, None, :]
 
 
 def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float, free: np.ndarray) -> np.ndarray:

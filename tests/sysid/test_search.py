@@ -204,6 +204,29 @@ def test_a_delay_is_profiled_on_a_grid_and_the_others_follow(objective):
 
 
 def test_starts_that_have_converged_are_not_searched_further(objective):
+    calls, tried = [], []
+
+    class Counted:
+        counted = objective.counted
+
+        @staticmethod
+        def residuals(u):
+            tried.append(len(u))
+            return objective.residuals(u)
+
+        @staticmethod
+        def jacobian(u):
+            calls.append(len(u))
+            return objective.jacobian(u)
+
+    starts = np.array([U_TRUTH, [0.9, 0.9, 0.1]])
+    result = gradient.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
+    assert calls[0] == 2 and calls[-1] == 1
+    assert result.evaluations == sum(calls) + sum(tried)
+
+
+def test_steps_that_bring_what_they_promise_are_followed_without_a_new_jacobian(objective):
+    """Fewer Jacobians lead to the same place, and what is learnt on the way foretells the last step exactly."""
     calls = []
 
     class Counted:
@@ -215,10 +238,21 @@ def test_starts_that_have_converged_are_not_searched_further(objective):
             calls.append(len(u))
             return objective.jacobian(u)
 
-    starts = np.array([U_TRUTH, [0.9, 0.9, 0.1]])
-    result = gradient.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
-    assert calls[0] == 2 and calls[-1] == 1
-    assert result.evaluations == 5 * sum(calls)
+    space, start = objective.space, np.array([[0.2, 0.8, 0.7]])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gradient, "FOLLOWING", 0)
+        plain = gradient.fit(Counted(), space, starts=start, iterations=20)
+        needed, calls[:] = len(calls), []
+        assert plain.evaluations == needed * 5
+    quick = gradient.fit(Counted(), space, starts=start, iterations=20)
+    assert len(calls) < needed
+    assert quick.cost == pytest.approx(plain.cost, rel=1e-4) and np.abs(quick.u - plain.u).max() < 0.01
+    rng = np.random.default_rng(0)
+    jacobian, change, move = rng.normal(size=(2, 3, 4, 5)), rng.normal(size=(2, 3, 4)), rng.normal(size=(2, 5))
+    learnt = gradient._learnt(jacobian, change, move)
+    np.testing.assert_allclose(np.einsum("nbkp,np->nbk", learnt, move), change, atol=1e-12)
+    across = np.cross(move[0, :3], rng.normal(size=3))
+    np.testing.assert_allclose(learnt[0, ..., :3] @ across, jacobian[0, ..., :3] @ across, atol=1e-12)
 
 
 def test_a_diverged_simulation_is_dear_and_not_a_number_nowhere(objective):
