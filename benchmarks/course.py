@@ -46,7 +46,8 @@ def run(options: argparse.Namespace) -> None:
             out=options.out, vehicle=options.vehicle, task=options.task, preset=preset, layout=options.layout,
             seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
             action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
-            change=tuple(options.change), instances=options.instances, eval_every=options.eval_every,
+            second_tries=options.second_tries, change=tuple(options.change), instances=options.instances,
+            eval_every=options.eval_every,
             export="best" if preset == "cpu" else "last",
             episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
         )
@@ -96,7 +97,9 @@ def together(options: argparse.Namespace) -> None:
                 for name, value in one.items()}
 
     starts = preset.exploring_starts if options.starts is None else options.starts
-    training = make_training_env(task, vehicle, preset.instances, exploring_starts=starts)
+    training = make_training_env(
+        task, vehicle, preset.instances, exploring_starts=starts, second_tries=preset.second_tries
+    )
     env = functional_env(training, targets=TRUTH in learner.decode_only)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
@@ -232,6 +235,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
     one.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
+    one.add_argument("--second-tries", type=float, help="share of failed worlds begun again; the preset's unless given")
     one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
     one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ class BatchState:
 
     env: State  # leaves (N, ...)
     params: VehicleParams  # leaves (N, ...): each instance has its own vehicle
+    origin: jax.Array  # (N,) random key from which world, vehicle and start of the episode were drawn
+    tries: jax.Array  # (N,) int32: how often the episode's world was begun again
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +39,13 @@ class BatchEnv:
     """Relative spread of the vehicle parameters, drawn anew for each episode; 0 gives all the nominal ones."""
     devices: tuple = ()
     """Devices over which the instances are split evenly; none leaves the placement to JAX."""
+    second_tries: float = 0.0
+    """Share of the episodes without an arrival after which the same world is begun again, with the same vehicle and
+    start; for training. What fails is met more often so (cf. prioritised level replay, Jiang et al. 2021)."""
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.second_tries < 1.0:
+            raise ValueError(f"second_tries is {self.second_tries}: it is a share of episodes; use 0 to below 1.")
         if self.devices and self.count % len(self.devices):
             raise ValueError(f"{self.count} instances do not split evenly over {len(self.devices)} devices.")
 
@@ -67,19 +75,25 @@ class BatchEnv:
         obs = jax.vmap(lambda one: observe(self.env, one))(state.env)  # once, after the choice between step and reset
         return state, time_step(obs, outcome, first)
 
-    def _begin(self, key: jax.Array) -> tuple[BatchState, Outcome]:
-        key, params_key = jax.random.split(key)
+    def _begin(self, origin: jax.Array, tries: jax.Array | int = 0) -> tuple[BatchState, Outcome]:
+        key, params_key = jax.random.split(origin)
         params = randomize_params(params_key, self.params, self.spread) if self.spread else self.params
         params = jax.tree.map(jnp.asarray, params)
         state = reset_state(self.env, params, key)
-        return BatchState(state, params), first_outcome(self.env, state)
+        return BatchState(state, params, origin, jnp.asarray(tries, jnp.int32)), first_outcome(self.env, state)
+
+    def _again(self, state: BatchState) -> tuple[jax.Array, jax.Array]:
+        """Key with which the next episode of an instance begins, and how often its world was begun before."""
+        chance = jax.random.uniform(jax.random.fold_in(state.env.key, state.tries))
+        again = (state.env.goal_distance > self.env.task.goal_radius) & (chance < self.second_tries)
+        return jnp.where(again, state.origin, state.env.key), jnp.where(again, state.tries + 1, 0)
 
     def _advance(self, state: BatchState, action: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
         ended = state.env.done
         after, outcome = step_state(self.env, state.params, state.env, action)
-        begun = self._begin(state.env.key)
+        begun = self._begin(*(self._again(state) if self.second_tries else (state.env.key,)))
         chosen, outcome = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old), begun, (BatchState(after, state.params), outcome)
+            lambda new, old: jnp.where(ended, new, old), begun, (dataclasses.replace(state, env=after), outcome)
         )
         return chosen, outcome, ended
 
@@ -95,6 +109,8 @@ class BatchEnv:
         return jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
 
 
-def make_batch(env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = ()) -> BatchEnv:
+def make_batch(
+    env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0
+) -> BatchEnv:
     """`count` instances of `env`; see `BatchEnv` for the rest."""
-    return BatchEnv(env, params, count, spread, tuple(devices))
+    return BatchEnv(env, params, count, spread, tuple(devices), second_tries)

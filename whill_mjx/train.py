@@ -95,6 +95,9 @@ class TrainOptions:
     exploring_starts: float | None = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
     and a real course cannot; evaluations always begin at the start. None takes the preset's."""
+    second_tries: float | None = None
+    """Share of the training episodes without an arrival after which the same world is begun again, which a simulator
+    can do; evaluations never do. None takes the preset's."""
     instances: int | None = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
@@ -198,6 +201,7 @@ def choose_preset(options: TrainOptions) -> Preset:
         instances=options.instances or preset.instances,
         eval_every=options.eval_every or preset.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
+        second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
@@ -241,8 +245,9 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
     """Train the world model and its policy, with an evaluation every `eval_every` steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts
-    )
+        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
+        second_tries=preset.second_tries,
+    )  # fmt: skip
     held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
     evaluate = evaluation_of(held_out, preset, options.seed)
     stopper = Stopper(options.out, preset.stop_success)
@@ -267,8 +272,9 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trai
     """Train the model-free baseline with as many environment steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts
-    )
+        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
+        second_tries=preset.second_tries,
+    )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt

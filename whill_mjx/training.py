@@ -44,6 +44,8 @@ class Preset:
     """Episodes of an evaluation inside the run; they are not those of the final one."""
     exploring_starts: float = 0.0
     """Share of training episodes that begin anywhere on the way (`whill_mjx.starts`); evaluations never do."""
+    second_tries: float = 0.0
+    """Share of the training episodes without an arrival whose world is begun again (`whill_mjx.batch`)."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -215,11 +217,11 @@ MIRROR = Mirror(mirrored_obs, lambda action: action * jnp.array([1.0, -1.0]))
 
 def make_training_env(
     task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0,
+    exploring_starts: float = 0.0, second_tries: float = 0.0,
 ) -> BatchEnv:  # fmt: skip
-    """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the last see `Preset`."""
+    """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
     env, params = make_env(task, vehicle, exploring_starts=exploring_starts)
-    return make_batch(env, params, instances, spread, devices)
+    return make_batch(env, params, instances, spread, devices, second_tries)
 
 
 def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[Step, dict[str, Any]]:

@@ -135,3 +135,36 @@ def test_instances_can_be_split_over_devices_and_uneven_splits_are_refused():
     assert len(first.obs.sharding.device_set) == len(devices)
     with pytest.raises(ValueError, match="evenly"):
         make_batch(env, params, 3, devices=devices * 2)
+
+
+@pytest.mark.parametrize(
+    ("radius", "share", "least", "most"), [(1.0, 0.5, 0.35, 0.65), (1.0, 0.0, 0, 0), (20.0, 0.9, 0, 0)]
+)
+def test_a_share_of_the_failed_worlds_is_begun_again(radius, share, least, most):
+    """The same world, vehicle and start; one that was arrived in is never begun again."""
+    env, params = make_env(ObstacleCourse(max_steps=1, goal_radius=radius), height=8, width=8)
+    many = make_batch(env, params, 32, spread=0.05, second_tries=share)
+    state, _ = jax.jit(many.reset)(jax.random.key(2))
+
+    def two(state, _):
+        ended, _ = many.step(state, jnp.ones((32, 2)))  # one step: time is up, or the goal reached
+        begun, frame = many.step(ended, jnp.ones((32, 2)))
+        same = [jax.vmap(lambda one, two: jnp.allclose(one, two, atol=1e-5))(a, b) for a, b in zip(
+            jax.tree.leaves((state.env.scene, state.params, state.env.vehicle.qpos)),
+            jax.tree.leaves((begun.env.scene, begun.params, begun.env.vehicle.qpos)), strict=True)]
+        return begun, (jnp.all(jnp.stack(same), 0), jnp.all(frame.first), begun.tries)
+
+    _, (same, first, tries) = jax.jit(lambda state: jax.lax.scan(two, state, None, length=12))(state)
+    assert bool(first.all())
+    assert least <= float(same.mean()) <= most
+    counted = np.zeros(32, int)
+    for row, told in zip(np.asarray(same), np.asarray(tries), strict=True):
+        counted = np.where(row, counted + 1, 0)
+        np.testing.assert_array_equal(told, counted)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_failed_worlds_cannot_be_begun_again_for_ever(share):
+    env, params = make_env(height=8, width=8)
+    with pytest.raises(ValueError, match="second_tries"):
+        make_batch(env, params, 2, second_tries=share)
