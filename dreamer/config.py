@@ -133,6 +133,8 @@ class DreamerConfig:
     """Weight of the representation loss."""
     recon_scale: float = 1.0
     """Weight of the loss of each reconstruction, images and vectors."""
+    vector_scale: float = 1.0
+    """Further weight of that of the vectors: a few numbers that decide weigh little beside thousands of pixels."""
     reward_scale: float = 1.0
     """Weight of the reward loss."""
     continue_scale: float = 1.0

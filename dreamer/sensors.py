@@ -104,7 +104,8 @@ def representation_losses(
         projected = nets.linear(params["project"], latent.features())
         return {"barlow": config.barlow_scale * barlow_loss(projected, tokens, config.barlow_redundancy)}
     losses = reconstruction_losses(config, params, latent, obs)
-    return {name: config.recon_scale * error for name, error in losses.items()}
+    weights = {"recon": config.recon_scale, "recon_vector": config.recon_scale * config.vector_scale}
+    return {name: weights[name] * error for name, error in losses.items()}
 
 
 def barlow_loss(projected: jax.Array, tokens: jax.Array, redundancy: float) -> jax.Array:

@@ -16,8 +16,8 @@ from whill_mjx.scene import Boxes, Footprint, footprint
 from whill_mjx.task import goal_position
 
 UNIT = 0.1  # m
-RANGE = 3.0  # m, farthest free distance told
-RAYS = 16
+RANGE = 5.0  # m, farthest free distance told
+RAYS = 48  # 3 m away they lie 0.39 m apart: at least one meets a box as wide as the corridor's
 SIZE = 4 + RAYS
 ANGLES = np.arange(RAYS) * 2 * np.pi / RAYS  # rad, from straight ahead to the left; mirrored, ray k is ray -k
 

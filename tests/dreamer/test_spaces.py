@@ -101,6 +101,9 @@ def test_vectors_are_encoded_and_predicted_as_their_symlogs():
     losses = sensors.reconstruction_losses(CONFIG, dec, latent, {"lidar": lidar})
     assert set(losses) == {"recon_vector"}
     np.testing.assert_allclose(losses["recon_vector"], np.square(predicted - squeezed).sum(-1), rtol=1e-5)
+    heavier = dataclasses.replace(CONFIG, recon_scale=2.0, vector_scale=3.0)
+    weighted = sensors.representation_losses(heavier, dec, latent, {"lidar": lidar}, None)
+    np.testing.assert_allclose(weighted["recon_vector"], 6.0 * losses["recon_vector"], rtol=1e-5)
 
 
 def test_tokens_have_the_declared_width_whatever_is_seen():

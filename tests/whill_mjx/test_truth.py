@@ -34,7 +34,7 @@ def test_free_distances_are_those_of_a_walk_along_each_ray():
     boxes = stack_boxes([box(2.0, 0.3, 0.6, 0.4, 0.5, jnp.ones(3), 0.4), box(-0.5, 1.5, 0.2, 3.0, 0.5, jnp.ones(3)),
                          box(0.0, -1.0, 4.0, 0.1, 0.5, jnp.ones(3), mask=False)])  # fmt: skip
     body = footprint(ENV.model.spec, 0.1, -0.2, 0.7)
-    steps = np.linspace(0.0, truth.RANGE, 30001)
+    steps = np.linspace(0.0, truth.RANGE, 50001)
     expected = []
     for angle in truth.ANGLES + 0.7:
         dx = float(body.x) + steps * np.cos(angle) - np.asarray(boxes.centre[:, :1])
@@ -48,6 +48,16 @@ def test_free_distances_are_those_of_a_walk_along_each_ray():
     assert 3 <= sum(value < truth.RANGE for value in expected) < truth.RAYS
     np.testing.assert_allclose(truth.free_distances(body, boxes), expected, atol=2e-4)
     np.testing.assert_array_equal(truth.free_distances(body, no_boxes(2)), truth.RANGE)
+
+
+@pytest.mark.quick
+def test_some_ray_meets_a_box_of_the_corridor_wherever_it_stands_ahead():
+    """As wide as a cardboard box, up to 3 m away and turned in any way."""
+    body, rng = footprint(ENV.model.spec, 0.0, 0.0, 0.0), np.random.default_rng(2)
+    for _ in range(50):
+        far, aside, turned = rng.uniform(0.9, 2.9), rng.uniform(-0.5, 0.5), rng.uniform(-0.8, 0.8)
+        boxes = stack_boxes([box(float(body.x) + far, aside, 0.4, 0.4, 0.45, jnp.ones(3), turned)])
+        assert float(truth.free_distances(body, boxes).min()) < far
 
 
 def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
