@@ -49,9 +49,11 @@ QUICK_ITERATIONS = 14
 FEATURE_ITERATIONS = 20
 GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
-FLAT, ENDS = 1.6, 4
-"""Factor on the cost within which an end of a range may be worse and still be searched from, and from how many."""
-LOOK = 3  # iterations after which a search from elsewhere must be better
+DEAR, FAR = 10.0, 12
+"""Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
+FIRST, KEPT, LOOK = 1, 4, 3
+"""Iterations from all of these, how many are searched further, and iterations after which one must be better."""
+LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class FitConfig:
     iterations: int = 40
     """Iterations of the gradient search on poses."""
     elsewhere: bool = True
-    """Whether the gradient search is also tried from the ends of ranges that cost little and from other delays."""
+    """Whether the gradient search also starts far away along ranges where that costs little, and from other delays."""
     seed: int = 0
     """Seed of both searches."""
     quick: bool = False
@@ -315,8 +317,9 @@ def gradient_search(
 ) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
 
-    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
-    between looks flat from here: LM tries the ends of ranges that cost little. Delays are profiled on a grid, and LM
+    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and a torque
+    limit that is never met looks right: LM also starts far away along each range that costs little, and does so again
+    where that led far down. Delays are profiled on a grid, and LM
     tries another valley that is about as deep. Neither is tried without `config.elsewhere`.
     """
 
@@ -328,10 +331,13 @@ def gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
-    if config.elsewhere:
-        costs, ends = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
-        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:ENDS]
-        result = _from_elsewhere(partial(search, objective), result, ends[near], iterations)
+    lost = config.elsewhere
+    while lost:
+        before = result.cost
+        costs, points = gradient.far_points(objective, result.u, robust=config.robust)
+        points = points[costs < DEAR * result.cost][:FAR]
+        result = _from_elsewhere(partial(search, objective), result, points, iterations)
+        lost = result.cost < LOST * before
     found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
     for name, _, costs, followed in found:
         here = result.u[space.names.index(name)]
@@ -349,8 +355,12 @@ def _from_elsewhere(
     iterations, the best of them to its end where it is lower by then."""
     if not len(starts):
         return result
+    spent = result.evaluations
+    if len(starts) > KEPT:
+        first = search(starts, FIRST)
+        starts, spent = first.starts[:KEPT], spent + first.evaluations
     new = search(starts, min(LOOK, iterations))
-    spent = result.evaluations + new.evaluations
+    spent += new.evaluations
     if new.cost < result.cost:
         new = search(new.u[None], iterations)
         result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations

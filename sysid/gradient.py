@@ -21,7 +21,8 @@ DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
 MAX_DAMPING = 1e4
 MAX_STEP = 0.3  # of the range, in one iteration
-APART = 0.1  # of the range, from which an end of it may lie in another valley
+GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
+PLATEAU = 0.02  # share of the cost within which they lie on the same ground
 FOLLOWING = 3  # tries at most without a new Jacobian
 PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
 GOES_ON = 10.0  # tolerances by which a step that is not the last lowers the cost
@@ -125,17 +126,56 @@ def fit(
                      history=np.array(history))
 
 
-def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Costs (E,) and points (E, P) with one parameter of u (P,) at an end of its range, where that is far away."""
-    points = []
-    for index, here in enumerate(u):
-        for end in (0.0, 1.0):
-            if abs(end - here) > APART:
-                points.append(u.copy())
-                points[-1][index] = end
-    starts = np.array(points).reshape(-1, len(u))
-    residual = objective.residuals(starts)
-    return np.asarray(robust_cost(residual, robust) / objective.counted), starts
+def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (E,) and points (E, P) where one parameter each is far from what it is in u (P,), the promising first.
+
+    Of a grid over the range of each parameter the best point below and the best above, the others following by one
+    damped Gauss-Newton step. Points that cost what u does are left out: a search from there comes back to where it was.
+    What lies behind such level ground comes first, since no derivative tells of it: a limit that was never met, say.
+    The rest is in the order of its costs.
+    """
+    linear = _linearised(objective, u)
+    here = robust_cost(linear[0], robust)[0] / objective.counted
+    points, held, side = [], [], []
+    for index, value in enumerate(u):
+        for other in np.linspace(0.0, 1.0, GRID):
+            if abs(other - value) > APART:
+                points.append(np.where(np.arange(len(u)) == index, other, u))
+                held.append(index)
+                side.append(2 * index + int(other > value))
+    costs, followed = _followed(objective, linear, np.array(points), np.array(held), robust)
+    sides, level = np.array(side), np.abs(costs / here - 1.0) <= PLATEAU
+    behind = np.isin(sides, sides[level])
+    order = np.lexsort((costs, ~behind))
+    order = order[~level[order]]
+    order = order[np.sort(np.unique(sides[order], return_index=True)[1])]  # the first of each side
+    return costs[order], followed[order]
+
+
+_Linear = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _linearised(objective: Residuals, u: np.ndarray) -> _Linear:
+    """Residual (1, B, K) and derivatives (B, K, P) at u (P,), and the Gauss-Newton Hessian (P, P)."""
+    residual, jacobian = objective.jacobian(u[None])
+    return residual, jacobian[0], np.einsum("bkp,bkq->pq", jacobian[0], jacobian[0])
+
+
+def _followed(
+    objective: Residuals, linear: _Linear, points: np.ndarray, held: np.ndarray, robust: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (E,) and points (E, P) after a damped Gauss-Newton step of all but the `held` (E,) parameter of each, with
+    the derivatives of elsewhere, where that step is better than none.
+    """
+    _, jacobian, hessian = linear
+    index = np.arange(points.shape[1])
+    residual = objective.residuals(points)
+    weight = huber_weight(residual) if robust else np.ones_like(residual)
+    moved = np.stack([
+        _step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, index != fixed)
+        for point, one, fixed in zip(points, residual * weight, held, strict=True)])  # fmt: skip
+    costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))]) / objective.counted
+    return costs.min(0), np.where((costs[1] < costs[0])[:, None], moved, points)
 
 
 def profile_delays(
@@ -159,12 +199,7 @@ def profile_delays(
     delays = [index for index, name in enumerate(space.names) if is_delay(name)]
     if not delays:
         return []
-    jacobian = objective.jacobian(u[None])[1][0]
-    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
-
-    def cost(residual: np.ndarray) -> np.ndarray:
-        return np.asarray(robust_cost(residual, robust) / objective.counted)
-
+    linear = _linearised(objective, u)
     for index in delays:
         values = space.to_values(u)
         around = np.tile(values, (13 * len(near), 1))
@@ -173,14 +208,8 @@ def profile_delays(
         grid = np.unique(grid.round(9))
         at = np.tile(u, (len(grid), 1))
         at[:, index] = grid
-        residual = objective.residuals(at)
-        free = np.arange(space.size) != index
-        weight = huber_weight(residual) if robust else np.ones_like(residual)
-        moved = np.stack([_step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, free)
-                          for point, one in zip(at, residual * weight, strict=True)])
-        both = np.stack([cost(residual), cost(objective.residuals(moved))])
-        followed = np.where((both[1] < both[0])[:, None], moved, at)
-        profiles.append((space.names[index], space.to_values(at)[:, index], both.min(0), followed))
+        costs, followed = _followed(objective, linear, at, np.full(len(at), index), robust)
+        profiles.append((space.names[index], space.to_values(at)[:, index], costs, followed))
     return profiles
 
 

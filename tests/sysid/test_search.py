@@ -38,16 +38,48 @@ class TwoValleys:
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize(("steep", "cost"), [(2.0, 0.04), (4.0, 1.0)])
-def test_a_search_goes_on_from_the_end_of_a_range_that_costs_little(steep, cost):
+@pytest.mark.parametrize(("dear", "cost"), [(10.0, 0.04), (0.01, 1.0)])
+def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, cost, monkeypatch):
     space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
-    valleys, start = TwoValleys(steep), np.full((1, 2), 0.5)
+    valleys, start = TwoValleys(4.0), np.full((1, 2), 0.5)
     stuck = gradient.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
+    monkeypatch.setattr("sysid.fit.DEAR", dear)
     result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
-    assert result.cost == pytest.approx(cost, abs=1e-3)  # the steep end costs 4: not looked from
+    assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
     np.testing.assert_array_equal(result.starts, stuck.starts)  # the report tells where the given starts ended
+    same, _, _ = gradient_search(valleys, space, start, 20, FitConfig(elsewhere=False), None)
+    assert same.cost == stuck.cost
+
+
+class NeverMet:
+    """A gain and the limit of what it drives: while the limit is above all that is driven nothing tells of it."""
+
+    counted = 1
+    noise = Noise(np.ones(3), np.ones(5), "replicates")
+    t = np.linspace(0.0, 1.0, 12)
+
+    def _driven(self, u):
+        return np.minimum(u[:, :1] * self.t, u[:, 1:])
+
+    def residuals(self, u):
+        return (10 * (self._driven(u) - self._driven(np.array([[0.9, 0.37]]))))[:, None]
+
+    def jacobian(self, u):
+        sides = [self.residuals(u + sign * 1e-4 * one) for one in np.eye(2) for sign in (1, -1)]
+        return self.residuals(u), np.stack([sides[0] - sides[1], sides[2] - sides[3]], axis=-1) / 2e-4
+
+
+@pytest.mark.quick
+def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
+    space = Space(("gain", "limit"), np.zeros(2), np.ones(2), np.array([0.5, 1.0]), np.zeros(2, bool))
+    stuck = gradient.fit(NeverMet(), space, iterations=20)
+    assert stuck.u[1] == 1.0 and stuck.cost > 1.0
+    costs, points = gradient.far_points(NeverMet(), stuck.u)
+    assert points[0, 1] < 0.6 and len(costs) == 3  # the limit behind level ground, a smaller gain and a larger one
+    result, _, _ = gradient_search(NeverMet(), space, np.array([[0.5, 1.0]]), 20, FitConfig(), None)
+    np.testing.assert_allclose(result.u, [0.9, 0.37], atol=1e-3)
 
 
 def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
