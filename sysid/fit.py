@@ -49,6 +49,7 @@ QUICK_ITERATIONS = 14
 FEATURE_ITERATIONS = 20
 GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
+FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
 DEAR, FAR = 10.0, 12
 """Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
 FIRST, KEPT, LOOK = 1, 4, 3
@@ -317,10 +318,10 @@ def gradient_search(
 ) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
 
-    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and a torque
-    limit that is never met looks right: LM also starts far away along each range that costs little, and does so again
-    where that led far down. Delays are profiled on a grid, and LM
-    tries another valley that is about as deep. Neither is tried without `config.elsewhere`.
+    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
+    right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
+    on a grid, and LM tries another valley that is about as deep. Nothing of this is done without `config.elsewhere`.
     """
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
@@ -331,6 +332,10 @@ def gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
+    if config.elsewhere:
+        costs, points = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
+        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
+        result = _from_elsewhere(partial(search, objective), result, points[near], iterations)
     lost = config.elsewhere
     while lost:
         before = result.cost

@@ -126,6 +126,19 @@ def fit(
                      history=np.array(history))
 
 
+def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (E,) and points (E, P) with one parameter of u (P,) at an end of its range, where that is far away."""
+    points = []
+    for index, here in enumerate(u):
+        for end in (0.0, 1.0):
+            if abs(end - here) > APART:
+                points.append(u.copy())
+                points[-1][index] = end
+    starts = np.array(points).reshape(-1, len(u))
+    residual = objective.residuals(starts)
+    return np.asarray(robust_cost(residual, robust) / objective.counted), starts
+
+
 def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Costs (E,) and points (E, P) where one parameter each is far from what it is in u (P,), the promising first.
 

@@ -91,7 +91,7 @@ class TrainOptions:
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
     """Let the world model also tell goal, speeds and free distances, which the simulator knows (`whill_mjx.truth`). The
-    policy still sees the camera alone. The preset paper does so on the obstacle course anyway."""
+    policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: float | None = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
     and a real course cannot; evaluations always begin at the start. None takes the preset's."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluate import EvaluateOptions, choose_task
@@ -238,8 +239,8 @@ def test_the_falling_rate_spans_the_run_whatever_its_train_ratio():
 
 @pytest.mark.parametrize("learner", ["dreamer", "ppo"])
 def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
-    """Evaluations, inside the run and after it, are driven from the start."""
-    shares = []
+    """Evaluations, inside the run and after it, are driven from the start, in a new world each."""
+    shares, tries = [], []
 
     class Enough(Exception):
         pass
@@ -251,14 +252,19 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
         shares.append(exploring_starts)
         return make_env(*args)
 
+    def batched(*args):
+        tries.append(args[-1])
+        return make_batch(*args)
+
+    monkeypatch.setattr("whill_mjx.training.make_batch", batched)
     monkeypatch.setattr("whill_mjx.training.make_env", noted)
     monkeypatch.setattr("whill_mjx.train.train", stop)
     monkeypatch.setattr("whill_mjx.train.train_ppo", stop)
     options = TrainOptions(out=tmp_path, vehicle=Path("whill_cr_ramp"), preset="smoke", exploring_starts=0.5,
-                           learner=learner)
+                           second_tries=0.25, learner=learner)
     with pytest.raises(Enough):
         main(options)
-    assert shares == [0.5, 0.0]
+    assert shares == [0.5, 0.0] and tries[:2] == [0.25, 0.0]
 
 
 @pytest.mark.quick
