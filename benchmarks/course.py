@@ -147,8 +147,8 @@ def collect(options: argparse.Namespace) -> None:
 def ablation(options: argparse.Namespace) -> None:
     """Record how well trainings with other settings drive late in the run, whether or not they were finished.
 
-    A folder is called NAME_SEED. A seed's value is the median return of the evaluations in the last quarter of its
-    steps; the settings that differ from the size's defaults stand beside it.
+    A folder is called NAME_SEED. A seed's value is the median return (or `metric`) of the evaluations in the last
+    quarter of its steps. Beside it: the settings that differ from the size's defaults, and what whole runs came to.
     """
     groups: dict[str, dict[int, tuple[Path, list[dict[str, Any]]]]] = {}
     for path in options.runs:
@@ -157,7 +157,7 @@ def ablation(options: argparse.Namespace) -> None:
         groups.setdefault(name, {})[int(seed)] = path, lines
     figures = {}
     for name, seeds in groups.items():
-        values, last = [], []
+        values, last, whole = [], [], {}
         for seed, (path, lines) in sorted(seeds.items()):
             key = next(key for key in (f"eval/{options.metric}", f"eval/{options.metric}_{seed}")
                        if any(key in line for line in lines))  # fmt: skip
@@ -165,13 +165,21 @@ def ablation(options: argparse.Namespace) -> None:
             late = [line[key] for line in lines if key in line and line["env_steps"] >= 0.75 * last[-1]]
             values.append(statistics.median(late))
             config = json.loads((path / "config.json").read_text())
+            if (path / "course.json").exists():
+                policy = json.loads((path / "course.json").read_text())["policy"]
+                whole[str(seed)] = {key: policy[key] for key in ("episodes", "success", "collision", "return")}
         changed = min((_changes(config, size) for size in PRESETS), key=len)
-        ending = "" if options.metric == "return" else f"_{options.metric.removesuffix('_return')}"
         entry = {**figure(values, "-", options.device), "seeds": sorted(seeds), "steps": last, "changed": changed}
         if (path / "environment.json").exists():  # older runs have none
             entry["environment"] = json.loads((path / "environment.json").read_text())
-        figures[f"ablation_{name}{ending}_return"] = entry
-        print(f"{name}{ending}: {[round(value) for value in values]} at {last} steps, {changed}")
+        elif (path / "run.json").exists():
+            begun = json.loads((path / "run.json").read_text())
+            starts = {key: begun["preset"].get(key, 0.0) for key in ("exploring_starts", "second_tries")}
+            entry["environment"] = {key: begun["command"][key] for key in ("task", "layout")} | starts
+        if whole:
+            entry["whole"] = whole
+        figures[f"ablation_{name}_{options.metric}"] = entry
+        print(f"{name}, {options.metric}: {[f'{value:.3g}' for value in values]} at {last} steps, {changed}")
     record("course", CLAIM, figures)
 
 
@@ -260,7 +268,7 @@ def parse() -> argparse.Namespace:
     several.set_defaults(call=collect)
     tried = commands.add_parser("ablation")
     tried.add_argument("--runs", type=Path, nargs="+", required=True)
-    tried.add_argument("--metric", default="return", help="name of the evaluation's return in the log")
+    tried.add_argument("--metric", default="return", help="name of what is told of the evaluations in the log")
     tried.add_argument("--device", required=True, help="on which they were made")
     tried.set_defaults(call=ablation)
     ceiling = commands.add_parser("planner")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import dataclasses
 import json
 
 import pytest
 
+from benchmarks import course
 from benchmarks.course_figures import groups, load_run
+from dreamer.config import preset
 
 COURSE, CORRIDOR = {"action_repeat": 1}, {"action_repeat": 1, "box_x": 2.5}
 
@@ -92,3 +96,25 @@ def test_a_training_to_its_last_step_without_its_final_evaluation_is_no_stopped_
     assert name == "course_paper_randomised"
     assert figures["return_at_18000_median"]["value"] == pytest.approx(190.0)
     assert figures["success_at_22000"]["value"] == 1.0
+
+
+@pytest.mark.quick
+def test_an_ablation_tells_late_evaluations_settings_and_what_whole_runs_came_to(tmp_path, monkeypatch):
+    recorded = {}
+    monkeypatch.setattr(course, "record", lambda name, claim, figures: recorded.update(figures))
+    final = {"policy": {"success": 0.97, "collision": 0.02, "return": 190.0, "episodes": 1000}}
+    paths = [write_run(tmp_path / "told_0", [0.1, 0.2, 0.9, 1.0], "paper", "dreamer", CORRIDOR, final),
+             write_run(tmp_path / "told_1", [0.1, 0.3, 0.4, 0.5], "paper", "dreamer", CORRIDOR)]
+    for path in paths:
+        config = dataclasses.asdict(dataclasses.replace(preset("size12m"), vector_scale=5.0))
+        (path / "config.json").write_text(json.dumps(config))
+        run = json.loads((path / "run.json").read_text())
+        run["command"]["task"], run["preset"]["second_tries"] = "corridor", 0.5
+        (path / "run.json").write_text(json.dumps(run))
+    course.ablation(argparse.Namespace(runs=paths, metric="success", device="X"))
+    entry = recorded["ablation_told_success"]
+    assert entry["repeats"] == pytest.approx([0.95, 0.45]) and entry["steps"] == [4000, 4000]
+    assert entry["changed"] == {"vector_scale": 5.0}
+    assert entry["whole"] == {"0": {"episodes": 1000, "success": 0.97, "collision": 0.02, "return": 190.0}}
+    told = {"task": "corridor", "layout": "randomised", "exploring_starts": 0.5, "second_tries": 0.5}
+    assert entry["environment"] == told
