@@ -385,7 +385,8 @@ def expected_steps(config: FitConfig) -> int:
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
-    return first + (iterations + 3 * min(LOOK, iterations) if config.method not in GLOBAL else 0)
+    elsewhere = FIRST + 4 * min(LOOK, iterations) if config.elsewhere else 0
+    return first + (iterations + elsewhere if config.method not in GLOBAL else 0)
 
 
 @dataclass(frozen=True, kw_only=True)
