@@ -27,11 +27,12 @@ from benchmarks.harness import figure, record
 from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
 from sysid import starts
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, gradient_search, make_problem
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, make_problem
 from sysid.log import Log, Trial, load_log
 from sysid.metrics import command_in_force
 from sysid.objective import estimate_noise
 from sysid.searches import Judge, Recorder
+from sysid.valleys import gradient_search
 
 NAMES = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "body.yaw_inertia", "body.com_x")
 MANOEUVRES = ("straight", "turn", "circle", "s_curve", "stop_and_go", "random")

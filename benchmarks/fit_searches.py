@@ -17,11 +17,12 @@ import numpy as np
 from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import starts, tpe
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, gradient_search
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem
 from sysid.log import Log, load_log
 from sysid.objective import HUGE, Objective
 from sysid.searches import Judge, Trace, arrivals, trace, write
 from sysid.studies import BATCH
+from sysid.valleys import gradient_search
 
 STARTS = 32
 SAME = 0.01

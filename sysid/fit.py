@@ -7,9 +7,7 @@ Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +38,7 @@ from sysid.result import FitResult, Progress
 from sysid.rollout import Plant, predictions, vehicle_plant
 from sysid.series import collect, save
 from sysid.space import Space, make_space, searched
+from sysid.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.config import VehicleConfig
 from whill_mjx.presets import preset_params
 
@@ -48,13 +47,6 @@ QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
 FEATURE_ITERATIONS = 20
 GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
-VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
-FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
-DEAR, FAR = 10.0, 12
-"""Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
-FIRST, KEPT, LOOK = 1, 4, 3
-"""Iterations from all of these, how many are searched further, and iterations after which one must be better."""
-LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 
 
 @dataclass(frozen=True)
@@ -310,66 +302,6 @@ def fit_dataset(
     else:
         save_model(out, fit.model, fit.params, intervals, provenance(report))
     return report
-
-
-def gradient_search(
-    objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
-    progress: Progress | None,
-) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
-    """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
-
-    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
-    between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
-    right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
-    on a grid, and LM tries another valley that is about as deep. Nothing of this is done without `config.elsewhere`.
-    """
-
-    def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
-        return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
-                            progress=progress)
-
-    result = search(objective, starts, iterations)
-    if objective.noise.source == "defaults":
-        objective = objective.with_noise(objective.residual_noise(result.u))
-        result = search(objective, result.starts, iterations)
-    if config.elsewhere:
-        costs, points = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
-        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
-        result = _from_elsewhere(partial(search, objective), result, points[near], iterations)
-    lost = config.elsewhere
-    while lost:
-        before = result.cost
-        costs, points = gradient.far_points(objective, result.u, robust=config.robust)
-        points = points[costs < DEAR * result.cost][:FAR]
-        result = _from_elsewhere(partial(search, objective), result, points, iterations)
-        lost = result.cost < LOST * before
-    found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
-    for name, _, costs, followed in found:
-        here = result.u[space.names.index(name)]
-        apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
-        if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
-            other = followed[apart][costs[apart].argmin()]
-            result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
-    return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
-
-
-def _from_elsewhere(
-    search: Callable[[np.ndarray, int], FitResult], result: FitResult, starts: np.ndarray, iterations: int
-) -> FitResult:
-    """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
-    iterations, the best of them to its end where it is lower by then."""
-    if not len(starts):
-        return result
-    spent = result.evaluations
-    if len(starts) > KEPT:
-        first = search(starts, FIRST)
-        starts, spent = first.starts[:KEPT], spent + first.evaluations
-    new = search(starts, min(LOOK, iterations))
-    spent += new.evaluations
-    if new.cost < result.cost:
-        new = search(new.u[None], iterations)
-        result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations
-    return replace(result, evaluations=spent)
 
 
 def _keep_channels(trial: Trial, channels: str) -> Trial:

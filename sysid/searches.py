@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from sysid import command_line, gradient, starts, tpe
-from sysid.fit import FitConfig, Problem, gradient_search, make_problem
+from sysid.fit import FitConfig, Problem, make_problem
 from sysid.html import Section, html_page, paragraph, png, table
 from sysid.log import Log
 from sysid.measured import load_any
@@ -34,6 +34,7 @@ from sysid.report import code_hashes, write_report
 from sysid.result import Progress
 from sysid.rollout import Simulated, predictions
 from sysid.studies import BATCH
+from sysid.valleys import gradient_search
 
 KIND = "sysid-searches"
 METHODS = ("features", "lm", "both", "tpe", "cmaes")

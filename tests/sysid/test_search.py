@@ -9,11 +9,12 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
 
 from sysid import gradient, tpe, uncertainty
-from sysid.fit import FitConfig, gradient_search
+from sysid.fit import FitConfig
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.objective import Noise
 from sysid.rollout import Replay, make_batch, predictions
 from sysid.space import Space
+from sysid.valleys import gradient_search
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -44,7 +45,7 @@ def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, c
     valleys, start = TwoValleys(4.0), np.full((1, 2), 0.5)
     stuck = gradient.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
-    monkeypatch.setattr("sysid.fit.DEAR", dear)
+    monkeypatch.setattr("sysid.valleys.DEAR", dear)
     result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
     assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)

@@ -1,0 +1,90 @@
+"""The gradient search on poses, and where else it looks: costs of drives have many valleys.
+
+A search ends in the valley that it starts in. Others are looked for at the ends of ranges, far along them, and at other
+delays; what a drive hardly tells, or tells only beyond a limit, is found so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid import gradient
+from sysid.objective import Objective
+from sysid.result import FitResult, Progress
+from sysid.space import Space
+
+if TYPE_CHECKING:
+    from sysid.fit import FitConfig
+
+VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
+FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
+DEAR, FAR = 10.0, 12
+"""Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
+FIRST, KEPT, LOOK = 1, 4, 3
+"""Iterations from all of these, how many are searched further, and iterations after which one must be better."""
+LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
+
+
+def gradient_search(
+    objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
+    progress: Progress | None,
+) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
+    """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
+
+    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
+    right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
+    on a grid, and LM tries another valley that is about as deep. Nothing of this is done without `config.elsewhere`.
+    """
+
+    def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
+        return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
+                            progress=progress)
+
+    result = search(objective, starts, iterations)
+    if objective.noise.source == "defaults":
+        objective = objective.with_noise(objective.residual_noise(result.u))
+        result = search(objective, result.starts, iterations)
+    if config.elsewhere:
+        costs, points = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
+        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
+        result = _from_elsewhere(partial(search, objective), result, points[near], iterations)
+    lost = config.elsewhere
+    while lost:
+        before = result.cost
+        costs, points = gradient.far_points(objective, result.u, robust=config.robust)
+        points = points[costs < DEAR * result.cost][:FAR]
+        result = _from_elsewhere(partial(search, objective), result, points, iterations)
+        lost = result.cost < LOST * before
+    found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
+    for name, _, costs, followed in found:
+        here = result.u[space.names.index(name)]
+        apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
+        if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
+            other = followed[apart][costs[apart].argmin()]
+            result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
+    return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
+
+
+def _from_elsewhere(
+    search: Callable[[np.ndarray, int], FitResult], result: FitResult, starts: np.ndarray, iterations: int
+) -> FitResult:
+    """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
+    iterations, the best of them to its end where it is lower by then."""
+    if not len(starts):
+        return result
+    spent = result.evaluations
+    if len(starts) > KEPT:
+        first = search(starts, FIRST)
+        starts, spent = first.starts[:KEPT], spent + first.evaluations
+    new = search(starts, min(LOOK, iterations))
+    spent += new.evaluations
+    if new.cost < result.cost:
+        new = search(new.u[None], iterations)
+        result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations
+    return replace(result, evaluations=spent)
