@@ -135,7 +135,8 @@ def train(
             figures are means over the runs, and parameters have a seed axis in front.
         eval_fn: (params, env_steps) -> figures, logged as eval/...
         eval_ahead: called once in a thread, with the parameters at the start, while the run's own program is compiled:
-            the same evaluation, say, which then is compiled too when it is due. Not with several devices.
+            the same evaluation, say. Evaluations that are due before it is done are made after it, with the parameters
+            of their time, and training goes on meanwhile; lines are logged in order. Not with several devices.
         eval_every: control steps between evaluations; one more happens at the end.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
         log_every_s: time between log lines [s].
@@ -182,19 +183,36 @@ def train(
     def wall_s() -> float:
         return wall_before + time.monotonic() - began
 
-    def write_log(state: TrainState, evaluated: bool) -> None:
+    def write_log(state: TrainState, evaluated: bool, at_once: bool) -> bool:
+        """Log a line, and whether the run is to stop after an evaluation; `at_once`: no line may wait any longer."""
         line = {"env_steps": env_steps, "updates": int(state.agent.updates) if counted else 0, "wall_s": wall_s()}
         figures = meter.read(config)
         line |= done | (figures if counted else {f"pretrain/{name}": value for name, value in figures.items()})
-        if evaluated and eval_fn is not None:
-            if ready is not None:
-                wait([ready])
-            # Several processes evaluate side by side, each on its own device.
-            params = state.agent.acting if jax.process_count() == 1 else jax.device_get(state.agent.acting)
-            line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, env_steps).items()}
-        log.write(line)
+        params = None
+        if evaluated and jax.process_count() > 1:
+            params = jax.device_get(state.agent.acting)  # they evaluate side by side, each on its own device
+        elif evaluated:
+            params = jax.tree.map(jnp.copy, state.agent.acting)  # the next iteration donates its own
+        waiting.append((line, params))
         bar.show(env_steps, _headline(line))
+        return write_waiting(at_once)
 
+    def write_waiting(at_once: bool) -> bool:
+        stops = False
+        while waiting:
+            line, params = waiting[0]
+            if params is not None and eval_fn is not None:
+                if ready is not None and not at_once and not ready.done():
+                    break
+                if ready is not None:
+                    wait([ready])
+                line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, line["env_steps"]).items()}
+            waiting.pop(0)
+            log.write(line)
+            stops = stops or (params is not None and stop is not None and stop(line))
+        return stops
+
+    waiting: list[tuple[dict[str, Any], Params | None]] = []
     logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
     stopped, iterations = False, 0
     try:
@@ -213,15 +231,15 @@ def train(
             finished = (counted or begins) and env_steps >= total_steps
             evaluate_now = eval_fn is not None and (finished or env_steps // eval_every > evaluated_at)
             if finished or begins or evaluate_now or now - logged_at >= log_every_s:
-                write_log(state, evaluate_now)
+                stopped = write_log(state, evaluate_now, at_once=finished or begins)
                 logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
-                stopped = evaluate_now and stop is not None and stop(log.last)
             iterations += 1
             due = now - saved_at >= checkpoint_every_s
             if jax.process_count() > 1:
                 due = iterations % AGREE_EVERY == 0 and parallel.agree(due)
             stopped = stopped or (time_limit_s is not None and parallel.agree(now - began > time_limit_s))
             if finished or stopped or due:
+                stopped = write_waiting(at_once=True) or stopped  # a run that goes on from here has no older lines
                 save_state(out, state, config, wall_s())
                 saved_at = time.monotonic()
             if begins:
@@ -229,6 +247,7 @@ def train(
                 iterate = iterate if finished or stopped else compiled(train_iteration)
     except KeyboardInterrupt:
         if jax.process_count() == 1:  # the other processes may not be there to take part
+            write_waiting(at_once=True)
             save_state(out, state, config, wall_s())
         raise
     finally:

@@ -1,6 +1,8 @@
 """Options that are off unless asked for: no decoder, and targets that only the decoder sees."""
 
 import dataclasses
+import json
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from dreamer_toys import SHAPE, corridor_env, tiny_config
 from dreamer import agent, sensors
 from dreamer.config import DreamerConfig
 from dreamer.iteration import init_state, train_iteration
+from dreamer.progress import Progress
 from dreamer.rssm import Latent
 from dreamer.train import train
 
@@ -114,6 +117,33 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due_and_leaves_the_run_
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(run.agent), jax.device_get(plain.agent))
     train(env, config, tmp_path / "ahead", 64, 0, **quiet, eval_fn=lambda *_: {}, eval_ahead=ahead.append)
     assert len(ahead) == 1  # nothing is left to train
+
+
+def test_training_goes_on_while_an_evaluation_waits_for_its_compilation(tmp_path, monkeypatch):
+    env, config = corridor_env(2), tiny_config()
+    over, stopped_at = threading.Event(), []
+
+    class Bar(Progress):
+        def show(self, done, figures):
+            if done >= 64:
+                over.set()
+
+    def run(folder, **ahead):
+        made = []
+        train(env, config, folder, 64, 0, eval_every=16, log_every_s=1e9, progress=False, **ahead,
+              eval_fn=lambda params, steps: made.append((steps, over.is_set())) or {
+                  "size": float(sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(params)))},
+              stop=lambda line: stopped_at.append(line["env_steps"]) or False)
+        lines = [json.loads(text) for text in (folder / "metrics.jsonl").read_text().splitlines()]
+        return made, [(line["env_steps"], line["eval/size"]) for line in lines]
+
+    at_once, plain = run(tmp_path / "plain")
+    assert at_once == [(16, False), (32, False), (48, False), (64, False)]
+    monkeypatch.setattr("dreamer.train.Progress", Bar)
+    late, lines = run(tmp_path / "ahead", eval_ahead=lambda params: over.wait(60))
+    assert late == [(16, True), (32, True), (48, True), (64, True)]
+    assert lines == plain and len({size for _, size in lines}) > 1  # each of the parameters of its time
+    assert stopped_at == [16, 32, 48, 64] * 2
 
 
 def test_evaluations_take_the_average(tmp_path):
