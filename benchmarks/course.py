@@ -35,6 +35,7 @@ from whill_mjx.train import TrainOptions, main, preset_name
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat, with_settings
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
+FINAL = 1000  # episodes of the last evaluation of seeds side by side
 CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; every seed listed in repeats"
 
 
@@ -112,14 +113,15 @@ def together(options: argparse.Namespace) -> None:
         print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
         return
     lines = [json.loads(line) for line in (options.out / "metrics.jsonl").read_text().splitlines()]
-    last = evaluation(result.agent.acting, 1077, 1000)
+    last = evaluation(result.agent.acting, 1077, FINAL)
     for seed, policy in zip(options.seeds, last, strict=True):
         folder = options.out / f"seed_{seed}"
         folder.mkdir(exist_ok=True)
         mine = [_of_seed(line, seed) for line in lines]
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in mine))
         note = {"device": device_name(), "preset": options.preset, "layout": options.layout, "seed": seed,
-                "together": len(options.seeds), "task": dataclasses.asdict(task), "policy": policy}
+                "together": len(options.seeds), "task": dataclasses.asdict(task),
+                "policy": {"episodes": FINAL, **policy}}
         (folder / "course.json").write_text(json.dumps(note, indent=1) + "\n")
         print(seed, policy, flush=True)
 
@@ -167,7 +169,8 @@ def ablation(options: argparse.Namespace) -> None:
             config = json.loads((path / "config.json").read_text())
             if (path / "course.json").exists():
                 policy = json.loads((path / "course.json").read_text())["policy"]
-                whole[str(seed)] = {key: policy[key] for key in ("episodes", "success", "collision", "return")}
+                whole[str(seed)] = {key: policy[key] for key in ("episodes", "success", "collision", "return")
+                                    if key in policy}  # fmt: skip
         changed = min((_changes(config, size) for size in PRESETS), key=len)
         entry = {**figure(values, "-", options.device), "seeds": sorted(seeds), "steps": last, "changed": changed}
         if (path / "environment.json").exists():  # older runs have none

@@ -1,22 +1,31 @@
 """Merges result files made on another machine into benchmarks/results: `python -m benchmarks.merge FILE.json ...`.
 
-A figure replaces one of the same name only if it was made on the same day or later.
+A figure replaces one of the same name only if it was made on the same day or later. `--only NAME ...` takes no other.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
-import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.harness import RESULTS
 
 
-def merge(source: Path, results: Path = RESULTS) -> Path:
-    """Put the figures of `source` into the file of the same name in `results`; returns that file."""
+def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> Path:
+    """Put the figures of `source` (those named, if any) into the file of the same name in `results`; returns that file.
+
+    Raises:
+        ValueError: `source` has no figure of a name asked for.
+    """
     target = results / source.name
     content = json.loads(source.read_text())
+    if missing := sorted(set(only) - set(content["figures"])):
+        raise ValueError(f"{source} has no figure {', '.join(missing)}; it has {', '.join(content['figures'])}.")
+    if only:
+        content["figures"] = {name: content["figures"][name] for name in only}
     if target.exists():
         old = json.loads(target.read_text())
         for name, entry in old["figures"].items():
@@ -30,5 +39,9 @@ def merge(source: Path, results: Path = RESULTS) -> Path:
 
 
 if __name__ == "__main__":
-    for argument in sys.argv[1:]:
-        print(merge(Path(argument)))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
+    parser.add_argument("--only", nargs="+", default=(), metavar="NAME")
+    given = parser.parse_args()
+    for file in given.files:
+        print(merge(file, only=given.only))

@@ -28,6 +28,11 @@ class Thresholds:
     """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
     excess: float = 0.06
     """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
+    excess_alone: float = 1e-3
+    """p-value of the excess below which something without a name is missing, whatever the search says."""
+    search_alone: float = 1e-10
+    """The same of the search, whatever the excess. Small p-values come more often than they say, so otherwise both must
+    be below alpha: on 420 days with nothing missing the least one with no such excess was 8e-10."""
     quiet: float = 0.05
     """p-value of the excess that is left from which it passes for a day's own."""
     second: float = 0.25

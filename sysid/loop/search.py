@@ -265,10 +265,20 @@ def _decide(
             and _of_what_lasts(found, wander, anything) >= thresholds.share):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
+    elif not _missing(found.p_value, wander.p_excess(before), thresholds):
+        found.accepted, found.classes, found.crowd = [], [], []
+        found.final, found.share, found.excess = found.base, 0.0, (before, before)
+        found.reason = "what stands out has no name, and days with nothing missing differ by as much"
     else:
         found.verdict = "unexplained"
         found.reason = (f"the best of the catalogue explains {max(found.share, 0):.0%} of what exceeds the noise, and "
                         f"{after:.0%} above the noise is left")
+
+
+def _missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
+    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
+    both = max(search_p, excess_p) < thresholds.alpha
+    return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
 
 
 def _class_of(

@@ -10,11 +10,11 @@ from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with
 from sysid.loop.classes import imitation
 from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives
 from sysid.loop.evidence import Columns, signature_columns
-from sysid.loop.found import Candidate, Thresholds
+from sysid.loop.found import Candidate, Search, Thresholds
 from sysid.loop.noise import fit_roughness, fit_whitener
 from sysid.loop.refit import Refit, Refitter
-from sysid.loop.search import _own
-from sysid.loop.wander import _pooled
+from sysid.loop.search import _decide, _own
+from sysid.loop.wander import Wander, _pooled
 from whill_mjx.presets import preset
 
 
@@ -86,6 +86,37 @@ def test_a_second_effect_that_leaves_nothing_is_there_though_manoeuvres_differ_o
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize(
+    ("search_p", "excess", "verdict"),
+    [
+        (1e-3, 0.0, "none"),  # no more is left than days differ by, and p-values of the search come out small too often
+        (1e-12, 0.0, "unexplained"),
+        (0.5, 3.3, "none"),  # standard deviations of a day's excess, of which 3.2 are alpha
+        (0.5, 4.5, "unexplained"),
+        (1e-3, 3.3, "unexplained"),  # both say so
+    ],
+)
+def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_them_beyond_doubt(
+    search_p, excess, verdict
+):
+    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
+
+    def fit(cost):
+        return Refit((one,), np.zeros(0), np.ones(1), cost, np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(0))
+
+    candidate = Candidate(one, 1.0, search_p, 0.1, fit(1 + 0.9 * excess))
+    found = Search("none", fit(1 + excess), fit(1 + excess), SimpleNamespace(p_family=0.0), rounds=[[candidate]])
+    if search_p < Thresholds().alpha:
+        found.accepted, found.classes = [candidate], [["quadratic_drag"]]
+    wander = Wander((), (), freedom=10.0, excess=1.0)
+    _decide(found, Thresholds(), wander, lambda refit: refit.cost - 1, lambda residual: 0.0, np.zeros(1, int),
+            lambda refit: 1.0)
+    assert found.verdict == verdict
+    if verdict == "none":
+        assert not found.accepted and not found.classes and found.final is found.base and found.share == 0
+        assert found.excess == (pytest.approx(excess), pytest.approx(excess))
+
+
 def test_every_hypothesis_vanishes_at_zero():
     spec, params = preset("whill_cr_physical")
     found = hypotheses(spec, params)
