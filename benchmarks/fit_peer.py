@@ -6,8 +6,8 @@ needs the packages of `pip install mujoco[sysid]`. The log is driven by the cont
 plant's own model in MJCF, with a native PI speed controller (a velocity servo and an integrating one, limited at the
 joint), its own threads, and nominal values to start from; ours the physical vehicle from its preset. Both fit the
 controller's gains and limit, the yaw inertia and where the centre of mass is; both know the delay of a command. The
-clock of each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for the
-one whose model is nearer to the truth that is long before its own end, which is told as well.
+clock of each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for
+the one whose model is nearer to the truth that is long before its own end, which is told as well.
 """
 
 from __future__ import annotations
