@@ -20,7 +20,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,17 +37,12 @@ from benchmarks.fit_jobs import (
     share_compilations,
     write_result,
 )
+from benchmarks.fit_measured import drive, mrclam
+from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, show_parameters
 from benchmarks.harness import device_name, figure, record
-from sysid.fit import Fit, FitConfig, fit_log, make_objective, make_problem, predict
-from sysid.log import Log, Trial, load_log
-from sysid.measured import load_drive, load_mrclam, split
-from sysid.report import error_rows, summaries
+from sysid.fit import Fit, FitConfig, fit_log, make_objective, make_problem
+from sysid.log import Log, load_log
 from sysid.searches import Judge
-
-CLAIM = "How near a fit comes to the noise floor of its data"
-DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
-DRIVE_HELD_OUT = {"asphalt": ("warthog_asphalt_a:0.667-1",), "sand": ("warthog_sand_2",)}
-DRIVE_RUNS = ("warthog_asphalt_a", "warthog_sand_1", "warthog_sand_2")
 
 
 @dataclass(frozen=True)
@@ -103,85 +98,6 @@ class Benchmark:
     """Base models."""
 
 
-def thin(log: Log, count: int) -> Log:
-    """The log with at most `count` training trials, spread evenly over each group; held-out ones are kept."""
-    groups: dict[str, list[Trial]] = {}
-    for trial in log.training:
-        groups.setdefault(trial.group, []).append(trial)
-    each = max(count // len(groups), 1)
-    kept = {group[i].name for group in groups.values()
-            for i in np.linspace(0, len(group) - 1, min(each, len(group))).round().astype(int)}
-    return log.select(lambda trial: trial.held_out or trial.name in kept)
-
-
-def evaluate(fit: Fit, trials: tuple[Trial, ...]) -> dict[str, Any]:
-    """Held-out summary of `sysid.report` for some trials."""
-    held_out = tuple(replace(trial, held_out=True) for trial in trials)
-    rows = error_rows(held_out, *predict(fit, held_out))
-    return summaries(rows, held_out)
-
-
-def gains(summary: dict[str, Any], prefix: str) -> dict[str, dict[str, Any]]:
-    """Figures of one held-out summary: errors of the outside pose before and after, and the share removed."""
-    figures = {}
-    for metric in ("trajectory", "yaw"):
-        one = summary["ground_truth"][metric]
-        name = prefix if metric == "trajectory" else f"{prefix}_yaw"
-        figures[f"gain_{name}"] = figure([1 - one["fitted"] / one["ideal"]], "share")
-        for which in ("ideal", "initial", "fitted"):
-            figures[f"rmse_{name}_{which}"] = figure([one[which]], one["unit"])
-    return figures
-
-
-def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -> FitConfig:
-    # The paper's drive has no wheel-spin state: its odometry is its body's motion, so it can only fit the pose.
-    return FitConfig(preset=preset, method="both", trials=settings.evaluations,
-                     iterations=settings.iterations, starts=settings.starts, physics_dt=settings.physics_dt,
-                     channels="both" if preset == "physical" else "ground_truth")
-
-
-def drive(settings: Benchmark) -> None:
-    """DRIVE: one fit per terrain and one pooled, native 2 s windows; the same vehicles on chained 6 s steps."""
-    folder = settings.shared / "data" / "measured" / "drive_norlab"
-    native, chained = (load_drive(folder, DRIVE_RUNS, chained=chained) for chained in (False, True))
-    everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))
-    choices = {name: (DRIVE_TRAIN[name], DRIVE_HELD_OUT[name]) for name in DRIVE_TRAIN} | {"pooled": everything}
-    for preset in settings.presets:
-        for name in settings.terrains:
-            train, held_out = choices[name]
-            log = split(native, train, held_out)
-            fit = fit_log(thin(log, settings.windows), measured_config(settings, preset))
-            result = evaluate(fit, log.held_out)
-            stem = f"drive_{name}_{preset}"
-            figures = gains(result["summary"]["held_out"], stem)
-            steps = evaluate(fit, split(chained, train, held_out).held_out)
-            figures |= gains(steps["summary"]["held_out"], f"{stem}_chained_6s")
-            for group, parts in (result["groups"] if name == "pooled" else {}).items():
-                figures |= gains(parts["held_out"], f"{stem}_on_{group}")
-            figures[f"seconds_{stem}"] = figure([fit.seconds], "s")
-            if preset == "physical" and name != "pooled":
-                figures[f"drive_gain_over_ideal_{name}"] = figures[f"gain_{stem}"]
-            record("measured", "A fitted vehicle predicts real robots better than an ideal one", figures)
-            show(figures)
-            show_parameters(fit)
-    for note in chained.notes:
-        print(note)
-
-
-def mrclam(settings: Benchmark) -> None:
-    """MRCLAM: robots 1 to 3 fitted, 4 and 5 held out."""
-    log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
-    log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
-    for preset in settings.presets:
-        # 15 s windows are long: a third of the windows is the same driving time.
-        fit = fit_log(thin(log, settings.windows // 3), measured_config(settings, preset))
-        figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")
-        figures[f"seconds_mrclam_{preset}"] = figure([fit.seconds], "s")
-        record("measured", "A fitted vehicle predicts real robots better than an ideal one", figures)
-        show(figures)
-        show_parameters(fit)
-
-
 def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
     log = load_log(settings.shared / "data" / "plant" / "plain")
@@ -194,18 +110,6 @@ def plant(settings: Benchmark) -> None:
         record("fit", CLAIM, figures)
         show(figures)
         show_parameters(fit)
-
-
-def against_replicates(fit: Fit, log: Log, stem: str) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Figures of the held-out trials; mean position RMSE over the replicates' spread."""
-    result = evaluate(fit, log.held_out)
-    one = result["summary"]["held_out"]["ground_truth"]["trajectory"]
-    # The held-out set has replicates of few manoeuvres; that of all trials is the floor.
-    floor = evaluate(fit, log.trials)["noise_floor"]["held_out"]["ground_truth"]["trajectory"]
-    figures = gains(result["summary"]["held_out"], stem)
-    figures[f"replicate_spread_{stem}"] = figure([floor], "m")
-    figures[f"seconds_{stem}"] = figure([fit.seconds], "s")
-    return figures, figure([one["fitted"] / floor], "-")
 
 
 def chair(settings: Benchmark) -> None:
@@ -419,16 +323,6 @@ def searches(settings: Benchmark) -> None:
                                       settings.iterations, settings.search_starts)
 
     run_jobs(folder / "jobs", labels_of(settings.part, labels), job)
-
-
-def show(figures: dict[str, dict[str, Any]]) -> None:
-    for name, one in figures.items():
-        print(f"{name:52} {one['value']:9.4f} {one['unit']}", flush=True)
-
-
-def show_parameters(fit: Fit) -> None:
-    for one in fit.uncertainty.estimates:
-        print(f"  {one.name:32} {one.value:10.4g}  [{one.low:.4g}, {one.high:.4g}] {one.remark}", flush=True)
 
 
 def main(settings: Benchmark) -> None:

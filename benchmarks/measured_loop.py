@@ -22,7 +22,8 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.fit import show, thin
+from benchmarks.fit_measured import CLAIM, thin
+from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
 from sysid.close_loop import LoopConfig, Result, close_loop, refit_poses
 from sysid.log import Log, Trial
@@ -36,7 +37,6 @@ from whill_mjx.parameters import set_values
 from whill_mjx.presets import preset_params
 from whill_mjx.vehicle_file import load_vehicle, save_vehicle
 
-CLAIM = "A fitted vehicle predicts real robots better than an ideal one"
 RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
 HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.667-1", "sand": "warthog_sand_2"}

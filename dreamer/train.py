@@ -202,7 +202,7 @@ def train(
         while waiting:
             line, params = waiting[0]
             if params is not None and eval_fn is not None:
-                if ready is not None and not at_once and not ready.done():
+                if ready is not None and not (at_once or ready.done()):
                     break
                 if ready is not None:
                     wait([ready])
@@ -247,8 +247,10 @@ def train(
                 iterate = iterate if finished or stopped else compiled(train_iteration)
     except KeyboardInterrupt:
         if jax.process_count() == 1:  # the other processes may not be there to take part
-            write_waiting(at_once=True)
-            save_state(out, state, config, wall_s())
+            try:
+                write_waiting(at_once=True)
+            finally:  # interrupted again, say
+                save_state(out, state, config, wall_s())
         raise
     finally:
         bar.close()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, corridor_env, tiny_config
 
-from dreamer import agent, sensors
+from dreamer import agent, checkpoint, sensors
 from dreamer.config import DreamerConfig
 from dreamer.iteration import init_state, train_iteration
 from dreamer.progress import Progress
@@ -144,6 +144,16 @@ def test_training_goes_on_while_an_evaluation_waits_for_its_compilation(tmp_path
     assert late == [(16, True), (32, True), (48, True), (64, True)]
     assert lines == plain and len({size for _, size in lines}) > 1  # each of the parameters of its time
     assert stopped_at == [16, 32, 48, 64] * 2
+
+
+def test_a_run_interrupted_again_while_it_evaluates_what_was_due_leaves_a_checkpoint(tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(corridor_env(2), tiny_config(), tmp_path, 64, 0, eval_every=16, progress=False, eval_fn=interrupted)
+    [kept] = checkpoint.complete(tmp_path / "checkpoints")
+    assert kept.name == f"{16:012d}"
 
 
 def test_evaluations_take_the_average(tmp_path):

@@ -117,6 +117,7 @@ def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_th
         assert found.excess == (pytest.approx(excess), pytest.approx(excess))
 
 
+@pytest.mark.quick
 def test_every_hypothesis_vanishes_at_zero():
     spec, params = preset("whill_cr_physical")
     found = hypotheses(spec, params)

@@ -1,0 +1,81 @@
+"""Fits to two published sets of measured robots, the parts drive and mrclam of `benchmarks.fit`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from benchmarks.fit_scores import evaluate, gains, show, show_parameters
+from benchmarks.harness import figure, record
+from sysid.fit import FitConfig, fit_log
+from sysid.log import Log, Trial
+from sysid.measured import load_drive, load_mrclam, split
+
+if TYPE_CHECKING:
+    from benchmarks.fit import Benchmark
+
+CLAIM = "A fitted vehicle predicts real robots better than an ideal one"
+DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}
+DRIVE_HELD_OUT = {"asphalt": ("warthog_asphalt_a:0.667-1",), "sand": ("warthog_sand_2",)}
+DRIVE_RUNS = ("warthog_asphalt_a", "warthog_sand_1", "warthog_sand_2")
+
+
+def thin(log: Log, count: int) -> Log:
+    """The log with at most `count` training trials, spread evenly over each group; held-out ones are kept."""
+    groups: dict[str, list[Trial]] = {}
+    for trial in log.training:
+        groups.setdefault(trial.group, []).append(trial)
+    each = max(count // len(groups), 1)
+    kept = {group[i].name for group in groups.values()
+            for i in np.linspace(0, len(group) - 1, min(each, len(group))).round().astype(int)}
+    return log.select(lambda trial: trial.held_out or trial.name in kept)
+
+
+def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -> FitConfig:
+    # The paper's drive has no wheel-spin state: its odometry is its body's motion, so it can only fit the pose.
+    return FitConfig(preset=preset, method="both", trials=settings.evaluations,
+                     iterations=settings.iterations, starts=settings.starts, physics_dt=settings.physics_dt,
+                     channels="both" if preset == "physical" else "ground_truth")
+
+
+def drive(settings: Benchmark) -> None:
+    """DRIVE: one fit per terrain and one pooled, native 2 s windows; the same vehicles on chained 6 s steps."""
+    folder = settings.shared / "data" / "measured" / "drive_norlab"
+    native, chained = (load_drive(folder, DRIVE_RUNS, chained=chained) for chained in (False, True))
+    everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))
+    choices = {name: (DRIVE_TRAIN[name], DRIVE_HELD_OUT[name]) for name in DRIVE_TRAIN} | {"pooled": everything}
+    for preset in settings.presets:
+        for name in settings.terrains:
+            train, held_out = choices[name]
+            log = split(native, train, held_out)
+            fit = fit_log(thin(log, settings.windows), measured_config(settings, preset))
+            result = evaluate(fit, log.held_out)
+            stem = f"drive_{name}_{preset}"
+            figures = gains(result["summary"]["held_out"], stem)
+            steps = evaluate(fit, split(chained, train, held_out).held_out)
+            figures |= gains(steps["summary"]["held_out"], f"{stem}_chained_6s")
+            for group, parts in (result["groups"] if name == "pooled" else {}).items():
+                figures |= gains(parts["held_out"], f"{stem}_on_{group}")
+            figures[f"seconds_{stem}"] = figure([fit.seconds], "s")
+            if preset == "physical" and name != "pooled":
+                figures[f"drive_gain_over_ideal_{name}"] = figures[f"gain_{stem}"]
+            record("measured", CLAIM, figures)
+            show(figures)
+            show_parameters(fit)
+    for note in chained.notes:
+        print(note)
+
+
+def mrclam(settings: Benchmark) -> None:
+    """MRCLAM: robots 1 to 3 fitted, 4 and 5 held out."""
+    log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
+    log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
+    for preset in settings.presets:
+        # 15 s windows are long: a third of the windows is the same driving time.
+        fit = fit_log(thin(log, settings.windows // 3), measured_config(settings, preset))
+        figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")
+        figures[f"seconds_mrclam_{preset}"] = figure([fit.seconds], "s")
+        record("measured", CLAIM, figures)
+        show(figures)
+        show_parameters(fit)
