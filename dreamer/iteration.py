@@ -132,7 +132,7 @@ def collect(
 ) -> tuple[TrainState, Metrics]:
     """One step of every instance, written to the replay. Actions are random until learning has started, or always."""
     policy_key, random_key = jax.random.split(key)
-    frame = with_mirrored(env, state.transition) if config.mirror else state.transition
+    frame = with_mirrored(env, state.env_state, state.transition) if config.mirror else state.transition
     actions, noise, drawn = spaces.actions(env.action_dim), None, None
     if state.noise is not None:
         noise = exploration.advance(config, state.noise, random_key)
@@ -179,10 +179,10 @@ def started(config: DreamerConfig, state: TrainState) -> jax.Array:
     return before + state.env_steps >= config.learning_starts
 
 
-def with_mirrored(env: FunctionalEnv, transition: Transition) -> Transition:
+def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transition) -> Transition:
     """The frames of N instances, and after them the same N as the mirror shows them."""
     assert env.mirror is not None
-    mirrored = dataclasses.replace(transition, obs=env.mirror.obs(transition.obs))
+    mirrored = dataclasses.replace(transition, obs=env.mirror.obs(env_state, transition.obs))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), transition, mirrored)
 
 

@@ -39,8 +39,8 @@ class Transition:
 class Mirror:
     """What is seen and done in the mirrored world, where rewards and ends are the same."""
 
-    obs: Callable[[Any], Any]
-    """Observations (N, ...) -> those of the mirrored world."""
+    obs: Callable[[EnvState, Any], Any]
+    """The environment's state and the observations (N, ...) of its last step -> those of the mirrored world."""
     action: Callable[[jax.Array], jax.Array]
     """Actions (N, A), one-hot where they are classes -> those of the mirrored world."""
 

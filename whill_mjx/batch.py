@@ -11,7 +11,17 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.env import Env, Outcome, State, first_outcome, observe, reset_state, step_state, time_step
+from whill_mjx.env import (
+    Env,
+    Outcome,
+    State,
+    first_outcome,
+    observe,
+    repainted,
+    reset_state,
+    step_state,
+    time_step,
+)
 from whill_mjx.randomize import randomize_params
 from whill_mjx.types import TimeStep, VehicleParams
 
@@ -64,6 +74,18 @@ class BatchEnv:
             actions: (N, 2), each in [-1, 1].
         """
         return self._split(self._step)(state, actions)
+
+    def observe_repainted(self, state: BatchState) -> jax.Array:
+        """(N, H, W, 3) images of the same moment in worlds of the same shape that look different (`env.repainted`).
+
+        A world looks the same until its episode ends.
+        """
+
+        def one(state: BatchState) -> jax.Array:
+            key = jax.random.fold_in(state.origin, 1 + state.tries)
+            return observe(self.env, repainted(self.env, state.env, key))
+
+        return self._split(jax.vmap(one))(state)
 
     def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome = jax.vmap(self._begin)(keys)

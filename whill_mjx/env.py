@@ -19,7 +19,7 @@ from whill_mjx.render import pinhole, render
 from whill_mjx.scene import Scene, clearance, collides, footprint
 from whill_mjx.specs import VehicleSpec
 from whill_mjx.starts import draw_start
-from whill_mjx.task import Task, goal_position, make_task, reward_terms, sample_world, scale_action
+from whill_mjx.task import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
 from whill_mjx.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle import drive, place
 from whill_mjx.vehicle_file import load_vehicle as load_vehicle_file
@@ -182,6 +182,19 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
         done=jnp.zeros((), bool),
         key=key,
     )
+
+
+def repainted(env: Env, state: State, key: jax.Array) -> State:
+    """The state with other colours, light and textures, and another photometric change, where `env` draws them at
+    random; shapes, places and motion stay."""
+    looks_key, photometry_key, key = jax.random.split(key, 3)
+    scene, photometry = state.scene, state.photometry
+    if env.random_looks:
+        marker = dataclasses.replace(scene.marker, colour=jnp.array(BLUE))  # as before its own shade was drawn
+        scene = randomize_looks(looks_key, dataclasses.replace(scene, marker=marker))
+    if env.photometric:
+        photometry = draw_photometry(photometry_key)
+    return dataclasses.replace(state, scene=scene, photometry=photometry, key=key)
 
 
 def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, Outcome]:

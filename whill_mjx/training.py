@@ -200,18 +200,25 @@ def functional_env(
 
     image = (batch.env.height, batch.env.width, 3)
     shape = {"camera": image, TRUTH: (truth.SIZE,)} if targets else image
-    return FunctionalEnv(num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=MIRROR)
+    return FunctionalEnv(
+        num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=mirror_of(batch)
+    )
 
 
-def mirrored_obs(obs: Any) -> Any:
-    """Observations (N, ...) of the world mirrored left to right: images are flipped."""
-    if isinstance(obs, dict):
-        return {"camera": mirrored_obs(obs["camera"]), TRUTH: truth.mirrored(obs[TRUTH])}
-    return obs[:, :, ::-1]
+def mirror_of(batch: BatchEnv) -> Mirror:
+    """Left and right exchanged. A vehicle that pulls to one side breaks the symmetry by as much as it pulls.
 
+    Where looks are drawn at random, the mirrored world has its own: what is learned from one drive is seen in two.
+    """
+    paints = batch.env.random_looks or batch.env.photometric
 
-MIRROR = Mirror(mirrored_obs, lambda action: action * jnp.array([1.0, -1.0]))
-"""Left and right exchanged. A vehicle that pulls to one side breaks the symmetry by as much as it pulls."""
+    def flipped(state: Any, obs: Any) -> Any:
+        known = isinstance(obs, dict)
+        image = batch.observe_repainted(state) if paints else obs["camera"] if known else obs
+        image = image[:, :, ::-1]
+        return {"camera": image, TRUTH: truth.mirrored(obs[TRUTH])} if known else image
+
+    return Mirror(flipped, lambda action: action * jnp.array([1.0, -1.0]))
 
 
 def make_training_env(

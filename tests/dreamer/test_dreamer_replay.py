@@ -159,7 +159,7 @@ def test_the_model_foresees_the_frame_from_the_right_action_and_not_from_a_shuff
 
 def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothing():
     plain_env = echo_env(2)
-    mirror = Mirror(lambda obs: 255 - obs, lambda action: -action)
+    mirror = Mirror(lambda state, obs: 255 - obs, lambda action: -action)
     env = dataclasses.replace(plain_env, mirror=mirror)
     config = tiny_config(mirror=True, learning_starts=0)
     with pytest.raises(ValueError, match="has no mirror"):

@@ -9,9 +9,9 @@ import pytest
 
 from whill_mjx import truth
 from whill_mjx.batch import make_batch
-from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
 from whill_mjx.scene import box, footprint, no_boxes, stack_boxes
-from whill_mjx.training import MIRROR, TRUTH, functional_env
+from whill_mjx.training import TRUTH, functional_env, mirror_of
 
 ENV, PARAMS = make_env("obstacle_course", "whill_cr", height=16, width=16)
 
@@ -64,10 +64,11 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     state = reset_state(ENV, PARAMS, jax.random.key(3))
     other = mirrored_state(state)
     drive = jax.jit(lambda state, action: step_state(ENV, PARAMS, state, action))
+    mirror = mirror_of(make_batch(ENV, PARAMS, 1))
     actions = jax.random.uniform(jax.random.key(1), (12, 2), minval=jnp.array([0.2, -1.0]), maxval=1.0)
     for action in actions:
         state, outcome = drive(state, action)
-        other, other_outcome = drive(other, MIRROR.action(action[None])[0])
+        other, other_outcome = drive(other, mirror.action(action[None])[0])
     known, other_known = (truth.truth(ENV, one) for one in (state, other))
     assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], truth.mirrored(known)[4:], atol=0.1)
     np.testing.assert_allclose(truth.mirrored(known), other_known, atol=2e-3)
@@ -76,9 +77,30 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     scenes = [dataclasses.replace(one.scene.looks, **plain) for one in (state, other)]
     images = [np.asarray(observe(ENV, dataclasses.replace(one, scene=dataclasses.replace(one.scene, looks=looks))))
               for one, looks in zip((state, other), scenes, strict=True)]  # fmt: skip
-    difference = np.abs(np.asarray(MIRROR.obs(images[0][None])[0], int) - images[1])
+    difference = np.abs(np.asarray(mirror.obs(None, images[0][None])[0], int) - images[1])
     assert images[0].std() > 10 and np.abs(images[0].astype(int) - images[1]).mean() > 5
     assert (difference > 3).mean() < 0.02  # only pixels on an edge
+
+
+def test_where_looks_are_random_the_mirrored_world_has_its_own_for_a_whole_episode():
+    env, params = make_env("corridor", height=16, width=16)
+    batch = make_batch(env, params, 2, second_tries=0.5)
+    mirror = mirror_of(batch)
+    state, _ = jax.jit(batch.reset)(jax.random.key(0))
+    views = []
+    for _ in range(3):
+        state, frame = jax.jit(batch.step)(state, jnp.array([[-1.0, 0.0]] * 2))  # stands still
+        mirrored = np.asarray(mirror.obs(state, frame.obs), float)
+        views.append(mirrored)
+        assert np.abs(mirrored - np.asarray(frame.obs, float)[:, :, ::-1]).mean((1, 2, 3)).min() > 15
+    assert np.abs(views[2] - views[1]).mean() < 12  # grey levels, of noise
+    one = jax.tree.map(lambda leaf: leaf[0], state)
+    other = repainted(env, one.env, jax.random.key(7))
+    assert not np.allclose(other.scene.boxes.colour, one.env.scene.boxes.colour, atol=0.05)
+    blue = np.array([repainted(env, one.env, key).scene.marker.colour for key in jax.random.split(one.origin, 40)])
+    assert blue[:, 2].min() > 0.5 and (blue[:, 2] - blue[:, :2].max(1)).min() > 0.2  # still the goal
+    for name in ("centre", "half", "yaw"):
+        np.testing.assert_array_equal(getattr(other.scene.boxes, name), getattr(one.env.scene.boxes, name))
 
 
 def test_the_targets_stand_beside_the_camera_and_are_no_input():
