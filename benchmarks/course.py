@@ -29,9 +29,10 @@ from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
-from whill_mjx.dataset import write_json
+from whill_mjx.dataset import plain, write_json
 from whill_mjx.inside import mean_figures
-from whill_mjx.train import TrainOptions, main, preset_name
+from whill_mjx.policy_file import RUN_FILE
+from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle, preset_name, train_policy
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat, with_settings
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
@@ -42,23 +43,22 @@ CORRIDOR_CLAIM = "DreamerV3 from 64x64 RGB in the paper's corridor, randomised; 
 def run(options: argparse.Namespace) -> None:
     """One training of the main command with its proofs of sight; notes device and settings beside its results."""
     preset = preset_name(options.preset)
-    result = main(
-        TrainOptions(
-            out=options.out, vehicle=options.vehicle, task=options.task, preset=preset, layout=options.layout,
-            seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
-            action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
-            second_tries=options.second_tries, change=tuple(options.change), instances=options.instances,
-            eval_every=options.eval_every,
-            export="best" if preset == "cpu" else "last",
-            episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
-        )
+    asked = TrainOptions(
+        out=options.out, vehicle=options.vehicle, task=options.task, preset=preset, layout=options.layout,
+        seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
+        action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
+        second_tries=options.second_tries, change=tuple(options.change), instances=options.instances,
+        eval_every=options.eval_every,
+        export="best" if preset == "cpu" else "last",
+        episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
     )  # fmt: skip
+    result = train_alone(asked) if options.training_only else main(asked)
     note = {"device": device_name(), "preset": preset, "layout": options.layout, "seed": options.seed}
     if options.beside:
         note["together"] = 1 + options.beside
     write_json(options.out / "course.json", {**note, **result})
     if not (options.out / "policy").exists():
-        print("no proofs of sight: there is no policy file, for what exports it is not installed here", flush=True)
+        print("no proofs of sight: there is no policy file", flush=True)
         return
     told = evaluation_command.main(
         evaluation_command.EvaluateOptions(
@@ -68,6 +68,19 @@ def run(options: argparse.Namespace) -> None:
     )  # fmt: skip
     note["sight"] = {kind: told["drivers"][f"policy {kind}"]["success"] for kind in BLIND}
     write_json(options.out / "course.json", {**note, **result})
+
+
+def train_alone(asked: TrainOptions) -> dict[str, Any]:
+    """The training without what the main command does after it: its last evaluation stands for the final one."""
+    preset = choose_preset(asked)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    write_json(asked.out / RUN_FILE, {"command": plain(asked), "preset": plain(preset)})
+    done = train_policy(asked, preset, prepare_vehicle(asked))
+    lines = [json.loads(line) for line in (asked.out / "metrics.jsonl").read_text().splitlines()]
+    last = [line for line in lines if "eval/success" in line][-1]
+    policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
+    return {"task": plain(preset.task), "learner": asked.learner, "seed": asked.seed, "env_steps": done.env_steps,
+            "updates": done.updates, "policy": {**policy, "episodes": preset.eval_episodes}}
 
 
 def together(options: argparse.Namespace) -> None:
@@ -249,6 +262,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--second-tries", type=float, help="share of failed worlds begun again; the preset's unless given")
     one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
+    one.add_argument("--training-only", action="store_true", help="no final evaluation, policy file or proofs of sight")
     one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
     one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
     one.set_defaults(call=run)

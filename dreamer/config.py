@@ -94,8 +94,9 @@ class DreamerConfig:
     pretrain_updates: int = 0
     """Updates of the world model alone on these steps, before the first counted one."""
 
-    mirror: bool = False
-    """Remember every step a second time as the environment's mirror shows it. Steps and ratio count the real ones."""
+    mirror: int = 0
+    """How many times more to remember every step, as the environment's mirror shows it in so many other worlds. Steps
+    and ratio count the real ones."""
 
     horizon: float = 333.0
     """Effective horizon [steps]; discount 1 - 1/horizon, contained in the continue head."""
@@ -186,6 +187,7 @@ class DreamerConfig:
             (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
+            (self.mirror >= 0, "mirror", "must not be negative"),
             (self.entropy_decay >= 0, "entropy_decay", "must not be negative"),
             (0 <= self.greedy_share < 1, "greedy_share", "must lie in 0..1 and below 1"),
             (self.behavior_lr > 0, "behavior_lr", "must be positive"),

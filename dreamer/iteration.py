@@ -65,8 +65,12 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
     Raises:
         ValueError: observation, action, replay or pretraining do not fit, or there is no mirror.
     """
-    if config.mirror and env.mirror is None:
-        raise ValueError("DreamerConfig.mirror is set, but the environment has no mirror: unset it, or give one.")
+    worlds = 0 if env.mirror is None else env.mirror.worlds
+    if config.mirror > worlds:
+        raise ValueError(
+            f"DreamerConfig.mirror = {int(config.mirror)}, but the environment has no mirror that shows more than "
+            f"{worlds} other worlds: lower it, or give one."
+        )
     sensors.check(config, env.obs_shape)
     needed = config.batch_length * env.num_envs
     if 0 < config.pretrain_steps <= needed:
@@ -132,7 +136,7 @@ def collect(
 ) -> tuple[TrainState, Metrics]:
     """One step of every instance, written to the replay. Actions are random until learning has started, or always."""
     policy_key, random_key = jax.random.split(key)
-    frame = with_mirrored(env, state.env_state, state.transition) if config.mirror else state.transition
+    frame = with_mirrored(env, state.env_state, state.transition, config.mirror)
     actions, noise, drawn = spaces.actions(env.action_dim), None, None
     if state.noise is not None:
         noise = exploration.advance(config, state.noise, random_key)
@@ -148,7 +152,8 @@ def collect(
     real = action[: env.num_envs]
     if config.mirror:
         assert env.mirror is not None
-        action = jnp.concatenate([real, env.mirror.action(real)])
+        others = range(1, config.mirror + 1)
+        action = jnp.concatenate([real, *(env.mirror.action(real, world) for world in others)])
     latent = Latent(carry["deter"], carry["stoch"])
     memory = replay.write(config, state.replay, frame, action, latent)
     env_state, transition = env.step(state.env_state, actions.to_env(real))
@@ -179,11 +184,14 @@ def started(config: DreamerConfig, state: TrainState) -> jax.Array:
     return before + state.env_steps >= config.learning_starts
 
 
-def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transition) -> Transition:
-    """The frames of N instances, and after them the same N as the mirror shows them."""
+def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transition, worlds: int) -> Transition:
+    """The frames of N instances, and after them the same N as the mirror shows them in each of so many worlds."""
+    if not worlds:
+        return transition
     assert env.mirror is not None
-    mirrored = dataclasses.replace(transition, obs=env.mirror.obs(env_state, transition.obs))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), transition, mirrored)
+    others = [dataclasses.replace(transition, obs=env.mirror.obs(env_state, transition.obs, world))
+              for world in range(1, worlds + 1)]  # fmt: skip
+    return jax.tree.map(lambda *each: jnp.concatenate(each), transition, *others)
 
 
 def learn(

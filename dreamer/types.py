@@ -37,12 +37,15 @@ class Transition:
 
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """What is seen and done in the mirrored world, where rewards and ends are the same."""
+    """What is seen and done in other worlds, mirrored ones say, where rewards and ends are the same."""
 
-    obs: Callable[[EnvState, Any], Any]
-    """The environment's state and the observations (N, ...) of its last step -> those of the mirrored world."""
-    action: Callable[[jax.Array], jax.Array]
-    """Actions (N, A), one-hot where they are classes -> those of the mirrored world."""
+    obs: Callable[[EnvState, Any, int], Any]
+    """The environment's state and the observations (N, ...) of its last step -> those of the other world number 1 to
+    `worlds`."""
+    action: Callable[[jax.Array, int], jax.Array]
+    """Actions (N, A), one-hot where they are classes -> those of the other world of that number."""
+    worlds: int = 1
+    """How many different ones there are."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,14 +75,14 @@ class BatchEnv:
         """
         return self._split(self._step)(state, actions)
 
-    def observe_repainted(self, state: BatchState) -> jax.Array:
+    def observe_repainted(self, state: BatchState, number: int) -> jax.Array:
         """(N, H, W, 3) images of the same moment in worlds of the same shape that look different (`env.repainted`).
 
-        A world looks the same until its episode ends.
+        There are as many as there are numbers; each looks the same until its episode ends.
         """
 
         def one(state: BatchState) -> jax.Array:
-            key = jax.random.fold_in(state.origin, 1 + state.tries)
+            key = jax.random.fold_in(jax.random.fold_in(state.origin, number), state.tries)
             return observe(self.env, repainted(self.env, state.env, key))
 
         return self._split(jax.vmap(one))(state)

@@ -75,10 +75,10 @@ def find_preset(name: str, task: str) -> Preset:
             steps, ratio = (22_000, 512) if on_course else (200_000, 160)
             learner = learner_preset(
                 "size12m", train_ratio=float(ratio), lr=1.5e-4, lr_decay=steps * ratio // 1024, entropy_scale=1e-3,
-                replay_capacity=250_000, mirror=True, average_rate=0.002, greedy_share=0.25, decode_only=(TRUTH,),
+                replay_capacity=250_000, average_rate=0.002, greedy_share=0.25, decode_only=(TRUTH,),
             )  # fmt: skip
-            own: dict[str, Any] = dict(horizon=100.0, return_lambda=0.98, imag_horizon=25)
-            own = own if on_course else dict(vector_scale=5.0)
+            own: dict[str, Any] = dict(horizon=100.0, return_lambda=0.98, imag_horizon=25, mirror=1)
+            own = own if on_course else dict(vector_scale=5.0, mirror=3)
             return Preset(
                 make_task(task), dataclasses.replace(learner, **own), steps, eval_every=1000 if on_course else 10_000,
                 eval_episodes=200, exploring_starts=0.5 if on_course else 0.0, second_tries=0.0 if on_course else 0.5,
@@ -208,17 +208,23 @@ def functional_env(
 def mirror_of(batch: BatchEnv) -> Mirror:
     """Left and right exchanged. A vehicle that pulls to one side breaks the symmetry by as much as it pulls.
 
-    Where looks are drawn at random, the mirrored world has its own: what is learned from one drive is seen in two.
+    Where looks are drawn at random, each of its worlds has its own, every second one with left and right as they are:
+    what is learned from one drive is seen in several.
     """
     paints = batch.env.random_looks or batch.env.photometric
 
-    def flipped(state: Any, obs: Any) -> Any:
+    def other_obs(state: Any, obs: Any, world: int) -> Any:
         known = isinstance(obs, dict)
-        image = batch.observe_repainted(state) if paints else obs["camera"] if known else obs
+        image = batch.observe_repainted(state, world) if paints else obs["camera"] if known else obs
+        if world % 2 == 0:
+            return {"camera": image, TRUTH: obs[TRUTH]} if known else image
         image = image[:, :, ::-1]
         return {"camera": image, TRUTH: truth.mirrored(obs[TRUTH])} if known else image
 
-    return Mirror(flipped, lambda action: action * jnp.array([1.0, -1.0]))
+    def other_action(action: jax.Array, world: int) -> jax.Array:
+        return action * jnp.array([1.0, -1.0 if world % 2 else 1.0])
+
+    return Mirror(other_obs, other_action, worlds=15 if paints else 1)
 
 
 def make_training_env(

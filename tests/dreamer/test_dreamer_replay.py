@@ -159,7 +159,7 @@ def test_the_model_foresees_the_frame_from_the_right_action_and_not_from_a_shuff
 
 def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothing():
     plain_env = echo_env(2)
-    mirror = Mirror(lambda state, obs: 255 - obs, lambda action: -action)
+    mirror = Mirror(lambda state, obs, world: 255 - obs, lambda action, world: -action)
     env = dataclasses.replace(plain_env, mirror=mirror)
     config = tiny_config(mirror=True, learning_starts=0)
     with pytest.raises(ValueError, match="has no mirror"):
@@ -181,6 +181,24 @@ def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothin
         np.testing.assert_array_equal(mirrored[name], real[name])
     gain, price = iteration.credit_rates(config, 2)
     assert updates == (14 - config.batch_length) * gain // price
+
+
+def test_each_world_of_the_mirror_has_a_stream_of_its_own():
+    mirror = Mirror(lambda state, obs, world: obs // 4 + 50 * world, lambda action, world: action / world, worlds=2)
+    env = dataclasses.replace(echo_env(2), mirror=mirror)
+    with pytest.raises(ValueError, match="mirror = 3, .* more than 2 other worlds"):
+        iteration.init_state(env, tiny_config(mirror=3), 0)
+    config = tiny_config(mirror=2, learning_starts=0)
+    step = jax.jit(lambda state: iteration.train_iteration(env, config, state))
+    state = iteration.init_state(env, config, 0)
+    for _ in range(8):
+        state, _ = step(state)
+    real, one, other = (jax.tree.map(lambda x: np.asarray(x[:8]), columns(state.replay, slice(i, i + 2)))
+                        for i in (0, 2, 4))  # fmt: skip
+    np.testing.assert_array_equal(one["obs"], real["obs"] // 4 + 50)
+    np.testing.assert_array_equal(other["obs"], real["obs"] // 4 + 100)
+    np.testing.assert_array_equal(other["action"], one["action"] / 2)
+    np.testing.assert_array_equal(one["action"], real["action"])
 
 
 def columns(memory, part):

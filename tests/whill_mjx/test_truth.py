@@ -68,7 +68,7 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     actions = jax.random.uniform(jax.random.key(1), (12, 2), minval=jnp.array([0.2, -1.0]), maxval=1.0)
     for action in actions:
         state, outcome = drive(state, action)
-        other, other_outcome = drive(other, mirror.action(action[None])[0])
+        other, other_outcome = drive(other, mirror.action(action[None], 1)[0])
     known, other_known = (truth.truth(ENV, one) for one in (state, other))
     assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], truth.mirrored(known)[4:], atol=0.1)
     np.testing.assert_allclose(truth.mirrored(known), other_known, atol=2e-3)
@@ -77,12 +77,12 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     scenes = [dataclasses.replace(one.scene.looks, **plain) for one in (state, other)]
     images = [np.asarray(observe(ENV, dataclasses.replace(one, scene=dataclasses.replace(one.scene, looks=looks))))
               for one, looks in zip((state, other), scenes, strict=True)]  # fmt: skip
-    difference = np.abs(np.asarray(mirror.obs(None, images[0][None])[0], int) - images[1])
+    difference = np.abs(np.asarray(mirror.obs(None, images[0][None], 1)[0], int) - images[1])
     assert images[0].std() > 10 and np.abs(images[0].astype(int) - images[1]).mean() > 5
     assert (difference > 3).mean() < 0.02  # only pixels on an edge
 
 
-def test_where_looks_are_random_the_mirrored_world_has_its_own_for_a_whole_episode():
+def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode():
     env, params = make_env("corridor", height=16, width=16)
     batch = make_batch(env, params, 2, second_tries=0.5)
     mirror = mirror_of(batch)
@@ -90,10 +90,16 @@ def test_where_looks_are_random_the_mirrored_world_has_its_own_for_a_whole_episo
     views = []
     for _ in range(3):
         state, frame = jax.jit(batch.step)(state, jnp.array([[-1.0, 0.0]] * 2))  # stands still
-        mirrored = np.asarray(mirror.obs(state, frame.obs), float)
-        views.append(mirrored)
-        assert np.abs(mirrored - np.asarray(frame.obs, float)[:, :, ::-1]).mean((1, 2, 3)).min() > 15
+        worlds = np.stack([np.asarray(mirror.obs(state, frame.obs, world), float) for world in (1, 2, 3)])
+        as_real = [worlds[0][:, :, ::-1], worlds[1], worlds[2][:, :, ::-1]]
+        shown = [np.asarray(frame.obs, float), *as_real]
+        apart = [np.abs(a - b).mean((1, 2, 3)).min() for i, a in enumerate(shown) for b in shown[:i]]
+        assert min(apart) > 10
+        views.append(worlds)
     assert np.abs(views[2] - views[1]).mean() < 12  # grey levels, of noise
+    turns = [float(mirror.action(jnp.array([[0.5, 0.25]]), world)[0, 1]) for world in (1, 2, 3)]
+    assert turns == [-0.25, 0.25, -0.25] and mirror.worlds > 3
+    assert mirror_of(make_batch(ENV, PARAMS, 1)).worlds == 1
     one = jax.tree.map(lambda leaf: leaf[0], state)
     other = repainted(env, one.env, jax.random.key(7))
     assert not np.allclose(other.scene.boxes.colour, one.env.scene.boxes.colour, atol=0.05)
