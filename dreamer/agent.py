@@ -158,7 +158,7 @@ def loss(
     outcome = (batch.reward, batch.is_last, batch.is_terminal)
     latest, tail = jax.tree.map(lambda x: x[-config.start_steps :], (latent, outcome))
     behavior_losses, returns, norm, metrics = behavior.imagination_loss(
-        config, params, agent.slow_value, agent.return_norm, latest, imagine_key, agent.updates
+        config, params, agent.slow_value, agent.return_norm, latest, imagine_key
     )
     losses.update(behavior_losses)
     start_return = returns.reshape(tail[0].shape)

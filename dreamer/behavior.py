@@ -148,13 +148,6 @@ def critic_loss(
     return jax.lax.stop_gradient(weight) * dist.cross_entropy(logits, jax.lax.stop_gradient(target))
 
 
-def entropy_left(config: DreamerConfig, updates: jax.Array | int) -> jax.Array | float:
-    """() share of the entropy's weight after so many updates."""
-    if not config.entropy_decay:
-        return 1.0
-    return 1.0 - 0.9 * jnp.clip(updates / config.entropy_decay, 0.0, 1.0)
-
-
 def imagination_loss(
     config: DreamerConfig,
     params: Params,
@@ -162,7 +155,6 @@ def imagination_loss(
     norm: ReturnNorm,
     start: Latent,
     key: jax.Array,
-    updates: jax.Array | int = 0,
 ) -> tuple[dict[str, jax.Array], jax.Array, ReturnNorm, dict[str, jax.Array]]:
     """Losses of actor and critic on imagined rollouts.
 
@@ -175,7 +167,6 @@ def imagination_loss(
         norm: running percentiles of the returns.
         start: states with any leading axes, M altogether, as `imagine` takes them.
         key: consumed.
-        updates: () done so far.
 
     Returns:
         Losses (H, M) by name, returns (M,) of the starts, new percentiles, metrics.
@@ -198,9 +189,8 @@ def imagination_loss(
     log_prob, entropy = actions.score(config, raw, rollout.actions[:-1])
     slow_logits = world_model.head(slow, features[:-1])
     pull = config.mean_pull * stop(weight[:-1]) * actions.saturation(raw) if config.mean_pull else 0.0
-    wanted = entropy_left(config, updates) * entropy
     losses = {
-        "policy": actor_loss(config, log_prob, wanted, advantage, weight[:-1]) + pull,
+        "policy": actor_loss(config, log_prob, entropy, advantage, weight[:-1]) + pull,
         "value": critic_loss(config, logits[:-1], slow_logits, returns, weight[:-1]),
     }
     metrics = {

@@ -108,9 +108,6 @@ class DreamerConfig:
     """Lambda of the returns."""
     entropy_scale: float = 3e-4
     """Weight of the actor's entropy."""
-    entropy_decay: int = 0
-    """Updates by which that has fallen linearly to a tenth, for runs of known length: the actor first explores and then
-    drives as well as it can without noise; 0 keeps it."""
     slow_rate: float = 0.02
     """Rate at which the slow critic follows."""
     slow_reg: float = 1.0
@@ -188,7 +185,6 @@ class DreamerConfig:
             (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
             (self.mirror >= 0, "mirror", "must not be negative"),
-            (self.entropy_decay >= 0, "entropy_decay", "must not be negative"),
             (0 <= self.greedy_share < 1, "greedy_share", "must lie in 0..1 and below 1"),
             (self.behavior_lr > 0, "behavior_lr", "must be positive"),
             (self.mean_pull >= 0, "mean_pull", "must not be negative"),

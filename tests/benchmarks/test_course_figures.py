@@ -11,6 +11,7 @@ import pytest
 from benchmarks import course
 from benchmarks.course_figures import groups, load_run
 from dreamer.config import preset
+from whill_mjx.train import Trained
 
 COURSE, CORRIDOR = {"action_repeat": 1}, {"action_repeat": 1, "box_x": 2.5}
 
@@ -118,3 +119,26 @@ def test_an_ablation_tells_late_evaluations_settings_and_what_whole_runs_came_to
     assert entry["whole"] == {"0": {"episodes": 1000, "success": 0.97, "collision": 0.02, "return": 190.0}}
     told = {"task": "corridor", "layout": "randomised", "exploring_starts": 0.5, "second_tries": 0.5}
     assert entry["environment"] == told
+
+
+@pytest.mark.quick
+def test_a_training_alone_ends_with_its_last_evaluation_and_is_recorded_like_a_whole_run(tmp_path, monkeypatch):
+    def train(options, preset, vehicle):
+        assert vehicle.exists() and preset.learner.lr == 1e-3
+        lines = [{"env_steps": steps, "wall_s": 80.0, "eval/success": share, "eval/collision": 1.0 - share,
+                  "eval/return": reward} for steps, share, reward in ((18_000, 0.5, 90.0), (22_000, 1.0, 210.0))]
+        (options.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return Trained(params={}, env_steps=22_000, updates=7, wall_s=80.0)
+
+    monkeypatch.setattr(course, "train_policy", train)
+    monkeypatch.setattr(course, "main", lambda options: pytest.fail("the whole command was run"))
+    asked = ["run", "--preset", "paper", "--layout", "fixed", "--seed", "2", "--out", str(tmp_path / "run"),
+             "--vehicle", "whill_cr_ramp", "--lr", "1e-3", "--training-only"]
+    monkeypatch.setattr("sys.argv", ["course", *asked])
+    course.run(course.parse())
+    run = load_run(tmp_path / "run")
+    [(name, _, figures)] = groups([run])
+    assert name == "course_paper_fixed" and run["policy"] == {"success": 1.0, "collision": 0.0, "return": 210.0,
+                                                              "episodes": 200}
+    assert figures["wallclock_s_fixed"]["value"] == 80.0 and figures["return_at_18000_median_fixed"]["value"] == 150.0
+    assert not [name for name in figures if "blinded" in name]

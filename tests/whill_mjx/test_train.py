@@ -149,7 +149,8 @@ def test_shaping_changes_the_learners_reward_and_not_the_evaluations():
         return SimpleNamespace(env=SimpleNamespace(command=action)), Step(**vars(told))
 
     batch = SimpleNamespace(count=2, step=step, env=SimpleNamespace(
-        task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1))))
+        task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1)),
+        random_looks=False, photometric=False))
     state, action = SimpleNamespace(env=SimpleNamespace(command=commands)), jnp.ones((2, 2))
     new, shaped = functional_env(batch, SAFETY["safe"]).step(state, action)
     np.testing.assert_allclose(new.env.command, [[0.1, 0.2]] * 2, atol=1e-6)  # 1 m/s^2 and 2 rad/s^2 for 0.1 s
