@@ -32,7 +32,15 @@ from whill_mjx import evaluate as evaluation_command
 from whill_mjx.dataset import plain, write_json
 from whill_mjx.inside import mean_figures
 from whill_mjx.policy_file import RUN_FILE
-from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle, preset_name, train_policy
+from whill_mjx.train import (
+    TrainOptions,
+    choose_preset,
+    main,
+    prepare_vehicle,
+    preset_name,
+    train_baseline,
+    train_policy,
+)
 from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat, with_settings
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
@@ -75,7 +83,8 @@ def train_alone(asked: TrainOptions) -> dict[str, Any]:
     preset = choose_preset(asked)
     asked.out.mkdir(parents=True, exist_ok=True)
     write_json(asked.out / RUN_FILE, {"command": plain(asked), "preset": plain(preset)})
-    done = train_policy(asked, preset, prepare_vehicle(asked))
+    train_it = train_policy if asked.learner == "dreamer" else train_baseline
+    done = train_it(asked, preset, prepare_vehicle(asked))
     lines = [json.loads(line) for line in (asked.out / "metrics.jsonl").read_text().splitlines()]
     last = [line for line in lines if "eval/success" in line][-1]
     policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
