@@ -152,8 +152,8 @@ def collect(
     real = action[: env.num_envs]
     if config.mirror:
         assert env.mirror is not None
-        others = range(1, config.mirror + 1)
-        action = jnp.concatenate([real, *(env.mirror.action(real, world) for world in others)])
+        others = env.mirror.action(real, config.mirror)
+        action = jnp.concatenate([real, others.reshape(-1, *real.shape[1:])])
     latent = Latent(carry["deter"], carry["stoch"])
     memory = replay.write(config, state.replay, frame, action, latent)
     env_state, transition = env.step(state.env_state, actions.to_env(real))
@@ -189,9 +189,10 @@ def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transitio
     if not worlds:
         return transition
     assert env.mirror is not None
-    others = [dataclasses.replace(transition, obs=env.mirror.obs(env_state, transition.obs, world))
-              for world in range(1, worlds + 1)]  # fmt: skip
-    return jax.tree.map(lambda *each: jnp.concatenate(each), transition, *others)
+    others = env.mirror.obs(env_state, transition.obs, worlds)
+    obs = jax.tree.map(lambda a, b: jnp.concatenate([a, b.reshape(-1, *a.shape[1:])]), transition.obs, others)
+    same = jax.tree.map(lambda a: jnp.concatenate([a] * (1 + worlds)), dataclasses.replace(transition, obs=None))
+    return dataclasses.replace(same, obs=obs)
 
 
 def learn(

@@ -40,12 +40,11 @@ class Mirror:
     """What is seen and done in other worlds, mirrored ones say, where rewards and ends are the same."""
 
     obs: Callable[[EnvState, Any, int], Any]
-    """The environment's state and the observations (N, ...) of its last step -> those of the other world number 1 to
-    `worlds`."""
+    """The environment's state, the observations (N, ...) of its last step, W -> those of W worlds (W, N, ...)."""
     action: Callable[[jax.Array, int], jax.Array]
-    """Actions (N, A), one-hot where they are classes -> those of the other world of that number."""
+    """Actions (N, A), one-hot where they are classes, and W -> those of the same W worlds (W, N, A)."""
     worlds: int = 1
-    """How many different ones there are."""
+    """How many different ones there are, at least W."""
 
 
 @dataclass(frozen=True, eq=False)

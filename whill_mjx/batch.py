@@ -75,17 +75,19 @@ class BatchEnv:
         """
         return self._split(self._step)(state, actions)
 
-    def observe_repainted(self, state: BatchState, number: int) -> jax.Array:
-        """(N, H, W, 3) images of the same moment in worlds of the same shape that look different (`env.repainted`).
+    def observe_repainted(self, state: BatchState, worlds: int) -> jax.Array:
+        """(W, N, H, W, 3) images of the same moment in other worlds of the same shape (`env.repainted`).
 
-        There are as many as there are numbers; each looks the same until its episode ends.
+        Each looks the same until its episode ends.
         """
 
-        def one(state: BatchState) -> jax.Array:
+        def one(state: BatchState, number: jax.Array) -> jax.Array:
             key = jax.random.fold_in(jax.random.fold_in(state.origin, number), state.tries)
             return observe(self.env, repainted(self.env, state.env, key))
 
-        return self._split(jax.vmap(one))(state)
+        numbers = jnp.arange(1, worlds + 1)
+        every = jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))
+        return jnp.swapaxes(self._split(lambda state: every(state, numbers))(state), 0, 1)
 
     def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome = jax.vmap(self._begin)(keys)

@@ -215,16 +215,23 @@ def mirror_of(batch: BatchEnv) -> Mirror:
     """
     paints = batch.env.random_looks or batch.env.photometric
 
-    def other_obs(state: Any, obs: Any, world: int) -> Any:
-        known = isinstance(obs, dict)
-        image = batch.observe_repainted(state, world) if paints else obs["camera"] if known else obs
-        if world % 2 == 0:
-            return {"camera": image, TRUTH: obs[TRUTH]} if known else image
-        image = image[:, :, ::-1]
-        return {"camera": image, TRUTH: truth.mirrored(obs[TRUTH])} if known else image
+    def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
+        """Every second of the worlds (W, ...) as it is."""
+        every_second = jnp.arange(plain.shape[0]) % 2 == 1
+        return jnp.where(every_second.reshape(-1, *[1] * (plain.ndim - 1)), plain, mirrored)
 
-    def other_action(action: jax.Array, world: int) -> jax.Array:
-        return action * jnp.array([1.0, -1.0 if world % 2 else 1.0])
+    def other_obs(state: Any, obs: Any, worlds: int) -> Any:
+        known = isinstance(obs, dict)
+        image = batch.observe_repainted(state, worlds) if paints else (obs["camera"] if known else obs)[None]
+        image = turned(image, image[..., ::-1, :])
+        if not known:
+            return image
+        told = jnp.broadcast_to(obs[TRUTH], (worlds, *obs[TRUTH].shape))
+        return {"camera": image, TRUTH: turned(told, truth.mirrored(told))}
+
+    def other_action(action: jax.Array, worlds: int) -> jax.Array:
+        action = jnp.broadcast_to(action, (worlds, *action.shape))
+        return turned(action, action * jnp.array([1.0, -1.0]))
 
     return Mirror(other_obs, other_action, worlds=15 if paints else 1)
 

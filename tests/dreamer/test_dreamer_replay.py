@@ -159,7 +159,7 @@ def test_the_model_foresees_the_frame_from_the_right_action_and_not_from_a_shuff
 
 def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothing():
     plain_env = echo_env(2)
-    mirror = Mirror(lambda state, obs, world: 255 - obs, lambda action, world: -action)
+    mirror = Mirror(lambda state, obs, worlds: 255 - obs[None], lambda action, worlds: -action[None])
     env = dataclasses.replace(plain_env, mirror=mirror)
     config = tiny_config(mirror=True, learning_starts=0)
     with pytest.raises(ValueError, match="has no mirror"):
@@ -184,7 +184,10 @@ def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothin
 
 
 def test_each_world_of_the_mirror_has_a_stream_of_its_own():
-    mirror = Mirror(lambda state, obs, world: obs // 4 + 50 * world, lambda action, world: action / world, worlds=2)
+    mirror = Mirror(
+        lambda state, obs, worlds: jnp.stack([obs // 4 + 50 * (1 + i) for i in range(worlds)]),
+        lambda action, worlds: jnp.stack([action / (1 + i) for i in range(worlds)]), worlds=2,
+    )  # fmt: skip
     env = dataclasses.replace(echo_env(2), mirror=mirror)
     with pytest.raises(ValueError, match="mirror = 3, .* more than 2 other worlds"):
         iteration.init_state(env, tiny_config(mirror=3), 0)

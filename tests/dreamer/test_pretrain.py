@@ -141,7 +141,9 @@ def test_a_killed_pretraining_goes_on_from_its_last_checkpoint(straight, tmp_pat
 
 
 def test_seeds_side_by_side_pretrain_as_each_alone_with_a_mirror_and_targets(tmp_path):
-    mirror = Mirror(lambda state, obs, world: obs, lambda action, world: action[:, ::-1])
+    mirror = Mirror(
+        lambda state, obs, worlds: jax.tree.map(lambda x: x[None], obs), lambda action, worlds: action[None, :, ::-1]
+    )
     env = dataclasses.replace(blind_env(2), mirror=mirror)
     config = tiny_config(
         lr=2e-3, warmup=5, mirror=True, decode_only=("range",), pretrain_steps=20, pretrain_updates=3, steps_per_iter=4,

@@ -68,7 +68,7 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     actions = jax.random.uniform(jax.random.key(1), (12, 2), minval=jnp.array([0.2, -1.0]), maxval=1.0)
     for action in actions:
         state, outcome = drive(state, action)
-        other, other_outcome = drive(other, mirror.action(action[None], 1)[0])
+        other, other_outcome = drive(other, mirror.action(action[None], 1)[0, 0])
     known, other_known = (truth.truth(ENV, one) for one in (state, other))
     assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], truth.mirrored(known)[4:], atol=0.1)
     np.testing.assert_allclose(truth.mirrored(known), other_known, atol=2e-3)
@@ -77,7 +77,7 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     scenes = [dataclasses.replace(one.scene.looks, **plain) for one in (state, other)]
     images = [np.asarray(observe(ENV, dataclasses.replace(one, scene=dataclasses.replace(one.scene, looks=looks))))
               for one, looks in zip((state, other), scenes, strict=True)]  # fmt: skip
-    difference = np.abs(np.asarray(mirror.obs(None, images[0][None], 1)[0], int) - images[1])
+    difference = np.abs(np.asarray(mirror.obs(None, images[0][None], 1)[0, 0], int) - images[1])
     assert images[0].std() > 10 and np.abs(images[0].astype(int) - images[1]).mean() > 5
     assert (difference > 3).mean() < 0.02  # only pixels on an edge
 
@@ -90,15 +90,18 @@ def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode
     views = []
     for _ in range(3):
         state, frame = jax.jit(batch.step)(state, jnp.array([[-1.0, 0.0]] * 2))  # stands still
-        worlds = np.stack([np.asarray(mirror.obs(state, frame.obs, world), float) for world in (1, 2, 3)])
+        worlds = np.asarray(mirror.obs(state, frame.obs, 3), float)
         as_real = [worlds[0][:, :, ::-1], worlds[1], worlds[2][:, :, ::-1]]
         shown = [np.asarray(frame.obs, float), *as_real]
         apart = [np.abs(a - b).mean((1, 2, 3)).min() for i, a in enumerate(shown) for b in shown[:i]]
         assert min(apart) > 10
         views.append(worlds)
     assert np.abs(views[2] - views[1]).mean() < 12  # grey levels, of noise
-    turns = [float(mirror.action(jnp.array([[0.5, 0.25]]), world)[0, 1]) for world in (1, 2, 3)]
-    assert turns == [-0.25, 0.25, -0.25] and mirror.worlds > 3
+    np.testing.assert_array_equal(mirror.action(jnp.array([[0.5, 0.25]]), 3)[:, 0, 1], [-0.25, 0.25, -0.25])
+    assert mirror.worlds > 3
+    known = jax.random.uniform(jax.random.key(1), (2, truth.SIZE))
+    told = mirror.obs(state, {"camera": frame.obs, TRUTH: known}, 2)[TRUTH]
+    np.testing.assert_array_equal(told, [truth.mirrored(known), known])
     assert mirror_of(make_batch(ENV, PARAMS, 1)).worlds == 1
     one = jax.tree.map(lambda leaf: leaf[0], state)
     other = repainted(env, one.env, jax.random.key(7))
