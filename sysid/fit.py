@@ -70,7 +70,8 @@ class FitConfig:
     iterations: int = 40
     """Iterations of the gradient search on poses."""
     elsewhere: bool = True
-    """Whether the gradient search also starts far away along ranges where that costs little, and from other delays."""
+    """Whether the gradient search also starts far away along ranges where that costs little, from other delays, and
+    from random points close to its end."""
     seed: int = 0
     """Seed of both searches."""
     quick: bool = False
@@ -317,7 +318,7 @@ def expected_steps(config: FitConfig) -> int:
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
-    elsewhere = FIRST + 4 * min(LOOK, iterations) if config.elsewhere else 0
+    elsewhere = FIRST + 5 * min(LOOK, iterations) if config.elsewhere else 0
     return first + (iterations + elsewhere if config.method not in GLOBAL else 0)
 
 

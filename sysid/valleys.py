@@ -28,6 +28,10 @@ DEAR, FAR = 10.0, 12
 FIRST, KEPT, LOOK = 1, 4, 3
 """Iterations from all of these, how many are searched further, and iterations after which one must be better."""
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
+SHAKES = (0.01, 0.016, 0.025, 0.04)
+"""Shares of its range by which each parameter moves at most, of the points that the end is shaken to."""
+ROUNDS, MISSES, WORTH = 6, 2, 0.001
+"""Of shaking at most, and after how many in a row it ends that lower the cost by less than that share."""
 
 
 def gradient_search(
@@ -39,7 +43,8 @@ def gradient_search(
     What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
     right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
-    on a grid, and LM tries another valley that is about as deep. Nothing of this is done without `config.elsewhere`.
+    on a grid, and LM tries another valley that is about as deep. At the end all parameters are shaken a little: the
+    floors of valleys are jagged. Nothing of this is done without `config.elsewhere`.
     """
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
@@ -68,7 +73,29 @@ def gradient_search(
         if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
             result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
+    if config.elsewhere:
+        result = _shaken(partial(search, objective), result, iterations, config.seed)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
+
+
+def _shaken(
+    search: Callable[[np.ndarray, int], FitResult], result: FitResult, iterations: int, seed: int
+) -> FitResult:
+    """The result with where searches from random points close to it end, round after round while that is worth it.
+
+    Delays act in steps and wheels stick or slip: on the floor of a curved valley a search stops at one of many folds,
+    between which neither a single parameter nor a straight line leads. From a little up its sides LM comes down
+    elsewhere.
+    """
+    random, sizes, misses = np.random.default_rng(seed), np.array(SHAKES)[:, None], 0
+    for _ in range(ROUNDS):
+        if misses == MISSES:
+            break
+        before = result.cost
+        points = result.u + sizes * random.uniform(-1.0, 1.0, (len(sizes), len(result.u)))
+        result = _from_elsewhere(search, result, np.clip(points, 0.0, 1.0), iterations)
+        misses = 0 if result.cost < before * (1 - WORTH) else misses + 1
+    return result
 
 
 def _from_elsewhere(

@@ -46,6 +46,7 @@ def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, c
     stuck = gradient.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
     monkeypatch.setattr("sysid.valleys.DEAR", dear)
+    monkeypatch.setattr("sysid.valleys.ROUNDS", 0)  # nor from close by
     result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
     assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
@@ -81,6 +82,39 @@ def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
     assert points[0, 1] < 0.6 and len(costs) == 3  # the limit behind level ground, a smaller gain and a larger one
     result, _, _ = gradient_search(NeverMet(), space, np.array([[0.5, 1.0]]), 20, FitConfig(), None)
     np.testing.assert_allclose(result.u, [0.9, 0.37], atol=1e-3)
+
+
+class Folded:
+    """A steep valley b = a^2 with a fold every 0.02 along its floor, which is lowest at a = 0.4: cost 1 there."""
+
+    counted = 1
+    noise = Noise(np.ones(3), np.ones(5), "replicates")
+
+    def residuals(self, u):
+        a, b = u[:, 0], u[:, 1]
+        floor = 2 * (a - 0.4) + 0.03 * np.sin(100 * np.pi * a)
+        return np.stack([np.ones_like(a), 50 * (b - a**2), floor], axis=-1)[:, None]
+
+    def jacobian(self, u):
+        sides = [self.residuals(u + sign * 1e-4 * one) for one in np.eye(2) for sign in (1, -1)]
+        return self.residuals(u), np.stack([sides[0] - sides[1], sides[2] - sides[3]], axis=-1) / 2e-4
+
+
+@pytest.mark.quick
+def test_shaken_searches_leave_the_folds_of_a_valleys_floor_and_agree(monkeypatch):
+    space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
+
+    def ends():
+        starts = np.array([[0.9, 0.9], [0.8, 0.2]])
+        return [gradient_search(Folded(), space, start[None], 40, FitConfig(), None)[0] for start in starts]
+
+    shaken, again = ends(), ends()
+    assert [one.cost for one in shaken] == pytest.approx([1.0, 1.0], abs=1e-3)
+    np.testing.assert_allclose(shaken[0].u, shaken[1].u, atol=0.01)
+    np.testing.assert_array_equal(shaken[0].u, again[0].u)  # the same seed shakes alike
+    monkeypatch.setattr("sysid.valleys.ROUNDS", 0)
+    stuck = ends()
+    assert min(one.cost for one in stuck) > 1.1 and abs(stuck[0].u[0] - stuck[1].u[0]) > 0.1
 
 
 def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
