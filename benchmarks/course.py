@@ -41,7 +41,15 @@ from whill_mjx.train import (
     train_baseline,
     train_policy,
 )
-from whill_mjx.training import TRUTH, find_preset, functional_env, make_training_env, with_repeat, with_settings
+from whill_mjx.training import (
+    TRUTH,
+    find_preset,
+    functional_env,
+    make_training_env,
+    with_layout,
+    with_repeat,
+    with_settings,
+)
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
 FINAL = 1000  # episodes of the last evaluation of seeds side by side
@@ -97,10 +105,10 @@ def together(options: argparse.Namespace) -> None:
 
     The time is that of all of them, so it says nothing of one run's.
     """
-    preset = find_preset(options.preset, options.task)
+    preset = with_layout(find_preset(options.preset, options.task), options.layout)
     if options.repeat:
         preset = with_repeat(preset, options.repeat)
-    task = dataclasses.replace(preset.task, layout=options.layout)
+    task = preset.task
     steps = options.steps or preset.total_steps
     learner = with_settings(preset.learner, options.change)
     rows = steps + 2 * preset.instances + learner.pretrain_steps

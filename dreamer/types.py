@@ -40,11 +40,11 @@ class Mirror:
     """What is seen and done in other worlds, mirrored ones say, where rewards and ends are the same."""
 
     obs: Callable[[EnvState, Any, int], Any]
-    """The environment's state, the observations (N, ...) of its last step, W -> those of W worlds (W, N, ...)."""
+    """The environment's state, the observations (N, ...) of its last step, K -> those of K worlds (K, N, ...)."""
     action: Callable[[jax.Array, int], jax.Array]
-    """Actions (N, A), one-hot where they are classes, and W -> those of the same W worlds (W, N, A)."""
+    """Actions (N, A), one-hot where they are classes, and K -> those of the same K worlds (K, N, A)."""
     worlds: int = 1
-    """How many different ones there are, at least W."""
+    """How many different ones there are: the largest K."""
 
 
 @dataclass(frozen=True, eq=False)

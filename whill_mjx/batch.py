@@ -76,7 +76,7 @@ class BatchEnv:
         return self._split(self._step)(state, actions)
 
     def observe_repainted(self, state: BatchState, worlds: int) -> jax.Array:
-        """(W, N, H, W, 3) images of the same moment in other worlds of the same shape (`env.repainted`).
+        """(K, N, H, W, 3) images of the same moment in K other worlds of the same shape (`env.repainted`).
 
         Each looks the same until its episode ends.
         """

@@ -40,6 +40,7 @@ from whill_mjx.training import (
     make_training_env,
     ppo_policy,
     step_driver,
+    with_layout,
     with_repeat,
     with_settings,
 )
@@ -174,7 +175,7 @@ def preset_name(name: str) -> str:
 def choose_preset(options: TrainOptions) -> Preset:
     """The preset with the options' changes put in."""
     name = preset_name(options.preset)
-    preset = find_preset(name, options.task)
+    preset = with_layout(find_preset(name, options.task), options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     say(f"preset {name}")
@@ -194,7 +195,6 @@ def choose_preset(options: TrainOptions) -> Preset:
         learner = with_settings(learner, options.change)
     return dataclasses.replace(
         preset,
-        task=dataclasses.replace(preset.task, layout=options.layout),
         learner=learner,
         ppo=baseline,
         total_steps=options.steps or preset.total_steps,

@@ -108,6 +108,13 @@ def find_preset(name: str, task: str) -> Preset:
     raise ValueError(f"unknown preset {name!r}; use {known}.")
 
 
+def with_layout(preset: Preset, layout: str) -> Preset:
+    """The same training in worlds of this layout. Where all look alike, the mirror shows no more than one other."""
+    task = dataclasses.replace(preset.task, layout=layout)  # an unknown one is refused here
+    worlds = preset.learner.mirror if task.randomised else min(preset.learner.mirror, 1)
+    return dataclasses.replace(preset, task=task, learner=dataclasses.replace(preset.learner, mirror=worlds))
+
+
 def with_repeat(preset: Preset, repeat: int) -> Preset:
     """The same training with a decision every `repeat` control periods.
 
@@ -216,7 +223,7 @@ def mirror_of(batch: BatchEnv) -> Mirror:
     paints = batch.env.random_looks or batch.env.photometric
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
-        """Every second of the worlds (W, ...) as it is."""
+        """Every second of the worlds (K, ...) as it is."""
         every_second = jnp.arange(plain.shape[0]) % 2 == 1
         return jnp.where(every_second.reshape(-1, *[1] * (plain.ndim - 1)), plain, mirrored)
 

@@ -22,7 +22,7 @@ from whill_mjx.policy_file import load_policy
 from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.task import Corridor, ObstacleCourse, make_task
 from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle
-from whill_mjx.training import find_preset, functional_env, with_repeat
+from whill_mjx.training import find_preset, functional_env, make_training_env, with_repeat
 
 
 @pytest.fixture(scope="module")
@@ -229,6 +229,16 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
         assert rows_for(preset.learner, preset.instances) * preset.instances >= preset.learner.learning_starts
         assert preset.instances % 8 == 0 and preset.learner.batch_size % 8 == 0
         assert preset.instances * preset.ppo.rollout % preset.ppo.minibatches == 0
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("task, layout, worlds", [("corridor", "randomised", 3), ("corridor", "fixed", 1),
+                                                  ("obstacle_course", "randomised", 1)])  # fmt: skip
+def test_the_mirror_shows_no_more_worlds_than_there_are(task, layout, worlds):
+    preset = choose_preset(TrainOptions(preset="paper", task=task, layout=layout))
+    batch = make_training_env(preset.task, "whill_cr_ramp", 1)
+    assert preset.learner.mirror == worlds <= functional_env(batch).mirror.worlds
+    assert preset.task.layout == layout
 
 
 @pytest.mark.quick
