@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.course_figures import BLIND, draw, groups, is_corridor, load_run
+from benchmarks.course_figures import BLIND, draw, groups, is_corridor, last_evaluation, load_run
 from benchmarks.harness import RESULTS, device_name, figure, record
 from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
@@ -92,12 +92,9 @@ def train_alone(asked: TrainOptions) -> dict[str, Any]:
     asked.out.mkdir(parents=True, exist_ok=True)
     write_json(asked.out / RUN_FILE, {"command": plain(asked), "preset": plain(preset)})
     train_it = train_policy if asked.learner == "dreamer" else train_baseline
-    done = train_it(asked, preset, prepare_vehicle(asked))
+    train_it(asked, preset, prepare_vehicle(asked))
     lines = [json.loads(line) for line in (asked.out / "metrics.jsonl").read_text().splitlines()]
-    last = [line for line in lines if "eval/success" in line][-1]
-    policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
-    return {"task": plain(preset.task), "learner": asked.learner, "seed": asked.seed, "env_steps": done.env_steps,
-            "updates": done.updates, "policy": {**policy, "episodes": preset.eval_episodes}}
+    return {"learner": asked.learner, "seed": asked.seed, **last_evaluation(asked.out, plain(preset), lines)}
 
 
 def together(options: argparse.Namespace) -> None:

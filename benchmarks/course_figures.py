@@ -39,17 +39,26 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **told}
     if (path / "evaluation.json").exists():
         return {**content, **json.loads((path / "evaluation.json").read_text())}
+    last = last_evaluation(path, begun["preset"], metrics)
+    left = begun["preset"].get("total_steps", float("inf")) - last["env_steps"]
+    return {**content, **({"stopped": True} if left > 0 else {}), **last}
+
+
+def last_evaluation(path: Path, preset: dict[str, Any], metrics: list[dict[str, Any]]) -> dict[str, Any]:
+    """A training's result by its last evaluation inside the run, in place of the final one; ValueError: there is none.
+
+    Args:
+        path: folder, for the error.
+        preset: as `run.json` has it.
+        metrics: lines of the log.
+    """
     evaluated = [line for line in metrics if "eval/success" in line]
     if not evaluated:
         raise ValueError(f"{path}: was stopped before its first evaluation. Give its command again, or leave it out.")
     last = evaluated[-1]
     policy = {name: last[f"eval/{name}"] for name in ("success", "collision", "return")}
-    left = begun["preset"].get("total_steps", float("inf")) - last["env_steps"]
-    return {
-        **content, **({"stopped": True} if left > 0 else {}), "task": begun["preset"]["task"],
-        "env_steps": last["env_steps"],
-        "updates": last["updates"], "policy": {**policy, "episodes": begun["preset"]["eval_episodes"]},
-    }  # fmt: skip
+    return {"task": preset["task"], "env_steps": last["env_steps"], "updates": last["updates"],
+            "policy": {**policy, "episodes": preset["eval_episodes"]}}
 
 
 def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]], dict[str, Any]]]:

@@ -25,6 +25,8 @@ from whill_mjx.safe import Safety, Step, limit_action, limited_policy, penalty
 from whill_mjx.task import Task, make_task
 from whill_mjx.types import TimeStep
 
+PAINTS = 15
+"""Worlds of other looks that the mirror shows at most; any number could be drawn, but each takes memory."""
 TRUTH = "truth"
 """Name of the observation that `whill_mjx.truth` makes; for `DreamerConfig.decode_only`."""
 
@@ -240,7 +242,7 @@ def mirror_of(batch: BatchEnv) -> Mirror:
         action = jnp.broadcast_to(action, (worlds, *action.shape))
         return turned(action, action * jnp.array([1.0, -1.0]))
 
-    return Mirror(other_obs, other_action, worlds=15 if paints else 1)
+    return Mirror(other_obs, other_action, worlds=PAINTS if paints else 1)
 
 
 def make_training_env(

@@ -125,8 +125,9 @@ def test_an_ablation_tells_late_evaluations_settings_and_what_whole_runs_came_to
 def test_a_training_alone_ends_with_its_last_evaluation_and_is_recorded_like_a_whole_run(tmp_path, monkeypatch):
     def train(options, preset, vehicle):
         assert vehicle.exists() and preset.learner.lr == 1e-3
-        lines = [{"env_steps": steps, "wall_s": 80.0, "eval/success": share, "eval/collision": 1.0 - share,
-                  "eval/return": reward} for steps, share, reward in ((18_000, 0.5, 90.0), (22_000, 1.0, 210.0))]
+        evaluations = ((18_000, 0.5, 90.0), (22_000, 1.0, 210.0))
+        lines = [{"env_steps": steps, "updates": 7, "wall_s": 80.0, "eval/success": share,
+                  "eval/collision": 1.0 - share, "eval/return": reward} for steps, share, reward in evaluations]
         (options.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         return Trained(params={}, env_steps=22_000, updates=7, wall_s=80.0)
 
