@@ -62,7 +62,7 @@ def find_preset(name: str, task: str) -> Preset:
     "paper" is the reference paper's setting: 16 instances, 22,000 control steps on the obstacle course and 200,000 in
     the corridor (at ratios of 384 and 160). Its updates are few, so it learns faster at first and explores more
     than DreamerV3's defaults; it also learns from the mirrored world and to tell what the simulator knows, a quarter of
-    its instances act without noise, and an average of its parameters drives. On the course it looks 3.3 s ahead, not 33,
+    its instances act without noise, and an average of its parameters drives. On the course it looks 5 s ahead, not 33,
     trusts its critic less, and begins half of its training episodes anywhere on the way: from the paper's start and
     with noise alone, two seeds in five learned a fixed layout. Its drives are short, so twice as many sequences of half
     the length make a batch, in less time. In the corridor, whose box may look like the floor behind it, what the
@@ -82,7 +82,7 @@ def find_preset(name: str, task: str) -> Preset:
             )  # fmt: skip
             own: dict[str, Any] = dict(vector_scale=5.0, mirror=3)
             if on_course:
-                own = dict(horizon=33.0, return_lambda=0.98, imag_horizon=25, mirror=1, batch_size=32, batch_length=32)
+                own = dict(horizon=50.0, return_lambda=0.98, imag_horizon=25, mirror=1, batch_size=32, batch_length=32)
             return Preset(
                 make_task(task), dataclasses.replace(learner, **own), steps, eval_every=1000 if on_course else 20_000,
                 eval_episodes=200, exploring_starts=0.5 if on_course else 0.0, second_tries=0.0 if on_course else 0.5,
