@@ -164,6 +164,8 @@ def _of_seed(line: dict[str, Any], seed: int) -> dict[str, Any]:
 def collect(options: argparse.Namespace) -> None:
     """Merge finished runs into course.json and draw their curves."""
     runs = sorted((load_run(path, options.device) for path in options.runs), key=lambda one: one["seed"])
+    if options.warm:
+        runs = [{**one, "together": one.get("together", 1)} for one in runs]
     for name, mine, figures in groups(runs):
         draw(mine, RESULTS / f"{name}.png")
         corridor = is_corridor(mine[0])
@@ -296,6 +298,7 @@ def parse() -> argparse.Namespace:
     several = commands.add_parser("collect")
     several.add_argument("--runs", type=Path, nargs="+", required=True)
     several.add_argument("--device", help="on which runs without a note of it were made")
+    several.add_argument("--warm", action="store_true", help="programs were compiled before: their time says nothing")
     several.set_defaults(call=collect)
     tried = commands.add_parser("ablation")
     tried.add_argument("--runs", type=Path, nargs="+", required=True)
