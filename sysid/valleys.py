@@ -44,7 +44,8 @@ def gradient_search(
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
     right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
     on a grid, and LM tries another valley that is about as deep. At the end all parameters are shaken a little: the
-    floors of valleys are jagged. Nothing of this is done without `config.elsewhere`.
+    floors of valleys are jagged. From the floor the ends of ranges are tried again, since what hid them may be gone.
+    Nothing of this is done without `config.elsewhere`.
     """
 
     def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
@@ -56,9 +57,7 @@ def gradient_search(
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
     if config.elsewhere:
-        costs, points = gradient.ends_of_ranges(objective, result.u, robust=config.robust)
-        near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
-        result = _from_elsewhere(partial(search, objective), result, points[near], iterations)
+        result = _from_ends(partial(search, objective), objective, result, iterations, config.robust)
     lost = config.elsewhere
     while lost:
         before = result.cost
@@ -73,8 +72,12 @@ def gradient_search(
         if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
             result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
-    if config.elsewhere:
+    deeper = config.elsewhere
+    while deeper:
         result = _shaken(partial(search, objective), result, iterations, config.seed)
+        floor = result.cost
+        result = _from_ends(partial(search, objective), objective, result, iterations, config.robust)
+        deeper = result.cost < floor * (1 - WORTH)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
 
 
@@ -96,6 +99,16 @@ def _shaken(
         result = _from_elsewhere(search, result, np.clip(points, 0.0, 1.0), iterations)
         misses = 0 if result.cost < before * (1 - WORTH) else misses + 1
     return result
+
+
+def _from_ends(
+    search: Callable[[np.ndarray, int], FitResult], objective: Objective, result: FitResult, iterations: int,
+    robust: bool,
+) -> FitResult:
+    """The result with where searches from those ends of ranges lead that cost little."""
+    costs, points = gradient.ends_of_ranges(objective, result.u, robust=robust)
+    near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
+    return _from_elsewhere(search, result, points[near], iterations)
 
 
 def _from_elsewhere(

@@ -117,6 +117,31 @@ def test_shaken_searches_leave_the_folds_of_a_valleys_floor_and_agree(monkeypatc
     assert min(one.cost for one in stuck) > 1.1 and abs(stuck[0].u[0] - stuck[1].u[0]) > 0.1
 
 
+class Hidden(Folded):
+    """A third parameter c is better at 1 than at 0 and 0.5, where a search finds it, but only the floor shows that."""
+
+    def residuals(self, u):
+        a, c = u[:, 0], u[:, 2]
+        valley = 1.0 + 0.25 * np.sin(2 * np.pi * (c - 0.5)) ** 2 - 3.2 * np.maximum(c - 0.75, 0.0)
+        hidden = 100 * (a - 0.4) * np.maximum(c - 0.75, 0.0)
+        return np.concatenate([super().residuals(u), np.stack([valley, hidden], axis=-1)[:, None]], axis=-1)
+
+    def jacobian(self, u):
+        sides = [self.residuals(u + sign * 1e-4 * one) for one in np.eye(3) for sign in (1, -1)]
+        return self.residuals(u), np.stack([sides[i] - sides[i + 1] for i in (0, 2, 4)], axis=-1) / 2e-4
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("rounds", "end", "cost"), [(6, 1.0, 1.04), (0, 0.0, 2.6)])
+def test_ends_of_ranges_are_tried_again_from_the_floor_of_the_valley(rounds, end, cost, monkeypatch):
+    space = Space(("a", "b", "c"), np.zeros(3), np.ones(3), np.full(3, 0.5), np.zeros(3, bool))
+    monkeypatch.setattr("sysid.valleys.DEAR", 0.01)  # far along the ranges lies nothing
+    monkeypatch.setattr("sysid.valleys.ROUNDS", rounds)
+    found, _, _ = gradient_search(Hidden(), space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
+    assert found.u[2] == pytest.approx(end, abs=0.02)
+    assert found.cost == pytest.approx(cost, rel=0.1)
+
+
 def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
     t = np.array([0.03, 0.55, 1.013, 2.5])
     command = Command(np.array([0.5]), np.array([0.4]), np.array([0.0]))
