@@ -143,3 +143,16 @@ def test_a_training_alone_ends_with_its_last_evaluation_and_is_recorded_like_a_w
                                                               "episodes": 200}
     assert figures["wallclock_s_fixed"]["value"] == 80.0 and figures["return_at_18000_median_fixed"]["value"] == 150.0
     assert not [name for name in figures if "blinded" in name]
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("warm", [False, True])
+def test_only_trainings_that_compiled_their_programs_tell_their_time(warm, tmp_path, monkeypatch):
+    recorded = {}
+    monkeypatch.setattr(course, "record", lambda name, claim, figures: recorded.update({name: figures}))
+    monkeypatch.setattr(course, "draw", lambda runs, path: None)
+    note = {"policy": {"success": 0.9, "collision": 0.1, "episodes": 500}, "env_steps": 1000, "updates": 1}
+    path = write_run(tmp_path / "0", [1.0], "paper", "dreamer", CORRIDOR, note)
+    course.collect(argparse.Namespace(runs=[path], device=None, warm=warm))
+    assert recorded["corridor"]["success"]["value"] == 0.9
+    assert ("wallclock_s" in recorded["corridor"]) == (not warm)
