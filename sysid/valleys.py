@@ -30,7 +30,7 @@ FIRST, KEPT, LOOK = 1, 4, 3
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 SHAKES = (0.01, 0.016, 0.025, 0.04)
 """Shares of its range by which each parameter moves at most, of the points that the end is shaken to."""
-ROUNDS, MISSES, WORTH = 6, 2, 0.001
+ROUNDS, MISSES, WORTH = 6, 3, 0.001
 """Of shaking at most, and after how many in a row it ends that lower the cost by less than that share."""
 
 
