@@ -56,14 +56,15 @@ def gradient_search(
     if objective.noise.source == "defaults":
         objective = objective.with_noise(objective.residual_noise(result.u))
         result = search(objective, result.starts, iterations)
+    follow = partial(search, objective)
     if config.elsewhere:
-        result = _from_ends(partial(search, objective), objective, result, iterations, config.robust)
+        result = _from_ends(follow, objective, result, iterations, config.robust)
     lost = config.elsewhere
     while lost:
         before = result.cost
         costs, points = gradient.far_points(objective, result.u, robust=config.robust)
         points = points[costs < DEAR * result.cost][:FAR]
-        result = _from_elsewhere(partial(search, objective), result, points, iterations)
+        result = _from_elsewhere(follow, result, points, iterations)
         lost = result.cost < LOST * before
     found = gradient.profile_delays(objective, space, result.u, robust=config.robust)
     for name, _, costs, followed in found:
@@ -71,12 +72,12 @@ def gradient_search(
         apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
         if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
-            result = _from_elsewhere(partial(search, objective), result, other[None], iterations)
+            result = _from_elsewhere(follow, result, other[None], iterations)
     deeper = config.elsewhere
     while deeper:
-        result = _shaken(partial(search, objective), result, iterations, config.seed)
+        result = _shaken(follow, result, iterations, config.seed)
         floor = result.cost
-        result = _from_ends(partial(search, objective), objective, result, iterations, config.robust)
+        result = _from_ends(follow, objective, result, iterations, config.robust)
         deeper = result.cost < floor * (1 - WORTH)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
 
