@@ -46,8 +46,7 @@ def fit_base(
 
     u, damping, cost = start.copy(), 1e-2, np.inf
     for iteration in range(iterations):
-        value = drives.simulate(space.to_values(u)[None])[0]
-        slope = drives.differences(space.to_values, u, sizes)
+        value, slope = drives.linearised(space.to_values, u, sizes)
         residual = whitener.apply(target - value, mask).reshape(-1)
         jacobian = whitener.apply(slope, mask).reshape(len(residual), -1)
         cost = float(residual @ residual) + penalty(u)

@@ -106,11 +106,12 @@ class Drives:
 
     def _sampled(self, paths: np.ndarray) -> Simulated:
         """Paths (B, R + 1, 9) at the measurements' times."""
-        row = np.arange(len(paths))[:, None]
+        first = paths.shape[1] * np.arange(len(paths))[:, None]
+        flat = paths.reshape(-1, paths.shape[2])
 
         def at(index: Any, weight: Any, columns: slice) -> np.ndarray:
-            index, seen = np.asarray(index), paths[:, :, columns].astype(float)
-            before, after = seen[row, index], seen[row, index + 1]
+            place = first + np.asarray(index)
+            before, after = (flat.take(place + step, axis=0)[..., columns].astype(float) for step in (0, 1))
             return before + np.asarray(weight)[..., None] * (after - before)
 
         one = self.batch
@@ -124,9 +125,14 @@ class Drives:
         Skidding wheels make the motion rough in its parameters: over the size of a day's change the mean slope counts.
         `sets` turns unit coordinates (P,) into values of all replayed parameters.
         """
+        return self.linearised(sets, u, sizes)[1]
+
+    def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
         points, spans = quotients(u, sizes)
-        seen = self.simulate(np.stack([sets(point) for point in points]))
-        return np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
+        at, *seen = self.simulate(np.stack([sets(point) for point in (u, *points)]))
+        return at, np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
