@@ -215,7 +215,8 @@ def close_loop(
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     alone = stands_alone(log.training, reference.known)
     if alone:
-        outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds)
+        wheels = any(trial.odometry is not None for trial in log.training)
+        outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds, wheels)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
         stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, ready.wander.p_excess))

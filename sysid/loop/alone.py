@@ -4,6 +4,10 @@ The noise is then only what the base model leaves of the drives themselves, so n
 Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
 be a lucky correlate of something else. It is named where blocks of drives speak for it: they agree on its size, and
 the gain of each is foretold by the others. Of effects that are not told apart the simplest is.
+
+Where there is no odometry either, nothing tells whether wheels fell short of the command or the vehicle of its wheels,
+while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
+acceleration and drag bend to the same few speeds.
 """
 
 from __future__ import annotations
@@ -17,6 +21,10 @@ from sysid.loop.agreement import disagreement, foretold
 from sysid.loop.found import Search, Thresholds
 from sysid.loop.noise import repeated
 
+BY_POSE = frozenset({"command_delay", "actuator_lag", "sensor_delay", "clock_offset", "pose_delay", "command_scale",
+                     "track_width", "turn_efficiency", "wheel_radius_difference", "slope", "wind"})
+"""Effects that an outside pose alone tells: when the vehicle moves, how far for what is commanded, and what depends on
+its heading in the room."""
 UNTOLD = "neither replicates nor reference drives tell the noise, so whether anything else is missing cannot be told"
 
 
@@ -25,16 +33,20 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def judged(found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds) -> Search:
+def judged(
+    found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds,
+    wheels: bool = True,
+) -> Search:
     """The search with a verdict that needs no noise level.
 
     Args:
         groups: blocks of trials.
         precision: (P, P) of the base parameters, in unit coordinates.
+        wheels: whether any trial has an odometry.
     """
     if found.verdict == "named":
         simplest(found)
-        against = doubts(found, groups, precision, thresholds)
+        against = doubts(found, groups, precision, thresholds) + ([] if wheels else of_wheels(found))
         if against:
             found.verdict, found.reason = "unexplained", f"{'; '.join(against)}; {UNTOLD}"
         else:
@@ -42,6 +54,12 @@ def judged(found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray
     else:
         found.reason = f"{found.reason}; {UNTOLD}"
     return found
+
+
+def of_wheels(found: Search) -> list[str]:
+    """What speaks against each named effect that only wheels show, in words."""
+    return [f"{one.effect} stands out, but without odometry nothing tells what the wheels did: log their speeds"
+            for one in found.final.hypotheses if one.effect not in BY_POSE]
 
 
 def simplest(found: Search) -> None:

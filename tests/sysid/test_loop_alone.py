@@ -83,6 +83,21 @@ def test_an_effect_is_named_only_where_blocks_of_drives_agree_on_it(shared):
     assert UNTOLD in found.reason
 
 
+@pytest.mark.parametrize(("effect", "wheels", "verdict"), [
+    ("command_dead_zone", True, "named"), ("command_dead_zone", False, "unexplained"),
+    ("command_delay", False, "named"), ("slope", False, "named")])
+def test_an_effect_of_the_wheels_has_a_name_only_where_the_wheels_were_seen(effect, wheels, verdict):
+    rng = np.random.default_rng(0)
+    column, residual = 3 * rng.standard_normal((16, 40)), rng.standard_normal((16, 40))
+    groups = tuple((2 * i, 2 * i + 1) for i in range(8))
+    given = search_with(residual, column)
+    named = Hypothesis(effect, (Axis(f"{effect}.size", 1.0),))
+    given.final = replace(given.final, hypotheses=(named,))
+    found = judged(given, groups, np.zeros((0, 0)), Thresholds(), wheels)
+    assert found.verdict == verdict
+    assert ("log their speeds" in found.reason) == (verdict == "unexplained")
+
+
 def test_of_effects_that_are_not_told_apart_the_simplest_is_named():
     def candidate(effect, axes, gain):
         one = Hypothesis(effect, tuple(Axis(f"{effect}.{i}", 1.0) for i in range(axes)))
