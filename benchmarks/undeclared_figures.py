@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import figure, provenance, record
+from benchmarks.harness import device_name, figure, provenance, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_plant import RECORDED, power_sizes
 from benchmarks.undeclared_reference import USUAL, Driven
@@ -240,8 +240,10 @@ def of_speed(work: Path) -> dict[str, Any]:
     for path in work.glob("speed_*.json"):
         one = json.loads(path.read_text())
         about = "linear nulls" if one["nulls"] is None else f"{one['nulls']['count']} refitted nulls"
-        name = "cpu_quick_seconds" if one["nulls"] is None else "cpu_seconds"
-        found[name] = figure([one["seconds"]], f"s, the whole command with {about}, compilations included")
+        device = one.get("device", device_name())
+        name = f"{'cpu' if device.startswith('cpu') else 'gpu'}{'_quick' if one['nulls'] is None else ''}_seconds"
+        found[name] = {**figure([one["seconds"]], f"s, the whole command with {about}, compilations included"),
+                       "device": device}
         if one["nulls"] is not None:
             found["refitted_null_alarms"] = figure([float(one["nulls"]["false_alarms"])],
                                                    f"of {one['nulls']['count']} simulated days of one log")

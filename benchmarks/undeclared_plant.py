@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import RESULTS
+from benchmarks.harness import RESULTS, device_name
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.make import make_log
@@ -287,7 +287,8 @@ def speed(work: Path, refit_nulls: int = 0) -> None:
     began = time.perf_counter()
     subprocess.run([str(part) for part in command], check=True, env=environment)
     nulls = json.loads((out / "report.json").read_text())["missing"]["null_refits"]
-    write_report(work / f"speed_{refit_nulls}.json", {"seconds": time.perf_counter() - began, "nulls": nulls})
+    seconds = time.perf_counter() - began
+    write_report(work / f"speed_{refit_nulls}.json", {"seconds": seconds, "nulls": nulls, "device": device_name()})
 
 
 def brief(result: Result) -> dict[str, Any]:

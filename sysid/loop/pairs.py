@@ -21,6 +21,8 @@ from sysid.loop.wander import Wander
 
 DRAWS = 300
 """Simulated nulls for the p-values of pairs: each is asked of some ten thousand columns."""
+TOGETHER = 256
+"""Pairs of columns that are solved in one call."""
 CHI_SQUARED = 2.0
 """Size over which the tail of chi-squared falls by e."""
 
@@ -64,21 +66,22 @@ class Bench:
         self.away = [np.concatenate([np.zeros((1, one.shape[1])), one]) for one in away]  # the drives' own is 0
         self.ends = [_ends(one, hypotheses[one.hypothesis]) for one in evidence.columns]
 
-    def look(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gain (1 + N,), worth (1 + N,) and coordinates (1 + N, k) of two columns' hypotheses together; 0 where one of
-        them would go where it cannot."""
-        pair = (first, second)
-        index = [i - self.size for one in pair for i in self.columns[one].index]
-        information = self.left[np.ix_(index, index)]
-        q = np.linalg.solve(information, self.score[:, index].T).T
-        q = q + np.concatenate([self.away[one] for one in pair], axis=1)
-        wide = np.zeros_like(information)
-        cut = len(self.columns[first].index)
-        wide[:cut, :cut], wide[cut:, cut:] = self.wander[first], self.wander[second]
-        low, upper = (np.concatenate([self.ends[one][end] for one in pair]) for end in (0, 1))
-        kept = ((q >= low) & (np.abs(q) <= upper)).all(1)
+    def look(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gain (M, 1 + N), worth (M, 1 + N) and coordinates (M, 1 + N, k) of M pairs of columns' hypotheses together; 0
+        where one of them would go where it cannot. The `first` (M,) all have as many coordinates, the `second` too."""
+        sides = (first, second)
+        index = np.concatenate([np.array([self.columns[i].index for i in one]) for one in sides], axis=1) - self.size
+        information = self.left[index[:, :, None], index[:, None, :]]  # (M, k, k)
+        q = np.linalg.solve(information, np.moveaxis(self.score[:, index], 0, -1)).swapaxes(1, 2)
+        q = q + np.concatenate([np.stack([self.away[i] for i in one]) for one in sides], axis=2)
+        wide, cut = np.zeros_like(information), len(self.columns[first[0]].index)
+        for one, part in zip(sides, (slice(cut), slice(cut, None)), strict=True):
+            wide[:, part, part] = np.stack([self.wander[i] for i in one])
+        low, upper = (np.concatenate([np.stack([self.ends[i][end] for i in one]) for one in sides], axis=1)[:, None]
+                      for end in (0, 1))
+        kept = ((q >= low) & (np.abs(q) <= upper)).all(2)
         whole = np.linalg.inv(np.linalg.inv(information) + wide)
-        return ((q @ information * q).sum(1) * kept, (q @ whole * q).sum(1) * kept, q)
+        return ((q @ information * q).sum(2) * kept, (q @ whole * q).sum(2) * kept, q)
 
 
 def _ends(columns: Columns, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
@@ -136,15 +139,19 @@ def _looked(
     placed: list[list[int]] = [[] for _ in hypotheses]
     for number, one in enumerate(bench.columns):
         placed[one.hypothesis].append(number)
-    gain, worth, found = np.zeros(len(members)), np.zeros(len(members)), []
+    gain, worth = np.zeros(len(members)), np.zeros(len(members))
+    found = [np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes)) for i, j in members]
     null = np.zeros((len(bench.score) - 1, len(members)))
+    alike: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
     for number, (i, j) in enumerate(members):
-        best = np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes))
-        for a in placed[i]:
-            for b in placed[j]:
-                gains, worths, q = bench.look(a, b)
-                null[:, number] = np.maximum(null[:, number], worths[1:])
-                if worths[0] > worth[number]:
-                    gain[number], worth[number], best = gains[0], worths[0], q[0]
-        found.append(best)
+        sizes = len(hypotheses[i].axes), len(hypotheses[j].axes)
+        alike.setdefault(sizes, []).extend((number, a, b) for a in placed[i] for b in placed[j])
+    for tried in alike.values():
+        for begin in range(0, len(tried), TOGETHER):
+            numbers, first, second = np.array(tried[begin : begin + TOGETHER]).T
+            gains, worths, q = bench.look(first, second)
+            np.maximum.at(null.T, numbers, worths[:, 1:])
+            for m, number in enumerate(numbers):
+                if worths[m, 0] > worth[number]:
+                    gain[number], worth[number], found[number] = gains[m, 0], worths[m, 0], q[m, 0]
     return gain, worth, tuple(found), null

@@ -251,3 +251,15 @@ def test_an_effect_that_the_catalogue_has_by_another_name_is_right_by_that_name(
     found = undeclared_figures.of_singles([("gain_fade", verdict("supply_sag") | warned), ("warm_up", verdict())], "")
     assert found["class_accuracy"]["value"] == 1.0 and found["class_accuracy"]["unit"] == "share of 1 logs"
     assert found["out_of_catalogue"]["unit"].startswith("share of 1 logs")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("device", "name"), [("cpu, 2 cores, X", "cpu_seconds"), ("NVIDIA H200", "gpu_seconds")])
+def test_how_long_a_loop_takes_is_told_of_the_device_that_it_ran_on(tmp_path, device, name):
+    nulls = {"count": 200, "false_alarms": 3}
+    (tmp_path / "speed_200.json").write_text(json.dumps({"seconds": 12.0, "nulls": nulls, "device": device}))
+    (tmp_path / "speed_0.json").write_text(json.dumps({"seconds": 5.0, "nulls": None, "device": device}))
+    found = undeclared_figures.of_speed(tmp_path)
+    assert {key: one["value"] for key, one in found.items()} == {
+        name: 12.0, name.replace("_", "_quick_"): 5.0, "refitted_null_alarms": 3.0}
+    assert found[name]["device"] == device
