@@ -31,7 +31,7 @@ from sysid import command_line
 from sysid.log import Log, Trial
 from sysid.loop.alone import judged, stands_alone
 from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.loop.drives import CHUNK, Drives, make_drives
+from sysid.loop.drives import Drives, make_drives, rows_of_call
 from sysid.loop.evidence import PARTS, Evidence, column_layout, gather
 from sysid.loop.falsifiers import FALSIFIERS
 from sysid.loop.found import Search, Thresholds
@@ -242,7 +242,7 @@ def prepare(
                              kind="parameter_shift" if fitted else "effect"),)
     full = with_catalogue(reference.params, found)
     base = base_values(full)
-    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), CHUNK)
+    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
     drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
                          paths)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sysid.cores import on_all_cores, on_processor
 from sysid.log import Trial
-from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch, on_all_cores
+from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
 
 INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
 SETS = 4  # parameter sets replayed together there: one compilation serves them all
@@ -55,7 +56,7 @@ class CourseReplay:
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
-        if jax.default_backend() != "cpu":
+        if not on_processor():
             return self._spread(self._replay.simulate(values), motion=True)
         rows, count = int(np.clip(INSTANCES // self.courses, 1, SETS)), len(values)
         values = np.concatenate([values, np.repeat(values[-1:], -count % rows, axis=0)])
@@ -66,7 +67,7 @@ class CourseReplay:
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
-        rows = 1 if jax.default_backend() == "cpu" else len(values)
+        rows = 1 if on_processor() else len(values)
         parts = []
         for i in range(0, len(values), rows):
             at, slope = self._replay.jacobian(values[i : i + rows])

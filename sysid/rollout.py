@@ -11,9 +11,7 @@ moved to the start pose. Its controller, delays and slip are those of a vehicle 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
@@ -302,30 +301,18 @@ class PathReplay:
         trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
         command, start = np.asarray(batch.command), np.asarray(batch.start)
 
-        def part(first: int) -> np.ndarray:
+        def part(first: int) -> jax.Array:
             chosen = trials[first : first + self.rows]
-            return np.asarray(self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
-                                        command[chosen], start[chosen], batch.warm_up))
+            return self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
+                             command[chosen], start[chosen], batch.warm_up)
 
-        parts = on_all_cores(part, range(0, len(values), self.rows), self._compiled)
+        firsts = range(0, len(values), self.rows)
+        if on_processor():
+            parts = on_all_cores(lambda first: np.asarray(part(first)), firsts, self._compiled)
+        else:  # it computes while rows are sent and fetched
+            parts = [np.asarray(paths) for paths in [part(first) for first in firsts]]
         self._compiled = True
         return np.concatenate(parts)[:count]
-
-
-def on_all_cores(replay: Callable[[int], Any], parts: Sequence[int], compiled: bool) -> list[Any]:
-    """What `replay` gives for each of `parts`, in their order. On a processor each keeps one core busy, so as many run
-    side by side as there are cores; an accelerator takes one after the other.
-
-    Args:
-        compiled: otherwise the first goes ahead alone and compiles what the others use.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = min(cores, len(parts)) if jax.default_backend() == "cpu" else 1
-    if workers < 2:
-        return [replay(part) for part in parts]
-    ahead = [] if compiled else [replay(parts[0])]
-    with ThreadPoolExecutor(workers) as threads:
-        return [*ahead, *threads.map(replay, parts[len(ahead) :])]
 
 
 def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:

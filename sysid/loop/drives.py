@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import numpy as np
 
+from sysid.cores import on_all_cores, on_processor
 from sysid.log import Trial
 from sysid.loop.features import Features, bin_width, make_features
 from sysid.loop.noise import roughness
@@ -70,29 +71,34 @@ class Drives:
 
     def simulate(self, values: np.ndarray) -> np.ndarray:
         """Features (N, B, K, 5) of replays with values (N, P)."""
-        return np.stack([self.features.of(self._sampled(paths)) for paths, _ in self._paths(values)])
+        def seen(each: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+            return self.features.of(self._sampled(*each))
+
+        return np.stack(on_all_cores(seen, self._paths(values)))
 
     def replay(self, values: np.ndarray) -> Simulated:
         """Replays with values (N, P) in the room, at the measurements' times; leaves gain the axis N in front."""
         start = np.asarray(self.batch.start, float)
         first = start[self.courses.first[self.courses.of_trial]]
-        each = [self._sampled(_moved(paths, first, start) if shared else paths)
-                for paths, shared in self._paths(values)]
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+        every = np.arange(len(self.trials))
 
-    def _paths(self, values: np.ndarray) -> Iterator[tuple[np.ndarray, bool]]:
-        """Of each of values (N, P) the paths (B, R + 1, 9), and whether trials of one course share theirs."""
+        def seen(each: tuple[np.ndarray, np.ndarray]) -> Simulated:
+            paths, mine = each
+            return self._sampled(_moved(paths[mine], first, start) if len(paths) < len(mine) else paths, every)
+
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *on_all_cores(seen, self._paths(values)))
+
+    def _paths(self, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each of values (N, P) the paths (U, R + 1, 9) of courses, or of all trials where those do not repeat one
+        another, and which of them is that of each trial (B,)."""
         every = np.arange(len(self.trials))
         once = [self.courses.repeat(row) for row in values]
         rows = [self.courses.first if shared else every for shared in once]
         sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
         drives = np.concatenate(rows)
         paths = self.paths(self._in_session(values[sets], drives), self.batch, drives)
-        start = 0
-        for shared, each in zip(once, rows, strict=True):
-            mine = paths[start : start + len(each)]
-            start += len(each)
-            yield (mine[self.courses.of_trial] if shared else mine), shared
+        parts = np.split(paths, np.cumsum([len(each) for each in rows])[:-1])
+        return [(part, self.courses.of_trial if shared else every) for part, shared in zip(parts, once, strict=True)]
 
     def _in_session(self, values: np.ndarray, drives: np.ndarray) -> np.ndarray:
         """Values (N, P) of one drive each (N,), with the time of the session at which that drive began."""
@@ -104,9 +110,9 @@ class Drives:
         out[known, self.names.index(SESSION)] = began[known]
         return out
 
-    def _sampled(self, paths: np.ndarray) -> Simulated:
-        """Paths (B, R + 1, 9) at the measurements' times."""
-        first = paths.shape[1] * np.arange(len(paths))[:, None]
+    def _sampled(self, paths: np.ndarray, of_trial: np.ndarray) -> Simulated:
+        """Paths (U, R + 1, 9), of each trial the one of `of_trial` (B,), at the measurements' times."""
+        first = paths.shape[1] * of_trial[:, None]
         flat = paths.reshape(-1, paths.shape[2])
 
         def at(index: Any, weight: Any, columns: slice) -> np.ndarray:
@@ -117,7 +123,7 @@ class Drives:
         one = self.batch
         pose = at(one.pose_index, one.pose_weight, POSE)
         odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
-        return Simulated(pose, odometry, paths[:, -1, 8])  # type: ignore[arg-type]
+        return Simulated(pose, odometry, paths[of_trial, -1, 8])  # type: ignore[arg-type]
 
     def differences(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """(B, K, 5, P) derivative by unit coordinates u (P,), by central differences of the given sizes.
@@ -186,10 +192,14 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width)
-    rows = min(CHUNK, 10 * len(courses.first)) if jax.default_backend() == "cpu" else ACCELERATED
-    paths = paths or PathReplay(plant, vehicle, rows)
+    paths = paths or PathReplay(plant, vehicle, rows_of_call(10 * len(courses.first)))
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
+
+
+def rows_of_call(most: int = CHUNK) -> int:
+    """Drives of one replay call, on a processor at most so many."""
+    return min(CHUNK, most) if on_processor() else ACCELERATED
 
 
 def _moved(paths: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:

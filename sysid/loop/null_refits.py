@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from sysid.cores import on_processor
 from sysid.loop.catalogue import Hypothesis
 from sysid.loop.classes import imitation
 from sysid.loop.evidence import Evidence, at_fit, white_leftover
@@ -29,8 +30,8 @@ from sysid.loop.wander import Wander
 from sysid.result import Progress
 from sysid.statistics import upper_rate
 
-TOGETHER = 16
-"""Days whose base fits advance side by side."""
+TOGETHER, ACCELERATED = 16, 64
+"""Days whose base fits advance side by side on a processor, and on an accelerator."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,10 @@ def _days(
     together: alone they would leave most rows of a replay unused."""
     reference = refitter.reference
     start = Start((), reference.u, np.zeros(0))
-    for first in range(0, count, TOGETHER):
+    together = TOGETHER if on_processor() else ACCELERATED
+    for first in range(0, count, together):
         drawn = [(np.clip(reference.u + drawn_away(factor, rng), 0.0, 1.0), _noise(refitter, rng))
-                 for _ in range(min(TOGETHER, count - first))]
+                 for _ in range(min(together, count - first))]
         seen = refitter.white_of(np.stack([u for u, _ in drawn]))
         days = [refitter.aimed(white + noise) for white, (_, noise) in zip(seen, drawn, strict=True)]
         yield from zip(days, side_by_side([(day, start) for day in days], ITERATIONS), strict=True)

@@ -14,13 +14,13 @@ import pytest
 from cart import cart
 
 from sysid import fit as fit_module
+from sysid.cores import on_all_cores
 from sysid.differences import DifferenceReplay
 from sysid.fit import Arguments, FitConfig, fit_log
 from sysid.log import Command, OdometryStream, PoseStream, make_trial
 from sysid.mjcf import mjcf_model
 from sysid.mjcf_file import load_robot, resolve, write_mjcf
 from sysid.models import function_model, load_model, make_parameters, model_space, set_parameters
-from sysid.rollout import on_all_cores
 from sysid.scenarios import Scenario
 from sysid.synthetic import write_dataset
 from whill_mjx.manoeuvres import command_table
