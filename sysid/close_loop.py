@@ -24,6 +24,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -100,6 +101,8 @@ class Prepared:
     names: tuple[str, ...]
     paths: PathReplay
     wander: Wander
+    others: dict[Any, PathReplay] = field(default_factory=dict)
+    """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
 
     def without(self, effects: Sequence[str]) -> Prepared:
         """The same without some effects of the catalogue; nothing is compiled or simulated again."""
@@ -322,7 +325,10 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
         values = {**base_values(ready.full), **values}
         drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
         return drives, np.array([values[name] for name in ready.names])
-    return make_drives(ready.plant, vehicle, tuple(values), trials, width), np.array(list(values.values()))
+    kind = ready.plant, jax.tree.structure(vehicle)
+    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width, ready.others.get(kind))
+    ready.others[kind] = drives.paths
+    return drives, np.array(list(values.values()))
 
 
 def _check(log: Log, references: Sequence[Log]) -> None:

@@ -29,6 +29,7 @@ from whill_mjx.specs import VehicleSpec
 
 WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
 WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
+FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
 RECORD_DT = 0.025  # s between recorded states; linear interpolation at 1 m/s^2 is then off by 0.1 mm at most
 POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
 SPEEDS = slice(6, 8)
@@ -299,7 +300,7 @@ class PathReplay:
         spare = -count % self.rows
         values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)])
         trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
-        command, start = np.asarray(batch.command), np.asarray(batch.start)
+        command, start = jnp.asarray(batch.command), jnp.asarray(batch.start)  # commands are much larger than the rest
 
         def part(first: int) -> jax.Array:
             chosen = trials[first : first + self.rows]
@@ -309,8 +310,10 @@ class PathReplay:
         firsts = range(0, len(values), self.rows)
         if on_processor():
             parts = on_all_cores(lambda first: np.asarray(part(first)), firsts, self._compiled)
-        else:  # it computes while rows are sent and fetched
-            parts = [np.asarray(paths) for paths in [part(first) for first in firsts]]
+        else:  # it computes while rows are sent and fetched; most of the spare ones stay there
+            begun = [part(first) for first in firsts]
+            begun[-1] = begun[-1][: self.rows - spare // FETCHED * FETCHED]
+            parts = [np.asarray(paths) for paths in begun]
         self._compiled = True
         return np.concatenate(parts)[:count]
 

@@ -21,7 +21,7 @@ from whill_mjx.types import parameters_of
 SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
 ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
 CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
-ACCELERATED = 2048  # the same on an accelerator, which takes as long for one
+ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from sysid.loop.wander import Wander
 from sysid.result import Progress
 from sysid.statistics import upper_rate
 
-TOGETHER, ACCELERATED = 16, 64
+TOGETHER, ACCELERATED = 16, 100
 """Days whose base fits advance side by side on a processor, and on an accelerator."""
 
 

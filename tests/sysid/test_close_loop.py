@@ -1,5 +1,6 @@
 """The closed loop on drives with known contents: named, none, the effect in the file, held-out trials closed."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from sysid.close_loop import (
     Arguments,
     LoopConfig,
     close_loop,
+    drives_of,
     expected_steps,
     main,
     manifest,
@@ -34,6 +36,7 @@ from sysid.loop.tables import Table
 from sysid.loop.trust import beside_still_base, warnings
 from sysid.loop.unnamed import vehicle_of, with_start_angles
 from sysid.metrics import score
+from sysid.models import with_effects
 from sysid.rollout import Measured, vehicle_plant
 from sysid.synthetic import write_dataset
 from whill_mjx.config import VehicleConfig
@@ -359,6 +362,35 @@ def test_replicates_move_alike_unless_the_room_does_something(drives, sloping):
     assert len(made.courses.first) == 3 < len(made.trials)
     assert np.abs(once - every).max() < 2e-3
     assert np.sqrt(np.square(once - every).mean()) < 1e-4
+
+
+def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
+    made = refitter_of(sloping).drives
+    every = np.arange(len(made.trials))
+    values = np.array([list(base_values(sloping.full).values())] * len(every))
+    usual = sloping.prepared.paths(values, made.batch, every)
+    monkeypatch.setattr("sysid.rollout.on_processor", lambda: False)
+    monkeypatch.setattr("sysid.rollout.FETCHED", 2)
+    large = copy.copy(sloping.prepared.paths)
+    for large.rows in (len(every) - 2, len(every) + 5):  # the second one has rows to spare, of which one is fetched
+        paths = large(values, made.batch, every)
+        np.testing.assert_allclose(paths, usual, atol=2e-3)
+        assert len(paths) == len(every)
+
+
+def test_vehicles_with_the_same_effects_share_what_was_compiled(sloping):
+    trials = sloping.log.training
+    wider = with_effects(sloping.reference.params, ("lateral_damping", "axle_pivot"))
+    assert not set(base_values(wider)) <= set(sloping.names)
+    first, values = drives_of(sloping, trials, wider)
+    mass = values[list(first.names).index("body.mass")]
+    heavier = set_values(wider, ["body.mass"], np.array([1.5 * mass], np.float32))
+    again, moved = drives_of(sloping, trials, heavier)
+    assert again.paths is first.paths
+    assert moved[list(again.names).index("body.mass")] == pytest.approx(1.5 * mass)
+    assert np.abs(again.simulate(moved[None]) - first.simulate(values[None])).max() > 1e-3
+    other, _ = drives_of(sloping, trials, with_effects(sloping.reference.params, ("axle_pivot",)))
+    assert other.paths is not first.paths
 
 
 def test_wander_is_what_days_show(sloping):
