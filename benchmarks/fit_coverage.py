@@ -34,8 +34,9 @@ PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")
 PLANT_LENGTH = 11.0  # s that are driven of each of them
 REPLICATES = 6
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
-MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension")
-USUAL = {"body.com_z": 0.1, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5, "sensor_delay.delay": 0.01}
+MORE = ("axle_pivot", "lateral_damping", "rolling_resistance_speed", "sensor_delay", "suspension")
+USUAL = {"body.com_z": 0.1, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
+         "rolling_resistance_speed.mu_1": 0.02, "sensor_delay.delay": 0.01}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted

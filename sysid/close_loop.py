@@ -288,12 +288,14 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
 
     The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
     refit may move base parameters and the accepted effects' own, and against a reference what every fit to poses has
-    besides (`measured_effects`): the search takes their part for the wander of days. Drives without one would only be
-    fitted closer by them: on a measured robot the errors of drives left out grew by 3 %.
+    besides (`measured_effects`, without the losses, which may be what is asked for): the search takes their part for
+    the wander of days. Drives without one would only be fitted closer by them: on a measured robot the errors of drives
+    left out grew by 3 %.
     """
     from sysid.loop.poses import fit_poses
 
-    extra = measured_effects(vehicle, result.log.spec, result.log.training) if result.reference.known else ()
+    known, trials = result.reference.known, result.log.training
+    extra = measured_effects(vehicle, result.log.spec, trials, losses=False) if known else ()
     vehicle = with_effects(vehicle, extra)
     have = describe(vehicle)
     names = list(result.reference.space.names)
@@ -305,9 +307,8 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
                   and np.isfinite(float(get_values(vehicle, [name])[0])) and name not in result.config.held]
     space = make_space(vehicle, result.log.spec, names)
     spread = np.zeros((space.size, space.size))
-    known = result.reference.space.size
-    spread[:known, :known] = result.reference.spread
-    trials = result.log.training
+    told = result.reference.space.size
+    spread[:told, :told] = result.reference.spread
     drives, held = drives_of(result, trials, vehicle)
     u = fit_poses(drives, trials, space, held, spread, iterations)
     return vehicle if u is None else set_values(

@@ -9,8 +9,8 @@ first moment and c = h / m the common centre of mass, I the inertia about it (al
     s' = (T_wheel - J alpha_y) / (J + A)                                            of each wheel, with armature A
 
 then speeds by Euler's step, as MuJoCo's integrator without implicit damping, and positions with the mean of old and
-new speeds. With the new speeds, as MuJoCo has them, everything would come half a step early. The suspension is damped
-enough for that at steps up to 40 ms (vehicle.py). Source: Newton and Euler.
+new speeds. With the new speeds, as MuJoCo has them, everything would come half a step early. The suspension is
+damped enough for that, and no stiffer than a step carries (vehicle.py). Source: Newton and Euler.
 """
 
 from __future__ import annotations

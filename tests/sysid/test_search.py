@@ -446,3 +446,17 @@ def test_how_high_the_mass_lies_is_searched_where_wheels_skid_by_their_load():
     assert "lateral_damping.c_rear" in searched(physical, ("lateral_damping",))
     paper = searched(preset_params(WHILL_CR, "paper"))
     assert "body.com_z" not in paper and "lateral_damping.c_rear" in paper
+
+
+@pytest.mark.quick
+def test_a_fit_gives_a_vehicle_with_slip_losses_that_rise_with_speed():
+    from sysid.models import measured_effects
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WARTHOG, WHILL_CR
+
+    for spec in (WHILL_CR, WARTHOG):
+        physical = preset_params(spec, "physical")
+        added = measured_effects(physical, spec, ())
+        assert {"rolling_resistance_speed", "suspension"} <= set(added)
+        assert set(added) - set(measured_effects(physical, spec, (), losses=False)) == {"rolling_resistance_speed"}
+    assert measured_effects(preset_params(WHILL_CR, "paper"), WHILL_CR, ()) == ()

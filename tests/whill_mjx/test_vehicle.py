@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from sysid.models import with_effects
+from whill_mjx.config import VehicleConfig
 from whill_mjx.kinematics import body_twist, reference_pose, rotation_from_quaternion
 from whill_mjx.model import build_model, mujoco_model
 from whill_mjx.parameters import describe, get_values, set_values
@@ -138,6 +140,28 @@ def test_suspension_carries_the_weight_and_shifts_it_towards_the_centre_of_mass(
     share_rear = (spec.front_x - float(params.body.com_x)) / spec.wheelbase
     np.testing.assert_allclose(load[:2].sum() / load.sum(), share_rear, atol=0.02)
     assert load[0] > load[1]  # centre of mass to the left
+
+
+def test_springs_are_as_stiff_as_the_physics_step_carries():
+    """Springs of 0.3 mm swing at 181 1/s: steps of 20 ms would let wheels hop, and the chair slide past its stop."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("suspension",))
+
+    def driven(dt, sag):
+        model = build_model(spec, VehicleConfig(physics_dt=dt, control_dt=0.2))
+        period = jax.jit(lambda vehicle, state, command: drive(model, vehicle, state, command))
+        vehicle = set_values(params, ["suspension.sag"], jnp.array([sag]))
+        state = place(model, vehicle, 0.0, 0.0, 0.0)
+        for command in ((0.9, 0.0), (0.9, 0.8), (0.0, 0.0)):
+            for _ in range(5):
+                state = period(vehicle, state, jnp.array(command))
+        return np.asarray(reference_pose(model, state.qpos))
+
+    fine = driven(0.0025, 0.0003)
+    for dt, atol in ((0.005, 1e-3), (0.01, 2e-3), (0.02, 5e-3), (0.04, 0.03)):
+        np.testing.assert_allclose(driven(dt, 0.0003), fine, atol=atol)
+    assert np.abs(driven(0.005, 0.0003) - driven(0.005, 0.0032)).max() > 1e-4  # steps of 5 ms carry them
+    np.testing.assert_allclose(driven(0.02, 0.0003), driven(0.02, 0.0032), atol=1e-6)
 
 
 def test_vmapped_instances_equal_a_loop_with_different_parameters():

@@ -16,13 +16,14 @@ class Suspension(Effect):
     """Each contact is a spring that a quarter of the weight compresses by s, with half the critical damping.
 
     When drive and brakes pull, a soft chair nods at sqrt(g / s) before its loads have shifted, and its wheels turn with
-    the nodding: seen in their speed, it looks like a late command and a high gain.
+    the nodding: seen in their speed, it looks like a late command and a high gain. Springs stiffer than the physics
+    step carries (vehicle.py) are as stiff as it does.
     """
 
     name = "suspension"
     typical = {"sag": (0.002, 0.01)}
-    source = "estimate: 1 to 2 mm for solid tyres, 5 mm for soft ones, 20 mm for a sprung chair"
-    sag: jax.Array = parameter("m", 0.001, 0.02, 0.005, "compression under a quarter of the weight, s")
+    source = "estimate: below 1 mm for hard wheels, 2 mm for solid tyres, 5 mm for soft ones, 20 mm for a sprung chair"
+    sag: jax.Array = parameter("m", 0.0003, 0.02, 0.005, "compression under a quarter of the weight, s")
 
     def world(self, memory: tuple[()], world: World) -> tuple[tuple[()], World]:
         """World for a vehicle on other springs."""
