@@ -85,16 +85,17 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
                      ) -> tuple[str, ...]:
     """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
 
-    Passive wheels resist sideways with their speed, and their axle may pivot: then the driven wheels alone carry what a
-    turn shifts, and brake by it. Soft springs let a vehicle nod, and its wheels turn with that. Bearings and motors
-    resist with their speed (`losses`): while the torque is at its limit nothing makes up for it. Readings of the
-    odometry have an age of their own, which shows against an outside pose.
+    On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
+    wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
+    torque is at its limit nothing makes up for it. Soft springs let a vehicle nod, and its wheels turn with that.
+    Readings of the odometry have an age of their own, which shows against an outside pose.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
-    rolling = (*(("rolling_resistance_speed",) if losses else ()), "suspension")
+    rolling: tuple[str, ...] = ("suspension",)
     if spec.drive != "skid":
-        rolling = ("axle_pivot", "lateral_damping", *rolling)
+        loss = ("rolling_resistance_speed",) if losses else ()
+        rolling = ("axle_pivot", "lateral_damping", *loss, "suspension")
     both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
     return (*rolling, "sensor_delay") if both else rolling
 
