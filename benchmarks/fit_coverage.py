@@ -86,8 +86,10 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
 
     Speeds and poses tell forces only per inertia: the model's mass and wheel inertia are nominal, so that its torques
     are the chair's times the ratio of the inertias that a straight drive moves, and its yaw inertia is the one with
-    which a turn about the driven axle needs the chair's torque times that ratio.
+    which a turn about the driven axle needs the chair's torque times that ratio. The model's controller acts all the
+    time; the chair's is sampled and holds its torque, which is as quick as a continuous one of a higher gain.
     """
+    from benchmarks.plant.base import TICK
     from benchmarks.plant.chair import build
 
     model = build(chair)
@@ -103,9 +105,11 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     spin = float(model.body_inertia[wheel].max() + chair.armature) / np.mean(chair.radius) ** 2  # [kg] of one wheel
     nominal = spec.wheel_inertia / spec.wheel_radius**2
     ratio = (spec.mass + 2 * nominal) / (mass.sum() + 2 * spin)
+    load = (mass.sum() + 2 * spin) / 2 * np.mean(chair.radius) ** 2  # [kg m^2] that one side's torque moves
+    held = -np.log(1 - chair.kp * TICK / load) / (chair.kp * TICK / load)  # of two controllers with the same pole
     turning = yaw + mass.sum() * middle[0] ** 2 + spin * chair.track**2 / 2
     inertia = ratio * turning - spec.mass * middle[0] ** 2 - nominal * spec.track**2 / 2
-    return {"torque_drive.kp": chair.kp * ratio, "torque_drive.ki": chair.ki * ratio,
+    return {"torque_drive.kp": chair.kp * held * ratio, "torque_drive.ki": chair.ki * held * ratio,
             "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": inertia,
             "body.com_x": spec.rear_x + float(middle[0]), "body.com_y": float(middle[1]),
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
