@@ -58,14 +58,15 @@ def record(
     stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS, replacing: str | None = None
 ) -> Path:
     """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept, but for
-    those that begin with `replacing`: they are of an earlier run which had others."""
+    those that begin with `replacing`: they are of an earlier run which had others. A figure measured elsewhere may tell
+    `versions` of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}.json"
     old = json.loads(path.read_text()) if path.exists() else {}
     stamp = provenance()
     kept = {name: one for name, one in old.get("figures", {}).items()
             if replacing is None or not name.startswith(replacing)}  # fmt: skip
-    merged = {**kept, **{name: {**value, **stamp} for name, value in figures.items()}}
+    merged = {**kept, **{name: {**stamp, **value} for name, value in figures.items()}}
     content = {"claim": claim, **stamp, "figures": merged}
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(content, indent=1) + "\n")

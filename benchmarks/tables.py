@@ -81,6 +81,7 @@ HEADLINES = (  # file, figure, factor, what it says
      "% false alarms at most (95 % bound), logs with nothing in them"),
     ("undeclared", "cpu_seconds", 1 / 60,
      "minutes for the whole loop, 27 drives of 22 s, six reference days, 200 refitted nulls, two cores"),
+    ("undeclared", "gpu_seconds", 1 / 60, "minutes for the same on an accelerator"),
     ("fit", "noise_floor_ratio", 1.0, "times the sensor noise: held-out error where the truth was planted"),
     ("fit", "plant_replicate_ratio", 1.0, "times the replicate spread: held-out pose error, contact-plant logs"),
     ("fit", "cpu_seconds", 1.0, "s for one start of a fit of 18 drives of 22 s on two cores, compilation included"),

@@ -239,12 +239,17 @@ def of_speed(work: Path) -> dict[str, Any]:
     found = {}
     for path in work.glob("speed_*.json"):
         one = json.loads(path.read_text())
-        about = "linear nulls" if one["nulls"] is None else f"{one['nulls']['count']} refitted nulls"
-        device = one.get("device", device_name())
-        name = f"{'cpu' if device.startswith('cpu') else 'gpu'}{'_quick' if one['nulls'] is None else ''}_seconds"
-        found[name] = {**figure([one["seconds"]], f"s, the whole command with {about}, compilations included"),
-                       "device": device}
-        if one["nulls"] is not None:
-            found["refitted_null_alarms"] = figure([float(one["nulls"]["false_alarms"])],
-                                                   f"of {one['nulls']['count']} simulated days of one log")
+        nulls, device = one["nulls"], one.get("device", device_name())
+        about = "linear nulls" if nulls is None else f"{nulls['count']} refitted nulls"
+        name = f"{'cpu' if device.startswith('cpu') else 'gpu'}{'_quick' if nulls is None else ''}_seconds"
+        new = {name: figure([one["seconds"]], f"s, the whole command with {about}, compilations included", device)}
+        if nulls is not None:
+            new["refitted_null_alarms"] = figure([float(nulls["false_alarms"])],
+                                                 f"of {nulls['count']} simulated days of one log", device)
+        report = path.with_suffix("") / "report.json"  # of a machine that may have had other versions than this one
+        if report.exists():
+            code = json.loads(report.read_text())["code"]
+            versions = {key: value for key, value in code.items() if "SHA" not in key}
+            new = {key: {**value, "versions": versions} for key, value in new.items()}
+        found.update(new)
     return found

@@ -12,6 +12,7 @@ pytest.importorskip("mujoco")
 
 from benchmarks import undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
+from benchmarks.harness import record  # noqa: E402
 from benchmarks.plant.chair import VEHICLES  # noqa: E402
 from benchmarks.undeclared import Benchmark  # noqa: E402
 from benchmarks.undeclared_reference import Driven  # noqa: E402
@@ -259,7 +260,13 @@ def test_how_long_a_loop_takes_is_told_of_the_device_that_it_ran_on(tmp_path, de
     nulls = {"count": 200, "false_alarms": 3}
     (tmp_path / "speed_200.json").write_text(json.dumps({"seconds": 12.0, "nulls": nulls, "device": device}))
     (tmp_path / "speed_0.json").write_text(json.dumps({"seconds": 5.0, "nulls": None, "device": device}))
+    (tmp_path / "speed_200").mkdir()
+    code = {"sysid sources SHA-256": "1a2b", "jax": "9.9.9"}
+    (tmp_path / "speed_200/report.json").write_text(json.dumps({"code": code}))
     found = undeclared_figures.of_speed(tmp_path)
     assert {key: one["value"] for key, one in found.items()} == {
         name: 12.0, name.replace("_", "_quick_"): 5.0, "refitted_null_alarms": 3.0}
-    assert found[name]["device"] == device
+    assert found[name]["device"] == found["refitted_null_alarms"]["device"] == device
+    written = json.loads(record("fixture", "how it is written", found, tmp_path).read_text())["figures"]
+    assert written[name]["versions"] == {"jax": "9.9.9"}
+    assert "numpy" in written[name.replace("_", "_quick_")]["versions"]
