@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sysid.arrays import namespace
 from sysid.cores import on_all_cores, on_processor
 from sysid.log import Trial
 from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
@@ -65,6 +66,10 @@ class CourseReplay:
         self._compiled = True
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
+    def traced(self, values: jax.Array) -> Simulated:
+        """As `simulate`, within a compiled function."""
+        return self._spread(self._replay.traced(values), motion=True)
+
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
         rows = 1 if on_processor() else len(values)
@@ -76,8 +81,9 @@ class CourseReplay:
 
     def _spread(self, simulated: Simulated, motion: bool) -> Simulated:
         """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...); derivatives are turned but not moved."""
-        pose, odometry = (self._at(name, np.asarray(getattr(simulated, name), float)) for name in self._times)
-        diverged: Any = np.asarray(simulated.diverged)[:, self._course]
+        xp = namespace(simulated.pose)
+        pose, odometry = (self._at(name, xp.asarray(getattr(simulated, name), float)) for name in self._times)
+        diverged: Any = simulated.diverged[:, self._course]
         extra = (1,) * (pose.ndim - 4)
         turn = (self._to[:, 2] - self._from[:, 2]).reshape(-1, 1, *extra)  # (B, 1)
         x, y, yaw = (pose[:, :, :, c] for c in range(3))
@@ -87,7 +93,7 @@ class CourseReplay:
         x, y = cos * x - sin * y, sin * x + cos * y
         if motion:
             x, y = x + self._to[:, :1], y + self._to[:, 1:2]
-        moved: Any = np.stack([x, y, yaw], axis=3)
+        moved: Any = xp.stack([x, y, yaw], axis=3)
         return Simulated(moved, odometry, diverged)
 
     def _at(self, name: str, values: np.ndarray) -> Any:

@@ -10,11 +10,12 @@ processor's vectors, tangents do not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
 
-from sysid.objective import Replays
 from sysid.rollout import Simulated
 from sysid.space import Space
 
@@ -26,13 +27,23 @@ STEP = 0.01
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: Replays
+    replay: Any
+    """As `sysid.objective.Replays`."""
     space: Space
     step: float = STEP
+
+    @cached_property
+    def compiled(self) -> dict[Any, Any]:
+        """What `sysid.normal_equations` compiled of it."""
+        return {}
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """As that of the replay."""
         return self.replay.simulate(values)
+
+    def traced(self, values: jax.Array) -> Simulated:
+        """As `simulate`, within a compiled function."""
+        return self.replay.traced(values)
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""

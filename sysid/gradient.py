@@ -10,12 +10,16 @@ step that leaves the box is cut at its wall and the parameters at a wall whose g
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sysid.arrays import namespace
 from sysid.result import FitResult, Progress
 from sysid.space import Space, is_delay
+
+if TYPE_CHECKING:
+    from sysid.normal_equations import NormalEquations
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
@@ -40,7 +44,10 @@ class _Points:
 
 
 class Residuals(Protocol):
-    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P)."""
+    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
+
+    One whose `equations` are not None has them summed up there.
+    """
 
     @property
     def counted(self) -> int: ...
@@ -48,6 +55,7 @@ class Residuals(Protocol):
     def residuals(self, u: np.ndarray) -> np.ndarray: ...
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
 
 def fit(
     objective: Residuals, space: Space, *, starts: np.ndarray | None = None, iterations: int = 30,
@@ -70,51 +78,84 @@ def fit(
     initial, evaluations = np.inf, 0
     history: list[float] = []
 
+    def settle(n: int, tried: np.ndarray, costs: np.ndarray, exact: bool) -> tuple[float, bool]:
+        """Move a start to the best of the points (D, P), if that costs less: what its cost fell by, and if that is
+        little. `exact`: the derivatives that led there are of the very point."""
+        best = costs.argmin()
+        fallen = float(cost[n] - costs[best])
+        small = fallen < tolerance * cost[n]
+        if fallen > 0:
+            if exact and (small or fallen > GOES_ON * tolerance * cost[n]):
+                calm[n] = calm[n] + 1 if small else 0
+            u[n], cost[n] = tried[best], costs[best]
+            damping[n] = np.clip(damping[n] * DAMPINGS[best], 1e-7, MAX_DAMPING)
+        elif exact:
+            # Only when even a short step down the gradient does not help is the start at its minimum.
+            calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
+            damping[n] = min(damping[n] * 100.0, MAX_DAMPING)
+        return fallen, small
+
+    def candidates(starts: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+        """(G, D, P) points that are tried next."""
+        nonlocal evaluations
+        evaluations += len(starts) * len(DAMPINGS)
+        return np.stack([
+            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in DAMPINGS])
+            for i, n in enumerate(starts)])
+
     def step(at: _Points) -> _Points:
         """Move these starts; those of them that can try again without a new Jacobian."""
-        nonlocal evaluations
         residual, jacobian = at.residual, at.jacobian
         weight = huber_weight(residual) if robust else np.ones_like(residual)
         gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
         hessian = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
-        candidates = np.stack([
-            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in DAMPINGS])
-            for i, n in enumerate(at.starts)])  # (G, D, P)
-        tried = objective.residuals(candidates.reshape(-1, space.size))
-        tried = tried.reshape(*candidates.shape[:2], *residual.shape[1:])
+        points = candidates(at.starts, gradient, hessian)
+        tried = objective.residuals(points.reshape(-1, space.size))
+        tried = tried.reshape(*points.shape[:2], *residual.shape[1:])
         costs = np.stack([robust_cost(one, robust) for one in tried]) / objective.counted
-        evaluations += costs.size
         best, rows = costs.argmin(-1), np.arange(len(at.starts))
-        after, moves = tried[rows, best], candidates[rows, best] - u[at.starts]
+        after, moves = tried[rows, best], points[rows, best] - u[at.starts]
         again = np.zeros(len(rows), bool)
         for i, n in enumerate(at.starts):
-            fallen = cost[n] - costs[i, best[i]]
+            exact = bool(at.exact[i])
+            fallen, small = settle(n, points[i], costs[i], exact)
             if fallen > 0:
-                small = fallen < tolerance * cost[n]
                 foretold = -(2 * gradient[i] + hessian[i] @ moves[i]) @ moves[i] / objective.counted
                 again[i] = not small and fallen > PROMISE * foretold
-                if at.exact[i] and (small or fallen > GOES_ON * tolerance * cost[n]):
-                    calm[n] = calm[n] + 1 if small else 0
-                u[n], cost[n] = candidates[i, best[i]], costs[i, best[i]]
-                damping[n] = np.clip(damping[n] * DAMPINGS[best[i]], 1e-7, MAX_DAMPING)
-            elif at.exact[i]:
-                # Only when even a short step down the gradient does not help is the start at its minimum.
-                calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
-                damping[n] = min(damping[n] * 100.0, MAX_DAMPING)
+            elif exact:
                 after[i], moves[i], again[i] = residual[i], 0.0, calm[n] < 2
         learnt = _learnt(jacobian[again], (after - residual)[again], moves[again])
         return _Points(at.starts[again], after[again], learnt, (at.exact & ~moves.any(-1))[again])
 
+    def step_there(
+        equations: NormalEquations, going: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+    ) -> None:
+        """Move these starts with sums that an accelerator makes; one whose steps all cost more tries shorter ones."""
+        left = np.arange(len(going))
+        for _ in range(1 + FOLLOWING):
+            points = candidates(going[left], gradient[left], hessian[left])
+            costs = equations.costs(points.reshape(-1, space.size), robust).reshape(len(left), -1) / objective.counted
+            stayed = [settle(n, points[i], costs[i], True)[0] <= 0 and calm[n] < 2 for i, n in enumerate(going[left])]
+            left = left[np.array(stayed)]
+            if not len(left):
+                break
+
+    equations = getattr(objective, "equations", None)
     for iteration in range(iterations):
         going = np.flatnonzero(calm < 2)
-        points = _Points(going, *objective.jacobian(u[going]), np.ones(len(going), bool))
-        cost[going] = robust_cost(points.residual, robust) / objective.counted
         evaluations += len(going)
-        if iteration == 0:
-            initial = float(cost[0])
-        for _ in range(1 + FOLLOWING):
-            if len(points.starts):
-                points = step(points)
+        if equations is not None:
+            values, *slopes = equations.quadratic(u[going], robust)
+            cost[going] = values / objective.counted
+            initial = float(cost[0]) if iteration == 0 else initial
+            step_there(equations, going, *slopes)
+        else:
+            points = _Points(going, *objective.jacobian(u[going]), np.ones(len(going), bool))
+            cost[going] = robust_cost(points.residual, robust) / objective.counted
+            initial = float(cost[0]) if iteration == 0 else initial
+            for _ in range(1 + FOLLOWING):
+                if len(points.starts):
+                    points = step(points)
         history.append(float(cost.min()))
         if progress is not None:
             progress(1, f"cost {cost.min():.4g}")
@@ -135,8 +176,7 @@ def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) ->
                 points.append(u.copy())
                 points[-1][index] = end
     starts = np.array(points).reshape(-1, len(u))
-    residual = objective.residuals(starts)
-    return np.asarray(robust_cost(residual, robust) / objective.counted), starts
+    return costs_of(objective, starts, robust), starts
 
 
 def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -233,17 +273,26 @@ def random_starts(space: Space, count: int, seed: int) -> np.ndarray:
     return draws
 
 
-def huber_weight(residual: np.ndarray) -> np.ndarray:
+def costs_of(objective: Residuals, u: np.ndarray, robust: bool = False) -> np.ndarray:
+    """Mean squares (N,), or Huber losses, of unit coordinates (N, P)."""
+    equations = getattr(objective, "equations", None)
+    sums = robust_cost(objective.residuals(u), robust) if equations is None else equations.costs(u, robust)
+    return np.asarray(sums / objective.counted)
+
+
+def huber_weight(residual: Any) -> Any:
     """Weight of the squares whose minimum is that of the Huber loss."""
-    return np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
+    xp = namespace(residual)
+    return xp.minimum(1.0, HUBER / xp.maximum(xp.abs(residual), 1e-12))
 
 
-def robust_cost(residual: np.ndarray, robust: bool) -> np.ndarray:
+def robust_cost(residual: Any, robust: bool) -> Any:
     """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K)."""
+    xp = namespace(residual)
     if not robust:
-        return np.square(residual).sum((-1, -2))
-    size = np.abs(residual)
-    return np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2).sum((-1, -2))
+        return xp.square(residual).sum((-1, -2))
+    size = xp.abs(residual)
+    return xp.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2).sum((-1, -2))
 
 
 def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:

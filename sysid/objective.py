@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from sysid.arrays import added, namespace
 from sysid.gradient import huber_weight
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
+from sysid.normal_equations import NormalEquations, make_equations
 from sysid.prior import Prior
 from sysid.rollout import Measured, Simulated
 from sysid.space import Space
@@ -92,6 +94,25 @@ class Objective:
                     mask[i, : int((stream.t <= trial.start.rest).sum()), :3] = 0.0
         return pose, odometry
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """What it may differ in from others of the same replay and `kind`."""
+        return self.noise.pose, self.noise.odometry
+
+    @property
+    def kind(self) -> tuple[Any, ...]:
+        """As in `sysid.normal_equations`."""
+        return Objective, None if self.prior is None else (*self.prior.mean, *self.prior.sd, self.prior.share)
+
+    def with_arrays(self, arrays: tuple[Any, Any]) -> Objective:
+        """The same with other `arrays`."""
+        return self.with_noise(replace(self.noise, pose=arrays[0], odometry=arrays[1]))
+
+    @cached_property
+    def equations(self) -> NormalEquations | None:
+        """What an accelerator computes of the residuals by itself."""
+        return make_equations(self)
+
     def with_noise(self, noise: Noise) -> Objective:
         return replace(self, noise=noise)
 
@@ -109,7 +130,7 @@ class Objective:
         error = np.square(values[..., :2] - target[..., :2]).sum(-1) * mask[..., 0]
         samples = np.maximum(mask[..., 0].sum(-1), 1)
         cost = np.sqrt(error.sum(-1) / samples).sum(-1)
-        return np.where(self._bad(simulated).any(-1) | ~np.isfinite(cost), HUGE, cost)
+        return np.where(self.bad(simulated).any(-1) | ~np.isfinite(cost), HUGE, cost)
 
     def weighted_cost(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
         """Mean squared residual (N,), 1 at the noise level; `simulated` is what `simulate(u)` gave, if it is known."""
@@ -156,26 +177,28 @@ class Objective:
                    *np.where(self._masks[1] > 0, odometry, np.nan).transpose(2, 0, 1)]
         return dict(zip(self.noise.as_dict(), columns, strict=True))
 
-    def _bad(self, simulated: Simulated) -> np.ndarray:
-        finite = np.isfinite(simulated.pose).all((-1, -2)) & np.isfinite(simulated.odometry).all((-1, -2))
-        return np.asarray((simulated.diverged > 0.5) | ~finite)  # (N, B)
+    def bad(self, simulated: Simulated) -> Any:
+        """(N, B) replays that diverged."""
+        xp = namespace(simulated.pose)
+        finite = xp.isfinite(simulated.pose).all((-1, -2)) & xp.isfinite(simulated.odometry).all((-1, -2))
+        return (simulated.diverged > 0.5) | ~finite
 
     def _whiten(self, simulated: Simulated, derivative: Simulated | None) -> tuple[np.ndarray, np.ndarray | None]:
-        measured, noise = self.measured, self.noise
+        measured, noise, xp = self.measured, self.noise, namespace(simulated.pose)
         count, trials = simulated.pose.shape[:2]
-        bad = self._bad(simulated)[:, :, None]
+        bad = self.bad(simulated)[:, :, None]
         pose_weight, odometry_weight = (
             mask / scale for mask, scale in zip(self._masks, (noise.pose, noise.odometry), strict=True))
 
         def flat(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
-            return np.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
+            return xp.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
                                    odometry.reshape(count, trials, -1, *odometry.shape[4:])], axis=2)
 
-        weights = flat(np.broadcast_to(pose_weight, simulated.pose.shape),
-                       np.broadcast_to(odometry_weight, simulated.odometry.shape)) > 0
+        weights = flat(xp.broadcast_to(pose_weight, simulated.pose.shape),
+                       xp.broadcast_to(odometry_weight, simulated.odometry.shape)) > 0
         residual = flat((simulated.pose - measured.pose) * pose_weight,
                         (simulated.odometry - measured.odometry) * odometry_weight)
-        residual = np.where(bad, HUGE * weights, residual)
+        residual = xp.where(bad, HUGE * weights, residual)
         jacobian = None
         if derivative is not None:
             jacobian = flat(derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None])
@@ -193,7 +216,7 @@ class Objective:
         own standstill, has such an error of its own.
         """
         noise, starts = self.noise, [trial.start for trial in self.trials]
-        begin = 0
+        begin, xp = 0, namespace(simulated.pose)
         for values, weight, origin, sigmas in (
             (simulated.pose, self._masks[0] / noise.pose, [(one.x, one.y) for one in starts],
              [(one.position_sigma, one.position_sigma, one.yaw_sigma) for one in starts]),
@@ -205,11 +228,11 @@ class Objective:
             if not np.any(sigmas):
                 continue
             sigma = np.maximum(sigmas, 1e-9)  # (B, 3)
-            design = _start_design(np.asarray(values), np.asarray(origin), weight)
+            design = _start_design(values, np.asarray(origin), weight)
             gain = _start_gain(design, huber_weight(residual[:, :, part]), sigma)  # (N, B, 3, K)
-            error = np.einsum("nbik,nbk->nbi", gain, residual[:, :, part])
-            residual = np.concatenate([residual, error / sigma], axis=2)
-            residual[:, :, part] += np.einsum("nbki,nbi->nbk", design, error)
+            error = xp.einsum("nbik,nbk->nbi", gain, residual[:, :, part])
+            residual = xp.concatenate([residual, error / sigma], axis=2)
+            residual = added(residual, (..., part), xp.einsum("nbki,nbi->nbk", design, error))
             if jacobian is not None:
                 slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, part])
                 jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
@@ -217,7 +240,7 @@ class Objective:
         return residual, jacobian
 
 
-def _start_design(values: np.ndarray, origin: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _start_design(values: Any, origin: np.ndarray, weight: np.ndarray) -> Any:
     """Whitened derivative (N, B, K, 3) of poses by an error of their start.
 
     Args:
@@ -225,21 +248,23 @@ def _start_design(values: np.ndarray, origin: np.ndarray, weight: np.ndarray) ->
         origin: (B, 2) where they start.
         weight: (B, M, C) one over the noise, 0 where masked.
     """
-    arm = np.nan_to_num(values[..., :2] - origin[:, None, :])  # (N, B, M, 2)
-    design = np.zeros((*values.shape, 3))
-    design[..., 0, 0] = design[..., 1, 1] = design[..., 2, 2] = 1.0
-    design[..., 0, 2], design[..., 1, 2] = -arm[..., 1], arm[..., 0]
+    xp = namespace(values)
+    arm = xp.nan_to_num(values[..., :2] - origin[:, None, :])  # (N, B, M, 2)
+    turned = xp.stack([-arm[..., 1], arm[..., 0], xp.ones_like(arm[..., 0])], axis=-1)  # of x, y, yaw
+    turned = xp.concatenate([turned, xp.zeros_like(values[..., 3:])], axis=-1)
+    columns = [xp.broadcast_to(np.eye(values.shape[-1])[i], values.shape) for i in range(2)]
+    design = xp.stack([*columns, turned], axis=-1)
     return (design * weight[..., None]).reshape(*values.shape[:2], -1, 3)
 
 
 def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
     weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
-    return -np.linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
+    return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
 
 
 def _append(table: np.ndarray, more: np.ndarray) -> np.ndarray:
     """Table (N, B, K, ...) with more (N, P, ...) behind the columns of its first trial and zeros behind the others'."""
-    behind = np.zeros((*table.shape[:2], *more.shape[1:]))
-    behind[:, 0] = more
-    return np.concatenate([table, behind], axis=2)
+    xp = namespace(table)
+    behind = added(xp.zeros((*table.shape[:2], *more.shape[1:])), (slice(None), 0), more)
+    return xp.concatenate([table, behind], axis=2)

@@ -195,6 +195,10 @@ class Replay:
         """Replay with each of values (N, P); leaves gain the axis N in front."""
         return self._call(self._simulate, values)
 
+    def traced(self, values: jax.Array) -> Simulated:
+        """As `simulate`, within a compiled function."""
+        return self._simulate(values, self._batch)
+
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
         return self._call(self._jacobian, values)

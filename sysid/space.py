@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.arrays import namespace
 from whill_mjx.specs import VehicleSpec
 
 LOG_SPAN = 10.0
@@ -50,11 +51,12 @@ class Space:
     def size(self) -> int:
         return len(self.names)
 
-    def to_values(self, u: np.ndarray) -> np.ndarray:
+    def to_values(self, u: Any) -> Any:
         """Values (..., P) of unit coordinates (..., P), which are clipped to [0, 1]."""
-        u = np.clip(u, 0.0, 1.0)
+        xp = namespace(u)
+        u = xp.clip(u, 0.0, 1.0)
         low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
-        return np.where(self.log, low * (high / low) ** u, self.low + u * (self.high - self.low))
+        return xp.where(self.log, low * (high / low) ** u, self.low + u * (self.high - self.low))
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
         """Unit coordinates (..., P) of values (..., P)."""

@@ -11,13 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sysid import gradient
+from sysid.arrays import namespace
+from sysid.cores import on_processor
 from sysid.loop.features import Features, bin_width, make_features
 from sysid.loop.noise import Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
+from sysid.normal_equations import NormalEquations, make_equations
 from sysid.objective import HUGE, Objective, Replays
 from sysid.result import FitResult, Progress
 from sysid.rollout import Simulated
@@ -30,7 +34,7 @@ KEPT = 3
 STEPS = 20
 """Iterations of those searches, at most."""
 EDGE = 0.02  # of the range, at both ends, without random points
-CHUNK = 512  # points replayed together
+CHUNK, ACCELERATED = 512, 4096  # points replayed together, on a processor and on an accelerator
 AGREE = 0.02
 """Starts agree where their costs differ by no more than this share of the best one."""
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
@@ -59,11 +63,34 @@ class FeatureObjective:
 
     def weighted_cost(self, u: np.ndarray) -> np.ndarray:
         """Mean squared residual (N,)."""
-        return np.square(self.residuals(u)).sum((-1, -2)) / self.counted
+        return gradient.costs_of(self, u)
 
-    def residuals(self, u: np.ndarray) -> np.ndarray:
+    def residuals(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
         """(N, B, K C) white residuals of unit coordinates (N, P); those of a drive that diverged are huge."""
-        return self._white(self.simulate(u))
+        return self._white(self.simulate(u) if simulated is None else self.features.of(simulated))
+
+    def bad(self, simulated: Simulated) -> Any:
+        """(N, B) replays that diverged."""
+        return _bad(self.features.of(simulated))[..., 0]
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What it may differ in from others of the same replay."""
+        return self.target, self.mask, self.whitener.scale, self.whitener.coefficients, self.whitener.inverse
+
+    @property
+    def kind(self) -> Any:
+        """As in `sysid.normal_equations`."""
+        return FeatureObjective
+
+    def with_arrays(self, arrays: tuple[Any, ...]) -> FeatureObjective:
+        """The same with other `arrays`."""
+        return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:]))
+
+    @cached_property
+    def equations(self) -> NormalEquations | None:
+        """What an accelerator computes of the residuals by itself."""
+        return make_equations(self)
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K C) and their derivatives by u (N, B, K C, P)."""
@@ -84,18 +111,20 @@ class FeatureObjective:
         return self._white(at), jacobian * scale[:, None, None, :]
 
     def _white(self, at: np.ndarray) -> np.ndarray:
-        white = self._apply(np.where(np.isfinite(at), at, 0.0) - self.target)
-        return np.where(_bad(at), HUGE * (self.mask > 0).reshape(len(self.mask), -1), white)
+        xp = namespace(at)
+        white = self._apply(xp.where(xp.isfinite(at), at, 0.0) - self.target)
+        return xp.where(_bad(at), HUGE * (self.mask > 0).reshape(len(self.mask), -1), white)
 
     def _apply(self, series: np.ndarray) -> np.ndarray:
         """White series (N, B, K C) of (N, B, K, C)."""
-        white = np.moveaxis(self.whitener.apply(np.moveaxis(series, 0, -1), self.mask), -1, 0)
+        xp = namespace(series)
+        white = xp.moveaxis(self.whitener.apply(xp.moveaxis(series, 0, -1), self.mask), -1, 0)
         return white.reshape(*white.shape[:2], -1)
 
 
 def _bad(at: np.ndarray) -> np.ndarray:
     """(N, B, 1) drives that diverged, of features (N, B, K, C)."""
-    return ~np.isfinite(at).all((-1, -2))[..., None]
+    return ~namespace(at).isfinite(at).all((-1, -2))[..., None]
 
 
 def fit(
@@ -145,7 +174,8 @@ def draw(
     # Close to the walls as well: of many parameters the likely values are a small share of the range.
     tried = np.concatenate([np.random.default_rng((seed, number)).uniform(EDGE, 1 - EDGE, (scan, space.size))
                             for number in scanned])
-    costs = np.concatenate([coarse.weighted_cost(tried[i : i + CHUNK]) for i in range(0, len(tried), CHUNK)])
+    chunk = CHUNK if on_processor() else ACCELERATED
+    costs = np.concatenate([coarse.weighted_cost(tried[i : i + chunk]) for i in range(0, len(tried), chunk)])
     costs, tried = costs.reshape(len(scanned), -1), tried.reshape(len(scanned), -1, space.size)
     kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :KEPT, None], axis=1)  # (S, KEPT, P)
     found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=STEPS, tolerance=TOLERANCE,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.arrays import namespace
 from sysid.log import Trial
 from sysid.rollout import Measured, Simulated
 
@@ -60,14 +61,15 @@ class Features:
 
     def of(self, values: Measured | Simulated) -> np.ndarray:
         """Features (..., B, K, 5); what was not measured is 0."""
-        pose, odometry = np.asarray(values.pose, float), np.asarray(values.odometry, float)
-        total = np.concatenate([np.zeros_like(odometry[..., :1, 3:]), np.cumsum(odometry[..., 3:], axis=-2)], axis=-2)
+        xp = namespace(values.pose)
+        pose, odometry = xp.asarray(values.pose, float), xp.asarray(values.odometry, float)
+        total = xp.concatenate([xp.zeros_like(odometry[..., :1, 3:]), xp.cumsum(odometry[..., 3:], axis=-2)], axis=-2)
         row = np.arange(len(self.first))[:, None]
         count = np.maximum(self.last - self.first, 1)[..., None]
         speeds = (total[..., row, self.last, :] - total[..., row, self.first, :]) / count
         start = np.broadcast_to(self.start[:, None], (*pose.shape[:-2], 1, 3))
-        pose = np.concatenate([start, pose], axis=-2)
-        return np.concatenate([speeds, _motion(self.pose.at(pose)) / self.width], axis=-1) * self.mask
+        pose = xp.concatenate([start, pose], axis=-2)
+        return xp.concatenate([speeds, _motion(self.pose.at(pose)) / self.width], axis=-1) * self.mask
 
 
 def bin_width(trials: Sequence[Trial]) -> float:
@@ -134,7 +136,8 @@ def _edges(times: list[np.ndarray], edge: np.ndarray) -> _Edges:
 
 def _motion(pose: np.ndarray) -> np.ndarray:
     """Displacement (..., K, 3) forward, left and in yaw between edges (..., K + 1, 3), in the frame of the earlier."""
-    step = np.diff(pose, axis=-2)
-    cos, sin = np.cos(pose[..., :-1, 2]), np.sin(pose[..., :-1, 2])
-    return np.stack([cos * step[..., 0] + sin * step[..., 1], -sin * step[..., 0] + cos * step[..., 1], step[..., 2]],
+    xp = namespace(pose)
+    step = xp.diff(pose, axis=-2)
+    cos, sin = xp.cos(pose[..., :-1, 2]), xp.sin(pose[..., :-1, 2])
+    return xp.stack([cos * step[..., 0] + sin * step[..., 1], -sin * step[..., 0] + cos * step[..., 1], step[..., 2]],
                     axis=-1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.arrays import added, namespace
 from sysid.log import Trial
 
 ORDER = 4  # bins of memory of the filter
@@ -38,10 +39,10 @@ class Whitener:
         extra = (1,) * (series.ndim - 3)
         shown = mask.reshape(*mask.shape, *extra)
         scaled = series / self.scale.reshape(-1, *extra) * shown
-        white = scaled.copy()
+        xp, white = namespace(series), scaled.copy()
         for lag, matrix in enumerate(self.coefficients, start=1):
-            white[:, lag:] -= np.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag])
-        return np.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
+            white = added(white, np.s_[:, lag:], -xp.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag]))
+        return xp.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
 
     def scaled(self, factor: float) -> Whitener:
         """The filter for noise that is larger by a factor."""

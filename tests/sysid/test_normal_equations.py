@@ -1,0 +1,126 @@
+"""Costs, gradients and Hessians that are summed where the replay runs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
+
+from sysid import gradient, normal_equations, objective, starts
+from sysid.courses import CourseReplay
+from sysid.differences import DifferenceReplay
+from sysid.normal_equations import NormalEquations, make_equations
+from sysid.objective import Objective, estimate_noise
+from sysid.prior import Prior
+from sysid.starts import make_features_objective
+
+SETS = np.array([[0.4, 0.5, 0.6], [0.6, 0.4, 0.3], [1.0, 0.45, 0.5]])
+"""One of them at a bound, where differences are one-sided."""
+
+
+@pytest.fixture(scope="module")
+def poses(unicycle_log) -> Objective:
+    trials = unicycle_log.training
+    replay = CourseReplay(unicycle_plant(), trials, lambda values: values)
+    differences = DifferenceReplay(replay, UNICYCLE_SPACE)
+    return Objective(differences, UNICYCLE_SPACE, trials, replay.measured, estimate_noise(trials))
+
+
+@pytest.fixture
+def on_accelerator(monkeypatch):
+    """Objectives take a processor for one, and fill calls up to two sets."""
+    monkeypatch.setattr(normal_equations, "on_processor", lambda: False)
+    for module in (objective, starts):
+        monkeypatch.setattr(module, "make_equations", lambda one: (
+            NormalEquations(one, least=2) if hasattr(one.replay, "traced") else None))
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("kind", ["poses", "features", "with a prior"])
+def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robust):
+    one = {"poses": poses, "features": make_features_objective(poses),
+           "with a prior": dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.01)))}[kind]
+    equations = NormalEquations(one, least=1)
+    value, slope, hessian = equations.quadratic(SETS, robust)
+    np.testing.assert_allclose(value, equations.costs(SETS, robust), rtol=1e-4)
+    residual, jacobian = one.jacobian(SETS)
+    weight = gradient.huber_weight(residual) if robust else np.ones_like(residual)
+    np.testing.assert_allclose(value, gradient.robust_cost(residual, robust), rtol=1e-3)
+    for parameter in range(3):
+        step = np.eye(3)[parameter] * 0.01
+        fallen = (equations.costs(SETS + step, robust) - equations.costs(SETS - step, robust)) / 0.04
+        inside = slice(0, 2)  # not the set at a bound
+        np.testing.assert_allclose(slope[inside, parameter], fallen[inside], atol=0.1 * np.abs(slope[inside]).max())
+    if kind == "features" or not robust:  # weights within the search for start poses are not differenced on the host
+        near = 0.05 if kind == "features" else 0.12
+        expected = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
+        np.testing.assert_allclose(hessian, expected, atol=near * np.abs(expected).max())
+
+
+def test_a_search_with_sums_ends_where_one_with_residuals_does(poses, on_accelerator):
+    points = gradient.random_starts(poses.space, 4, seed=2)
+    host = gradient.fit(dataclasses.replace(poses, replay=Hidden(poses.replay)), poses.space, starts=points,
+                        iterations=25, robust=True)
+    there = gradient.fit(dataclasses.replace(poses), poses.space, starts=points, iterations=25, robust=True)
+    assert there.cost == pytest.approx(host.cost, rel=2e-3)
+    np.testing.assert_allclose(poses.space.to_values(there.u), TRUTH, rtol=0.1)
+    assert there.initial_cost == pytest.approx(host.initial_cost, rel=1e-3)
+    assert np.isfinite(there.start_costs).all() and (np.diff(there.history) <= 1e-9).all()
+
+
+def test_starts_are_drawn_and_fitted_in_features_alike(poses, on_accelerator):
+    points = starts.draw(dataclasses.replace(poses), range(3), seed=0, scan=16)
+    assert points.shape == (3, 3)
+    found = starts.fit(dataclasses.replace(poses), points, 0.5, iterations=10)
+    np.testing.assert_allclose(poses.space.to_values(found.u), TRUTH, rtol=0.15)
+
+
+def test_a_replay_that_diverges_is_dear_and_has_no_slope(poses):
+    replay = poses.replay.replay
+    broken = DifferenceReplay(Diverging(replay), UNICYCLE_SPACE)
+    one = dataclasses.replace(poses, replay=broken)
+    value, slope, hessian = NormalEquations(one, least=1).quadratic(SETS[:1])
+    assert np.isfinite(value).all() and value[0] > 1e3 * gradient.robust_cost(poses.residuals(SETS[:1]), False)[0]
+    assert not slope.any() and not hessian.any()
+
+
+def test_a_processor_has_its_residuals_at_hand(poses):
+    assert poses.equations is None and make_equations(poses) is None
+
+
+def test_calls_are_filled_up_to_what_was_compiled(poses):
+    equations = NormalEquations(dataclasses.replace(poses, replay=dataclasses.replace(poses.replay)), least=2)
+    three = equations.costs(SETS)
+    np.testing.assert_allclose(equations.costs(SETS[1:2]), three[1:2], rtol=1e-5)
+    assert [size for sizes in equations.sums.sizes.values() for size in sizes] == [3]
+
+
+def test_other_noise_is_weighed_without_compiling_again(poses):
+    first = make_features_objective(poses)
+    louder = dataclasses.replace(first, whitener=first.whitener.scaled(2.0))
+    one, other = NormalEquations(first, least=3), NormalEquations(louder, least=3)
+    np.testing.assert_allclose(one.costs(SETS), 4 * other.costs(SETS), rtol=1e-4)
+    assert one.sums is other.sums and one.sums.cost._cache_size() == 1
+    wide = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.1)))
+    narrow = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.001)))
+    assert (NormalEquations(narrow).costs(SETS) > NormalEquations(wide).costs(SETS)).all()
+
+
+class Hidden:
+    """A replay that cannot be traced."""
+
+    def __init__(self, replay):
+        self.simulate, self.jacobian = replay.simulate, replay.jacobian
+
+
+class Diverging:
+    """A replay of which every drive diverges."""
+
+    def __init__(self, replay):
+        self._replay = replay
+
+    def traced(self, values):
+        found = self._replay.traced(values)
+        return found.replace(pose=np.nan * found.pose, diverged=1.0 + found.diverged)
