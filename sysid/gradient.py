@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
+MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
+"""The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
 MAX_DAMPING = 1e4
 MAX_STEP = 0.3  # of the range, in one iteration
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
@@ -75,6 +77,8 @@ def fit(
     free = np.array([name not in frozen for name in space.names])
     count, damping, calm = len(u), np.full(len(u), 1e-2), np.zeros(len(u), int)
     cost = np.full(count, np.inf)
+    equations = getattr(objective, "equations", None)
+    dampings = DAMPINGS if equations is None else MANY_DAMPINGS
     initial, evaluations = np.inf, 0
     history: list[float] = []
 
@@ -88,7 +92,7 @@ def fit(
             if exact and (small or fallen > GOES_ON * tolerance * cost[n]):
                 calm[n] = calm[n] + 1 if small else 0
             u[n], cost[n] = tried[best], costs[best]
-            damping[n] = np.clip(damping[n] * DAMPINGS[best], 1e-7, MAX_DAMPING)
+            damping[n] = np.clip(damping[n] * dampings[best], 1e-7, MAX_DAMPING)
         elif exact:
             # Only when even a short step down the gradient does not help is the start at its minimum.
             calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
@@ -98,9 +102,9 @@ def fit(
     def candidates(starts: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
         """(G, D, P) points that are tried next."""
         nonlocal evaluations
-        evaluations += len(starts) * len(DAMPINGS)
+        evaluations += len(starts) * len(dampings)
         return np.stack([
-            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in DAMPINGS])
+            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in dampings])
             for i, n in enumerate(starts)])
 
     def step(at: _Points) -> _Points:
@@ -130,17 +134,12 @@ def fit(
     def step_there(
         equations: NormalEquations, going: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
     ) -> None:
-        """Move these starts with sums that an accelerator makes; one whose steps all cost more tries shorter ones."""
-        left = np.arange(len(going))
-        for _ in range(1 + FOLLOWING):
-            points = candidates(going[left], gradient[left], hessian[left])
-            costs = equations.costs(points.reshape(-1, space.size), robust).reshape(len(left), -1) / objective.counted
-            stayed = [settle(n, points[i], costs[i], True)[0] <= 0 and calm[n] < 2 for i, n in enumerate(going[left])]
-            left = left[np.array(stayed)]
-            if not len(left):
-                break
+        """Move these starts with sums that an accelerator makes."""
+        points = candidates(going, gradient, hessian)
+        costs = equations.costs(points.reshape(-1, space.size), robust).reshape(len(going), -1) / objective.counted
+        for i, n in enumerate(going):
+            settle(n, points[i], costs[i], True)
 
-    equations = getattr(objective, "equations", None)
     for iteration in range(iterations):
         going = np.flatnonzero(calm < 2)
         evaluations += len(going)
