@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.harness import device_name
+from benchmarks.harness import device_name, provenance
 
 QUIET = 30.0  # s between two lines of a job's progress
 
@@ -47,7 +47,8 @@ def run_jobs(folder: Path, labels: Iterable[str], job: Callable[[str], dict[str,
             result = {"error": f"{type(error).__name__}: {error}"}
         seconds = time.perf_counter() - began
         write_result(folder / f"{label}.json",
-                     {"label": label, "job_seconds": seconds, "device": device_name(), **result})
+                     {"label": label, "job_seconds": seconds, "device": device_name(),
+                      "versions": provenance()["versions"], **result})
         print(f"{number}/{len(left)} {label}: {result.get('error', 'done')}, {seconds:.1f} s", flush=True)
     return len(left)
 
@@ -67,8 +68,11 @@ def read_results(folder: Path, pattern: str = "*") -> list[dict[str, Any]]:
 
 
 def on_device(figures: dict[str, dict[str, Any]], results: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The figures, said to be of the device where the first result was made rather than where they are collected."""
-    return {name: {**one, "device": results[0].get("device", one["device"])} for name, one in figures.items()}
+    """The figures, said to be of the device and versions of the first result rather than of where they are collected;
+    no version is told where that result did not note any."""
+    first = results[0]
+    return {name: {**one, "device": first.get("device", one["device"]), "versions": first.get("versions", {})}
+            for name, one in figures.items()}
 
 
 def staged(path: Path, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:

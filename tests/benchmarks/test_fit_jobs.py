@@ -154,4 +154,5 @@ def test_one_process_compiles_for_all(tmp_path):
 def test_figures_are_said_to_be_of_the_device_that_did_the_jobs():
     figures = {"a": {"value": 1.0, "device": "here"}}
     assert on_device(figures, [{"device": "there"}])["a"]["device"] == "there"
-    assert on_device(figures, [{}])["a"]["device"] == "here"
+    assert on_device(figures, [{}])["a"]["device"] == "here" and on_device(figures, [{}])["a"]["versions"] == {}
+    assert on_device(figures, [{"versions": {"jax": "9"}}])["a"]["versions"] == {"jax": "9"}
