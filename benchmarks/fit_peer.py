@@ -1,11 +1,13 @@
 """The fit against MuJoCo's own `mujoco.sysid` on the same log, the same parameters and the same machine.
 
     python -m benchmarks.fit_peer --trials 6
+    python -m benchmarks.fit_peer --no-known       # ours from the preset alone, by the default search
 
-needs the packages of `pip install mujoco[sysid]`. The log is driven by the contact plant. `mujoco.sysid` is given the
-plant's own model in MJCF, with a native PI speed controller (a velocity servo and an integrating one, limited at the
-joint), its own threads, and nominal values to start from; ours the physical vehicle from its preset. Both fit the
-controller's gains and limit, the yaw inertia and where the centre of mass is; both know the delay of a command. The
+needs the packages of `pip install mujoco[sysid]`. The log is driven by the contact plant on one of its days.
+`mujoco.sysid` is given the plant's own model in MJCF, with a native PI speed controller (a velocity servo and an
+integrating one, limited at the joint), the nominal values of all else, and its own threads; ours a vehicle fitted to
+another day before, as a vehicle file has it. Both fit the controller's gains and limit, the yaw inertia and where the
+centre of mass is, by Levenberg and Marquardt from the values of the preset, and both know the delay of a command. The
 clock of each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for
 the one whose model is nearer to the truth that is long before its own end, which is told as well.
 """
@@ -28,13 +30,15 @@ from benchmarks.fit_scores import CLAIM
 from benchmarks.harness import figure, record
 from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
-from sysid import starts
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, make_problem
+from sysid import gradient, starts
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, fit_log, make_problem
 from sysid.log import Log, Trial, load_log
 from sysid.metrics import command_in_force
 from sysid.objective import estimate_noise
 from sysid.searches import Judge, Recorder
 from sysid.valleys import gradient_search
+from whill_mjx.parameters import get_values, set_values
+from whill_mjx.presets import preset_params
 
 NAMES = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "body.yaw_inertia", "body.com_x")
 MANOEUVRES = ("straight", "turn", "circle", "s_curve", "stop_and_go", "random")
@@ -51,6 +55,11 @@ class Peer:
     """Fitted trials: the first of three replicates of six manoeuvres of 22 s."""
     seed: int = 3
     """Day of the contact plant."""
+    known: bool = True
+    """Ours knows the parameters that are not fitted from another day, as the peer does from the plant; otherwise it has
+    the preset's and searches as `sysid.fit` does without options."""
+    other_day: int = 4
+    """The day that it knows them from."""
     iterations: int = 40
     """Of both searches, at most."""
     eps: float = 1e-4
@@ -210,12 +219,14 @@ def compare(model: mujoco.MjModel, wheels: Sequence[int], log: Log, trial: Trial
 
 
 def fit_ours(log: Log, settings: Peer) -> tuple[Curve, dict[str, float], float]:
-    """Fit with the default search, compiled before; its error at every better point, values, seconds of compiling."""
-    problem = make_problem(log, FitConfig(parameters=NAMES))
+    """Fit, compiled before; its error at every better point, values, seconds of compiling."""
+    problem = make_problem(log, FitConfig(parameters=NAMES), known_vehicle(log, settings) if settings.known else None)
     objective, space = problem.objective, problem.space
     judge = Judge(problem, replace(log, trials=tuple(replace(trial, held_out=True) for trial in log.training)))
 
     def search(objective: Any) -> np.ndarray:
+        if settings.known:
+            return gradient.fit(objective, space, iterations=settings.iterations, robust=True).u
         points = starts.draw(objective, [0], 0)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS)
         return gradient_search(objective, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
@@ -231,6 +242,21 @@ def fit_ours(log: Log, settings: Peer) -> tuple[Curve, dict[str, float], float]:
     return curve, dict(zip(space.names, space.to_values(u).tolist(), strict=True)), first - recorder.seconds
 
 
+def known_vehicle(log: Log, settings: Peer) -> Any:
+    """The vehicle fitted to another day, but for the parameters that are searched: those are the preset's."""
+    other = fit_log(drive(settings.other_day), FitConfig(iterations=settings.iterations))
+    start = get_values(preset_params(log.spec, "physical"), NAMES)
+    return set_values(other.params, NAMES, start)
+
+
+def drive(seed: int) -> Log:
+    """A day of the contact plant, all of it to be fitted."""
+    with tempfile.TemporaryDirectory() as folder:
+        make_log(Path(folder) / "log", seed=seed, manoeuvres=MANOEUVRES)
+        log = load_log(Path(folder) / "log")
+    return replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
+
+
 def arrival(curve: Curve, goal: float) -> float:
     """Seconds until the error is at most `goal` [m]."""
     return next(seconds for seconds, error in curve if error <= goal)
@@ -243,12 +269,9 @@ def own_arrival(curve: Curve) -> float:
 
 def main(settings: Peer) -> None:
     """Drive the log, fit it with both, record the ratio of their times."""
-    with tempfile.TemporaryDirectory() as folder:
-        make_log(Path(folder) / "log", seed=settings.seed, manoeuvres=MANOEUVRES)
-        log = load_log(Path(folder) / "log")
+    log = drive(settings.seed)
     names = [trial.name for trial in log.trials][: settings.trials]
     log = log.select(lambda trial: trial.name in names)
-    log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
     ours, values, compiling = fit_ours(log, settings)
     theirs, their_values = fit_peer(log, settings)
     goal = EQUAL * max(min(error for _, error in curve) for curve in (ours, theirs))
@@ -264,6 +287,7 @@ def main(settings: Peer) -> None:
         "peer_ours_seconds_to_own_best": figure([own_arrival(ours)], "s"),
         "peer_trials": figure([float(len(log.trials))], "count"),
     }
+    figures = {name + ("" if settings.known else "_from_preset"): one for name, one in figures.items()}
     record("fit", CLAIM, figures)
     for name, one in figures.items():
         print(f"{name:44} {one['value']:10.4f} {one['unit']}")
