@@ -236,20 +236,14 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
         start: (5,) x, y, yaw, v, omega.
         warm_up: physics steps at the start's speeds before it.
     """
-    def physics(state: Any, command: jax.Array) -> tuple[Any, None]:
-        return plant.substep(params, state, command), None
-
     def record(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
-        if plant.substeps is None:
-            state, _ = jax.lax.scan(physics, state, commands)
-        else:
-            state = plant.substeps(params, state, commands)
+        state = _advance(plant, params, state, commands)
         return state, plant.observe(state)
 
     params, latency = _without_latency(params)
     state = plant.place(params, start)
     if warm_up:
-        state = plant.move(_settle(plant, params, state, start[3:], warm_up), start)
+        state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
     first = plant.observe(state)
     _, later = jax.lax.scan(record, state, command)
     path = jnp.concatenate([first[None], later])
@@ -333,16 +327,23 @@ def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
                      path[-1, 8])
 
 
-def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int) -> Any:
+def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
+    """State after K physics steps, each with its own of commands (K, 2)."""
+    if plant.substeps is not None:
+        return plant.substeps(params, state, commands)
+    return jax.lax.scan(lambda state, command: (plant.substep(params, state, command), None), state, commands)[0]
+
+
+def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int) -> Any:
     """State after driving so that the odometry reports `speeds` (2,): where the vehicle falls short of its command, as
-    a skid-steered one does, the command is raised until it does not."""
+    a skid-steered one does, the command, which is held for a few steps, is raised until it does not."""
 
     def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
         state, command = carry
-        state = plant.substep(params, state, command)
-        return (state, command + WARM_UP_GAIN * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
+        state = _advance(plant, params, state, jnp.broadcast_to(command, (held, 2)))
+        return (state, command + WARM_UP_GAIN * held * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
 
-    return jax.lax.scan(body, (state, speeds), None, length=steps)[0][0]
+    return jax.lax.scan(body, (state, speeds), None, length=max(steps // held, 1))[0][0]
 
 
 def _turns(angle: jax.Array) -> jax.Array:

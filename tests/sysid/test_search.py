@@ -404,6 +404,32 @@ def test_a_vehicle_that_starts_in_motion_is_under_way_at_the_start_pose():
     np.testing.assert_allclose(np.diff(pose[:, 2]) / 0.05, (pose[-1, 2] - pose[0, 2]) / t[-1], rtol=0.15)
 
 
+def test_a_drive_that_starts_in_motion_is_settled_by_the_quick_way_of_many_steps():
+    """One step after the other, each put together from single elements, takes sixty times as long."""
+    plain = unicycle_plant()
+    t = np.arange(0.0, 0.8, 0.05)
+    pose = PoseStream(t, 0 * t, 0 * t, 0 * t)
+    trial = Trial("a_1", "a", Command(np.array([0.0]), np.array([0.5]), np.array([0.4])), None, pose,
+                  Start(3.0, -2.0, 2.0, v=0.3, omega=0.2))
+    batch, _ = make_batch((trial,), plain.dt)
+    called = []
+
+    def substeps(params, state, commands):
+        called.append(len(commands))
+        for command in commands:
+            state = plain.substep(params, state, command)
+        return state
+
+    def refused(params, state, command):
+        raise AssertionError("a single step was asked for")
+
+    quick = dataclasses.replace(plain, substep=refused, substeps=substeps)
+    found, expected = (Replay(plant, batch, lambda values: values).simulate(TRUTH[None]).pose
+                       for plant in (quick, plain))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert batch.warm_up > 0 and set(called) == {batch.command.shape[2]}
+
+
 @pytest.mark.parametrize("speeds", [(0.0, 0.0), (0.5, 0.4)])
 def test_a_replay_reads_late_odometry_off_the_path(speeds):
     """As the odometry without latency was that long before; counted from where the vehicle starts, as a log is."""
