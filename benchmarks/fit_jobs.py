@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.harness import device_name, provenance
+from benchmarks.harness import device_name, versions
 
 QUIET = 30.0  # s between two lines of a job's progress
 
@@ -48,7 +48,7 @@ def run_jobs(folder: Path, labels: Iterable[str], job: Callable[[str], dict[str,
         seconds = time.perf_counter() - began
         write_result(folder / f"{label}.json",
                      {"label": label, "job_seconds": seconds, "device": device_name(),
-                      "versions": provenance()["versions"], **result})
+                      "versions": versions(), **result})
         print(f"{number}/{len(left)} {label}: {result.get('error', 'done')}, {seconds:.1f} s", flush=True)
     return len(left)
 

@@ -76,9 +76,13 @@ def record(
 
 def provenance() -> dict[str, Any]:
     """Command, versions, commit and date of what is running."""
-    versions = {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
-    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "versions": versions,
+    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "versions": versions(),
             "commit": _commit(), "date": datetime.date.today().isoformat()}
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that figures depend on."""
+    return {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
 
 
 def told(word: str) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sysid.courses import CourseReplay
 from sysid.rollout import Simulated
 from sysid.space import Space
 
@@ -27,8 +28,7 @@ STEP = 0.01
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: Any
-    """As `sysid.objective.Replays`."""
+    replay: CourseReplay
     space: Space
     step: float = STEP
 
