@@ -301,5 +301,9 @@ def brief(result: Result) -> dict[str, Any]:
             "excess_limit": wander.excess_limit(alpha), "warnings": warnings(result),
             "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
                         for one in named_effects(result)] if found.verdict == "named" else [],
+            "stood": [{"effect": one.effect, "manoeuvres": one.agreement.outcome, "scatter": one.agreement.scatter,
+                       "scatter_least": one.agreement.least,
+                       "predictions": [[each.falsifier.by, each.outcome, each.power] for each in one.falsifiers]}
+                      for one in result.stood],
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
                            for each in found.rounds]}

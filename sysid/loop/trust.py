@@ -20,6 +20,8 @@ NEARLY = 0.9
 """Share of the largest size that is looked for from which a size is at its end."""
 MOVED = 0.01
 """p-value of how far base parameters went, below which they went further than from day to day."""
+LAW = ("speed", "yaw rate", "size of the step")
+"""Quantities by which effects that act at the same times have different laws."""
 UNDONE = 0.5
 """What two effects change together, as a share of what each does by itself, below which one may stand for both."""
 
@@ -43,6 +45,10 @@ def warnings(result: Result) -> list[str]:
              for first, second, left in undone(found.final) if left < UNDONE]
     said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
              for name in at_the_end(result)]
+    named = {one.hypothesis.effect for one in found.accepted}
+    said += [f"these drives do not tell whether {one.effect} {each.falsifier.says}: an effect of another law may do it"
+             for one in result.stood if one.effect in named for each in one.falsifiers
+             if each.falsifier.by in LAW and each.outcome == "untold"]
     gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
     quantity = max(gains, key=lambda name: gains[name])
     if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):

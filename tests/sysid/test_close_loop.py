@@ -24,7 +24,7 @@ from sysid.fit import main as fit_main
 from sysid.log import load_log
 from sysid.loop.catalogue import base_values
 from sysid.loop.drives import make_drives
-from sysid.loop.falsifiers import course_of, put_to_test
+from sysid.loop.falsifiers import Falsifier, course_of, put_to_test
 from sysid.loop.features import CHANNELS, make_features
 from sysid.loop.next_manoeuvre import refitter_of
 from sysid.loop.noise import deviations, replicate_groups
@@ -191,6 +191,15 @@ def test_a_name_that_leaves_more_than_days_differ_by_comes_with_a_warning(slopin
     assert not warnings(replace(sloping, search=replace(sloping.search, verdict="none", excess=(1.0, 1.0))))
     crowded = replace(sloping.search, excess=(1.0, 0.0), crowd=["backlash"])
     assert "backlash cannot be told from it either" in warnings(replace(sloping, search=crowded))[0]
+
+
+@pytest.mark.parametrize(("by", "outcome", "warns"), [("speed", "untold", True), ("speed", "holds", False),
+                                                      ("time in the drive", "untold", False)])
+def test_a_name_whose_law_the_drives_did_not_put_to_test_comes_with_a_warning(sloping, by, outcome, warns):
+    first = sloping.stood[0]
+    tested = replace(first.falsifiers[0], falsifier=Falsifier("grows as its law says", by), outcome=outcome)
+    said = warnings(replace(sloping, stood=(replace(first, falsifiers=(tested,)),)))
+    assert any("do not tell whether slope grows as its law says" in one for one in said) == warns
 
 
 def test_report_and_vehicle_file(sloping, tmp_path):
