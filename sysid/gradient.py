@@ -104,7 +104,7 @@ def fit(
         nonlocal evaluations
         evaluations += len(starts) * len(dampings)
         return np.stack([
-            np.stack([_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in dampings])
+            np.stack([damped_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in dampings])
             for i, n in enumerate(starts)])
 
     def step(at: _Points) -> _Points:
@@ -224,7 +224,7 @@ def _followed(
     residual = objective.residuals(points)
     weight = huber_weight(residual) if robust else np.ones_like(residual)
     moved = np.stack([
-        _step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, index != fixed)
+        damped_step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, index != fixed)
         for point, one, fixed in zip(points, residual * weight, held, strict=True)])  # fmt: skip
     costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))]) / objective.counted
     return costs.min(0), np.where((costs[1] < costs[0])[:, None], moved, points)
@@ -301,8 +301,10 @@ def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.nd
     return jacobian + missed[..., None] * direction[:, None, None, :]
 
 
-def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float, free: np.ndarray) -> np.ndarray:
-    """The damped Gauss-Newton point of one start, within the box."""
+def damped_step(
+    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float, free: np.ndarray
+) -> np.ndarray:
+    """The damped Gauss-Newton point (P,) of u (P,) within the box; what is not `free` (P,) stays."""
     active = free & ~((u <= 0.0) & (gradient > 0)) & ~((u >= 1.0) & (gradient < 0))
     new = u.copy()
     for _ in range(3):  # cutting at a wall may let another parameter reach its own

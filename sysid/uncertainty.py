@@ -5,6 +5,8 @@ independent drives: the variance is that of their sums (`sysid.sandwich`), whate
 replicates share is no noise but what the model gets wrong about a manoeuvre; where they share more than chance would
 have it, manoeuvres are the independent blocks. Where too few trials tell a parameter, or where they happen to differ
 less than pieces of them do, blocks are pieces of trials, and errors are no less than those of independent samples.
+Slopes are averaged over the errors (`sysid.slopes`): by differences over a fixed share of their ranges, delays are told
+half as well as they are, and friction, slip and torque limits up to one and a half times.
 """
 
 from __future__ import annotations
@@ -13,10 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.gradient import HUBER, huber_weight
+from sysid.gradient import HUBER, huber_weight, robust_cost
 from sysid.metrics import replicate_groups
 from sysid.objective import Objective
 from sysid.sandwich import Variance, sandwich
+from sysid.slopes import average_slopes, likely
 
 CONFIDENCE = 0.90
 PIECES = 8
@@ -26,6 +29,7 @@ ENOUGH = 2.0
 CHANCE = 0.05
 """Probability below which what replicates share is taken for the model's error."""
 FLIPS = 999  # draws of the signs of trials
+PASSES = 2  # of averaging slopes: over errors as differences tell them, and as averaged slopes do
 PRIOR_SD = 0.29
 """Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
 UNIDENTIFIABLE = 0.5
@@ -82,6 +86,9 @@ def estimate(
 
     space = objective.space
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
+    size = float(robust_cost(residual[None], robust)[0]) / objective.counted
+    for _ in range(PASSES):
+        residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
     if objective.prior is not None:  # not a measurement: it comes back as a precision
         residual, jacobian = residual[:, : -space.size], jacobian[:, : -space.size]
     told = jacobian

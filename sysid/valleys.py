@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid import gradient
+from sysid import gradient, slopes
 from sysid.objective import Objective
 from sysid.result import FitResult, Progress
 from sysid.space import Space
@@ -28,10 +28,7 @@ DEAR, FAR = 10.0, 12
 FIRST, KEPT, LOOK = 1, 4, 3
 """Iterations from all of these, how many are searched further, and iterations after which one must be better."""
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
-SHAKES = (0.01, 0.016, 0.025, 0.04)
-"""Shares of its range by which each parameter moves at most, of the points that the end is shaken to."""
-ROUNDS, MISSES, WORTH = 6, 3, 0.001
-"""Of shaking at most, and after how many in a row it ends that lower the cost by less than that share."""
+WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
 
 
 def gradient_search(
@@ -43,8 +40,9 @@ def gradient_search(
     What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
     right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
-    on a grid, and LM tries another valley that is about as deep. At the end all parameters are shaken a little: the
-    floors of valleys are jagged. From the floor the ends of ranges are tried again, since what hid them may be gone.
+    on a grid, and LM tries another valley that is about as deep. The floors of valleys are jagged: at the end slopes
+    averaged over what estimates err lead on (`sysid.slopes`). From the floor the ends of ranges are tried again, since
+    what hid them may be gone.
     Nothing of this is done without `config.elsewhere`.
     """
 
@@ -75,31 +73,11 @@ def gradient_search(
             result = _from_elsewhere(follow, result, other[None], iterations)
     deeper = config.elsewhere
     while deeper:
-        result = _shaken(follow, result, iterations, config.seed)
+        result = slopes.descend(objective, result, config.robust, config.seed, progress)
         floor = result.cost
         result = _from_ends(follow, objective, result, iterations, config.robust)
         deeper = result.cost < floor * (1 - WORTH)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
-
-
-def _shaken(
-    search: Callable[[np.ndarray, int], FitResult], result: FitResult, iterations: int, seed: int
-) -> FitResult:
-    """The result with where searches from random points close to it end, round after round while that is worth it.
-
-    Delays act in steps and wheels stick or slip: on the floor of a curved valley a search stops at one of many folds,
-    between which neither a single parameter nor a straight line leads. From a little up its sides LM comes down
-    elsewhere.
-    """
-    random, sizes, misses = np.random.default_rng(seed), np.array(SHAKES)[:, None], 0
-    for _ in range(ROUNDS):
-        if misses == MISSES:
-            break
-        before = result.cost
-        points = result.u + sizes * random.uniform(-1.0, 1.0, (len(sizes), len(result.u)))
-        result = _from_elsewhere(search, result, np.clip(points, 0.0, 1.0), iterations)
-        misses = 0 if result.cost < before * (1 - WORTH) else misses + 1
-    return result
 
 
 def _from_ends(

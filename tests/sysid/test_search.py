@@ -45,7 +45,7 @@ def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, c
     stuck = gradient.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
     monkeypatch.setattr("sysid.valleys.DEAR", dear)
-    monkeypatch.setattr("sysid.valleys.ROUNDS", 0)  # nor from close by
+    monkeypatch.setattr("sysid.slopes.ROUNDS", 0)  # nor from close by
     result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
     assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
@@ -100,18 +100,18 @@ class Folded:
 
 
 @pytest.mark.quick
-def test_shaken_searches_leave_the_folds_of_a_valleys_floor_and_agree(monkeypatch):
+def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_lowest(monkeypatch):
     space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
 
     def ends():
         starts = np.array([[0.9, 0.9], [0.8, 0.2]])
         return [gradient_search(Folded(), space, start[None], 40, FitConfig(), None)[0] for start in starts]
 
-    shaken, again = ends(), ends()
-    assert [one.cost for one in shaken] == pytest.approx([1.0, 1.0], abs=1e-3)
-    np.testing.assert_allclose(shaken[0].u, shaken[1].u, atol=0.01)
-    np.testing.assert_array_equal(shaken[0].u, again[0].u)  # the same seed shakes alike
-    monkeypatch.setattr("sysid.valleys.ROUNDS", 0)
+    found, again = ends(), ends()
+    assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=2e-3)
+    np.testing.assert_allclose(found[0].u, found[1].u, atol=0.02)  # a fold's width
+    np.testing.assert_array_equal(found[0].u, again[0].u)  # the same seed, the same points
+    monkeypatch.setattr("sysid.slopes.ROUNDS", 0)
     stuck = ends()
     assert min(one.cost for one in stuck) > 1.1 and abs(stuck[0].u[0] - stuck[1].u[0]) > 0.1
 
@@ -135,7 +135,7 @@ class Hidden(Folded):
 def test_ends_of_ranges_are_tried_again_from_the_floor_of_the_valley(rounds, end, cost, monkeypatch):
     space = Space(("a", "b", "c"), np.zeros(3), np.ones(3), np.full(3, 0.5), np.zeros(3, bool))
     monkeypatch.setattr("sysid.valleys.DEAR", 0.01)  # far along the ranges lies nothing
-    monkeypatch.setattr("sysid.valleys.ROUNDS", rounds)
+    monkeypatch.setattr("sysid.slopes.ROUNDS", rounds)
     found, _, _ = gradient_search(Hidden(), space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
     assert found.u[2] == pytest.approx(end, abs=0.02)
     assert found.cost == pytest.approx(cost, rel=0.1)
