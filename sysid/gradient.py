@@ -110,9 +110,7 @@ def fit(
     def step(at: _Points) -> _Points:
         """Move these starts; those of them that can try again without a new Jacobian."""
         residual, jacobian = at.residual, at.jacobian
-        weight = huber_weight(residual) if robust else np.ones_like(residual)
-        gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
-        hessian = np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
+        gradient, hessian = normal_sums(residual, jacobian, robust)
         points = candidates(at.starts, gradient, hessian)
         tried = objective.residuals(points.reshape(-1, space.size))
         tried = tried.reshape(*points.shape[:2], *residual.shape[1:])
@@ -299,6 +297,14 @@ def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.nd
     missed = change - np.einsum("nbkp,np->nbk", jacobian, move)
     direction = move / np.maximum(np.square(move).sum(-1, keepdims=True), 1e-300)
     return jacobian + missed[..., None] * direction[:, None, None, :]
+
+
+def normal_sums(residual: np.ndarray, jacobian: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients (N, P) and Gauss-Newton Hessians (N, P, P), by half, of squares or Huber losses of residuals (N, B, K)
+    with the derivatives (N, B, K, P)."""
+    weight = huber_weight(residual) if robust else np.ones_like(residual)
+    gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
+    return gradient, np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
 
 
 def damped_step(

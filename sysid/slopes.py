@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.gradient import Residuals, damped_step, huber_weight, robust_cost
+from sysid.gradient import Residuals, damped_step, normal_sums, robust_cost
 from sysid.result import FitResult, Progress
 
 ROTATIONS = 3
@@ -83,9 +83,7 @@ def descend(
         before = cost
         covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
         residual, slopes = average_slopes(objective, u, covariance, seed + number)
-        weight = huber_weight(residual) if robust else np.ones_like(residual)
-        gradient = np.einsum("bkp,bk->p", slopes, residual * weight)
-        hessian = np.einsum("bkp,bkq->pq", slopes, slopes * weight[..., None])
+        (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], robust)
         points = np.stack([damped_step(u, gradient, hessian, damping, free) for damping in DAMPINGS])
         costs = robust_cost(objective.residuals(points), robust) / objective.counted
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)

@@ -84,7 +84,8 @@ def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
 
 
 class Folded:
-    """A steep valley b = a^2 with a fold every 0.02 along its floor, which is lowest at a = 0.4: cost 1 there."""
+    """A steep valley b = a^2 with a fold every 0.02 along its floor, which is lowest, at cost 1, in five points
+    from a = 0.385 to 0.415."""
 
     counted = 1
     noise = Noise(np.ones(3), np.ones(5), "replicates")
@@ -108,8 +109,8 @@ def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_l
         return [gradient_search(Folded(), space, start[None], 40, FitConfig(), None)[0] for start in starts]
 
     found, again = ends(), ends()
-    assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=2e-3)
-    np.testing.assert_allclose(found[0].u, found[1].u, atol=0.02)  # a fold's width
+    assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=1e-5)  # no fold beside it costs as little
+    assert [one.u[0] for one in found] == pytest.approx([0.4, 0.4], abs=0.0155)
     np.testing.assert_array_equal(found[0].u, again[0].u)  # the same seed, the same points
     monkeypatch.setattr("sysid.slopes.ROUNDS", 0)
     stuck = ends()
