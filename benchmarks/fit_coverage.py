@@ -34,9 +34,10 @@ PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")
 PLANT_LENGTH = 11.0  # s that are driven of each of them
 REPLICATES = 6
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
-MORE = ("axle_pivot", "lateral_damping", "rolling_resistance_speed", "sensor_delay", "suspension")
+MORE = ("axle_pivot", "lateral_damping", "rolling_resistance_speed", "sensor_delay", "suspension", "wheel_inertia")
 USUAL = {"body.com_z": 0.1, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
-         "rolling_resistance_speed.mu_1": 0.02, "sensor_delay.delay": 0.01}
+         "rolling_resistance_speed.mu_1": 0.02, "sensor_delay.delay": 0.01, "sensor_delay.speed": 0.005,
+         "wheel_inertia.ratio": 2.0}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted
@@ -70,12 +71,12 @@ def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
 
 def plant_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
     """A log of a day of the contact plant, and the values of the physical model that are known."""
-    from benchmarks.plant.chair import Chair
+    from benchmarks.plant.chair import COULOMB, Chair
     from benchmarks.plant.commands import nine
     from benchmarks.plant.make import make_log
 
     tables = {name: table[table[:, 0] < PLANT_LENGTH] for name, table in nine(seed).items() if name in PLANT_MANOEUVRES}
-    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES)
+    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB)
     log = load_log(folder / "log")
     log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
     return log, plant_values(Chair().on_day(np.random.default_rng([seed, 1])), log.spec)
@@ -84,10 +85,9 @@ def plant_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
 def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     """The values of the physical model that a chair of the contact plant has.
 
-    Speeds and poses tell forces only per inertia: the model's mass and wheel inertia are nominal, so that its torques
-    are the chair's times the ratio of the inertias that a straight drive moves, and its yaw inertia is the one with
-    which a turn about the driven axle needs the chair's torque times that ratio. The model's controller acts all the
-    time; the chair's is sampled and holds its torque, which is as quick as a continuous one of a higher gain.
+    Speeds and poses tell forces only per mass: the model's mass is nominal, so that its torques and its inertias are
+    the chair's times the ratio of the masses. The model's controller acts all the time; the chair's is sampled and
+    holds its torque, which is as quick as a continuous one of a higher gain.
     """
     from benchmarks.plant.base import TICK
     from benchmarks.plant.chair import build
@@ -102,15 +102,13 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
                         for matrix, inertia in zip(data.ximat[1:], model.body_inertia[1:], strict=True)])
     yaw = float(upright.sum() + (mass * np.square(apart).sum(1)).sum())
     wheel = model.body("wheel_left").id
-    spin = float(model.body_inertia[wheel].max() + chair.armature) / np.mean(chair.radius) ** 2  # [kg] of one wheel
-    nominal = spec.wheel_inertia / spec.wheel_radius**2
-    ratio = (spec.mass + 2 * nominal) / (mass.sum() + 2 * spin)
-    load = (mass.sum() + 2 * spin) / 2 * np.mean(chair.radius) ** 2  # [kg m^2] that one side's torque moves
+    spin = float(model.body_inertia[wheel].max() + chair.armature)  # of one wheel
+    ratio = spec.mass / mass.sum()
+    load = mass.sum() / 2 * np.mean(chair.radius) ** 2 + spin  # [kg m^2] that one side's torque moves
     held = -np.log(1 - chair.kp * TICK / load) / (chair.kp * TICK / load)  # of two controllers with the same pole
-    turning = yaw + mass.sum() * middle[0] ** 2 + spin * chair.track**2 / 2
-    inertia = ratio * turning - spec.mass * middle[0] ** 2 - nominal * spec.track**2 / 2
     return {"torque_drive.kp": chair.kp * held * ratio, "torque_drive.ki": chair.ki * held * ratio,
-            "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": inertia,
+            "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": yaw * ratio,
+            "wheel_inertia.ratio": spin * ratio / spec.wheel_inertia,
             "body.com_x": spec.rear_x + float(middle[0]), "body.com_y": float(middle[1]),
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from sysid import command_line, gradient, starts, tpe, uncertainty
+from sysid import command_line, frames, gradient, starts, tpe, uncertainty
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -126,6 +126,8 @@ class Fit:
     """What was fitted in place of the simulator's vehicle."""
     likelihoods: tuple[Profile, ...] = ()
     """Profile likelihoods of the parameters that `profile` names."""
+    frame: float | None = None
+    """Time between the frames of the odometry [s] (`sysid.frames`), where they show."""
 
 
 def fit_log(
@@ -184,7 +186,7 @@ def fit_log(
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, objective.prior, model, tuple(traced))
+               profiles, time.perf_counter() - began, plant, objective.prior, model, tuple(traced), given.frame)
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,8 @@ class Problem:
     intervals: dict[str, tuple[float, float]]
     """Of an earlier vehicle file."""
     model: Model | None
+    frame: float | None = None
+    """Time between the frames of the odometry [s], which the trials' rows are at."""
 
 
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
@@ -209,6 +213,8 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
+    frame = frames.find_period(trials)
+    trials = frames.at_frames(trials, frame)
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
@@ -227,8 +233,8 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         params = preset_params(log.spec, config.preset) if params is None else params
         params = with_effects(params, (*config.effects, *(() if given else measured_effects(params, log.spec, trials))))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
-    objective = make_objective(plant, params, space, trials, estimate_noise(log.training))
-    return Problem(plant, params, space, objective, intervals, model)
+    objective = make_objective(plant, params, space, trials, estimate_noise(frames.at_frames(log.training, frame)))
+    return Problem(plant, params, space, objective, intervals, model, frame)
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
@@ -288,6 +294,8 @@ def fit_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
+    if fit.frame is not None:
+        log = replace(log, trials=frames.at_frames(log.trials, fit.frame), notes=(*log.notes, frames.note(fit.frame)))
     trials = (*log.training, *log.held_out)
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
@@ -361,6 +369,8 @@ def main(arguments: Arguments) -> None:
                              source={"train": arguments.train, "held_out_selection": arguments.held_out})
     finally:
         close()
+    for note in report["dataset"]["notes"][len(log.notes):]:
+        print(note)
     print(parameter_table(report))
     if report["prior"] is not None:
         print(f"Against {settings.vehicle}, assuming {settings.spread:.0%} from day to day:")

@@ -87,7 +87,8 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
 
     On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
     wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
-    torque is at its limit nothing makes up for it. Soft springs let a vehicle nod, and its wheels turn with that.
+    torque is at its limit nothing makes up for it. A wheel that skids is thrown by its own inertia, of which the
+    rotor of its motor may be the most. Soft springs let a vehicle nod, and its wheels turn with that.
     Readings of the odometry have an age of their own, which shows against an outside pose.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
@@ -95,7 +96,7 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
     rolling: tuple[str, ...] = ("suspension",)
     if spec.drive != "skid":
         loss = ("rolling_resistance_speed",) if losses else ()
-        rolling = ("axle_pivot", "lateral_damping", *loss, "suspension")
+        rolling = ("axle_pivot", "lateral_damping", *loss, "suspension", "wheel_inertia")
     both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
     return (*rolling, "sensor_delay") if both else rolling
 

@@ -170,7 +170,7 @@ def vehicle_mjcf(spec: VehicleSpec, params: VehicleParams, physics_dt: float = 0
         for geom in editable.body(name).geoms:
             geom.size = [spec.wheel_radius, geom.size[1], 0.0]
         joint = editable.joint(name)
-        joint.armature = spec.wheel_inertia
+        joint.armature = spec.wheel_inertia * float(world.wheel_inertia)
         limits = (spec.v_min, spec.v_max) if name == "left_wheel" else (-spec.omega_max, spec.omega_max)
         control = editable.add_actuator(name="v" if name == "left_wheel" else "omega", target=name,
                                         trntype=mujoco.mjtTrn.mjTRN_JOINT)

@@ -24,7 +24,7 @@ from whill_mjx.model import VehicleModel
 
 def step(
     model: VehicleModel, mass: jax.Array, inertia: jax.Array, com: jax.Array, gravity: jax.Array,
-    qpos: jax.Array, qvel: jax.Array, force: jax.Array,
+    qpos: jax.Array, qvel: jax.Array, force: jax.Array, armature: jax.Array | float = 1.0,
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """qpos (9,) and qvel (8,) one physics step on.
 
@@ -34,10 +34,11 @@ def step(
         gravity: (3,) in the world frame [m/s^2].
         qpos, qvel: the present state.
         force: (8,) as MuJoCo's qfrc_applied.
+        armature: of the wheels, over the model's.
     """
     dt = model.config.physics_dt
     rotation = rotation_from_quaternion(qpos[3:7])
-    acceleration = accelerations(model, mass, inertia, com, gravity, rotation, qvel, force)
+    acceleration = accelerations(model, mass, inertia, com, gravity, rotation, qvel, force, armature)
     return moved(qpos, qvel + acceleration * (dt / 2), dt), qvel + acceleration * dt
 
 
@@ -48,7 +49,7 @@ def moved(qpos: jax.Array, qvel: jax.Array, dt: float) -> jax.Array:
 
 def accelerations(
     model: VehicleModel, mass: jax.Array, inertia: jax.Array, com: jax.Array, gravity: jax.Array,
-    rotation: jax.Array, qvel: jax.Array, force: jax.Array,
+    rotation: jax.Array, qvel: jax.Array, force: jax.Array, armature: jax.Array | float = 1.0,
 ) -> jax.Array:  # fmt: skip
     """qacc (8,): M^-1 (force - bias). Arguments as of `step`, with the rotation (3, 3), chassis to world."""
     wheels = model.wheels
@@ -61,7 +62,7 @@ def accelerations(
         about = about + _parallel(wheels.mass, jnp.array([wheels.x, side, 0.0]) - centre)
     rate, spin = qvel[3:6], qvel[6:8]
     push = rotation.T @ force[:3]
-    hinge = wheels.inertia + wheels.armature
+    hinge = wheels.inertia + wheels.armature * armature
     torque, wheel_torque = force[3:6], force[6:8]
     turning = about @ rate + jnp.array([0.0, 1.0, 0.0]) * wheels.inertia * (spin[0] + spin[1])  # angular momentum
     moment = torque - _cross(centre, push) - _cross(rate, turning)

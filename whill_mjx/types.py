@@ -61,6 +61,8 @@ class World:
     payload: Payload | None = None
     ground: tuple = ()  # surfaces on the plane z = 0, see ground.py; none costs nothing
     sag: jax.Array | float = 0.005  # () m, compression of each contact under a quarter of the weight
+    damping: jax.Array | float = 0.5  # () of the contacts, over the critical
+    wheel_inertia: jax.Array | float = 1.0  # () spin inertia of the driven wheels over the nominal
 
 
 @struct.dataclass

@@ -110,7 +110,8 @@ def integrate(
     """qpos (9,) and qvel (8,) one physics step on, under the generalised force (8,)."""
     if model.config.dynamics == "fused":
         return rigid.step(
-            model, *mass_distribution(model, params, world), world.gravity, state.qpos, state.qvel, force
+            model, *mass_distribution(model, params, world), world.gravity, state.qpos, state.qvel, force,
+            world.wheel_inertia,
         )
     from mujoco import mjx
 
@@ -134,13 +135,14 @@ def mass_distribution(
 
 
 def instance_model(model: VehicleModel, params: VehicleParams, world: World):
-    """The mjx.Model with this instance's mass distribution and gravity."""
+    """The mjx.Model with this instance's mass distribution, wheels and gravity."""
     mass, inertia, com = mass_distribution(model, params, world)
     nominal = model.mjx
     return nominal.replace(
         body_mass=jnp.concatenate([nominal.body_mass[:1], mass[None], nominal.body_mass[2:]]),
         body_inertia=jnp.concatenate([nominal.body_inertia[:1], inertia[None], nominal.body_inertia[2:]]),
         body_ipos=jnp.concatenate([nominal.body_ipos[:1], com[None], nominal.body_ipos[2:]]),
+        dof_armature=jnp.concatenate([nominal.dof_armature[:6], nominal.dof_armature[6:] * world.wheel_inertia]),
         opt=nominal.opt.replace(gravity=world.gravity),
     )
 
@@ -173,7 +175,8 @@ def nominal_world(model: VehicleModel) -> World:
         driven=jnp.array(driven),
     )
     sag = jnp.asarray(STATIC_SAG, jnp.result_type(float))
-    return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3), sag=sag)
+    return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3), sag=sag,
+                 damping=jnp.asarray(DAMPING_RATIO, sag.dtype), wheel_inertia=jnp.ones((), sag.dtype))
 
 
 def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
@@ -195,7 +198,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
 
     forward, left, normal = under.contact_axes
     mass, inertia, com = mass_distribution(model, params, world)
-    stiffness, damping = suspension(params.body.mass, carried_sag(model, world))
+    stiffness, damping = suspension(params.body.mass, carried_sag(model, world), world.damping)
     smooth = SMOOTH_LOAD * params.body.mass * GRAVITY / 4  # [N]
     load = stiffness * (spec.wheel_radius - under.height) - damping * along(normal)
     return Motion(
@@ -215,7 +218,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         spin=state.qvel[6:8],
         drive_torque=jnp.zeros(2),
         yielding=Yielding.none(),
-        wheel_inertia=jnp.asarray(spec.wheel_inertia),
+        wheel_inertia=jnp.asarray(spec.wheel_inertia) * world.wheel_inertia,
         total_mass=mass,
         com=com,
         yaw_inertia=inertia[2],
@@ -231,15 +234,22 @@ def softplus(value: jax.Array) -> jax.Array:
     return jnp.maximum(value, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(value)))
 
 
-def suspension(mass: jax.Array, sag: jax.Array | float = STATIC_SAG) -> tuple[jax.Array, jax.Array]:
+def suspension(
+    mass: jax.Array, sag: jax.Array | float = STATIC_SAG, ratio: jax.Array | float = DAMPING_RATIO
+) -> tuple[jax.Array, jax.Array]:
     """Stiffness [N/m] and damping [N s/m] of each of the four contacts: `sag` under a quarter of the weight."""
     stiffness = mass * GRAVITY / (4 * sag)
-    return stiffness, 2 * DAMPING_RATIO * jnp.sqrt(stiffness * mass / 4)
+    return stiffness, 2 * ratio * jnp.sqrt(stiffness * mass / 4)
 
 
 def carried_sag(model: VehicleModel, world: World) -> jax.Array:
-    """The sag [m], or the least one that physics steps of this length carry (0.2 mm at 5 ms, 3.2 mm at 20 ms)."""
-    return jnp.maximum(world.sag, LEAST_SAG * model.config.physics_dt**2)
+    """The sag [m], or the least one that physics steps of this length carry: 0.2 mm at 5 ms, 3.2 mm at 20 ms.
+
+    A spring damped by the ratio z is stable while (z + sqrt(1 + z^2)) omega dt < 2, so that more damping takes more.
+    """
+    ratio = jnp.maximum(world.damping, DAMPING_RATIO)
+    more = ((ratio + jnp.sqrt(1 + ratio**2)) / (DAMPING_RATIO + (1 + DAMPING_RATIO**2) ** 0.5)) ** 2
+    return jnp.maximum(world.sag, LEAST_SAG * more * model.config.physics_dt**2)
 
 
 def generalised_force(motion: Motion, wrench: Wrench) -> jax.Array:

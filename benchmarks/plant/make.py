@@ -7,14 +7,14 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zlib import crc32
 
 import numpy as np
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import VEHICLES, Chair, Nominal
+from benchmarks.plant.chair import SLOW, VEHICLES, Chair, Contact, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.sensors import odometry, outside_pose
@@ -43,12 +43,13 @@ class Setting:
     seed: int
     noise: float
     chair: Chair
+    contact: Contact = SLOW
 
 
 def make_log(
     out: Path | str, effects: Mapping[str, float] | None = None, seed: int = 0, noise: float = 1.0, day: bool = True,
     ground_truth: bool = True, manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
-    answers: Path | str | None = None, processes: int = 1, vehicle: str = "chair",
+    answers: Path | str | None = None, processes: int = 1, vehicle: str = "chair", contact: Contact = SLOW,
 ) -> Path:  # fmt: skip
     """Drive a dataset and write it; returns its folder. The same arguments give the same files.
 
@@ -64,12 +65,14 @@ def make_log(
         answers: file that tells what was driven; it must lie outside `out`.
         processes: 1 drives here, more in as many processes.
         vehicle: of `chair.VEHICLES`.
+        contact: how the contacts are computed.
 
     Raises:
         ValueError, FileExistsError: naming the value, the rule and the remedy.
     """
     out = Path(out)
     setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates, vehicle)
+    setting = replace(setting, contact=contact)
     if out.exists():
         raise FileExistsError(f"{out}: exists. Name a new folder, or delete this one.")
     if answers is not None and Path(answers).resolve().is_relative_to(out.resolve()):
@@ -137,7 +140,7 @@ Result = tuple[str, np.ndarray, np.ndarray]
 
 def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
     """Drive trials one after the other; each has random numbers of its own."""
-    plant = Plant(setting.chair)
+    plant = Plant(setting.chair, setting.contact)
     noise = Noise().of(setting.chair).scaled(setting.noise)
     results = []
     for job in jobs:

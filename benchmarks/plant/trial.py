@@ -9,9 +9,8 @@ import mujoco
 import numpy as np
 
 from benchmarks.plant.base import TICK, Effect, Load, Moment
-from benchmarks.plant.chair import TIMESTEP, Chair, Nominal, build
+from benchmarks.plant.chair import SLOW, Chair, Contact, Nominal, build
 
-SUBSTEPS = round(TICK / TIMESTEP)
 REPORT = 0.05  # s between rows of odometry and outside pose
 ROLLING = 0.4  # rad/s, both wheels' speeds together: a slower chair feels less of the road, one at rest nothing
 ENCODER = 2 * math.pi / 4096  # rad per tick
@@ -69,16 +68,17 @@ class Drive:
 class Plant:
     """A chair ready to drive: its model is compiled and settled once."""
 
-    def __init__(self, chair: Chair) -> None:
-        self.chair, self.model = chair, build(chair)
+    def __init__(self, chair: Chair, contact: Contact = SLOW) -> None:
+        self.chair, self.model = chair, build(chair, contact)
+        self.substeps = round(TICK / contact.timestep)
         self.data = mujoco.MjData(self.model)
         joint = {name: self.model.joint(name) for name in ("wheel_left", "wheel_right")}
         motor = [f"rotor_{side}" if chair.play else f"wheel_{side}" for side in ("left", "right")]
         self.wheel_q = [int(joint[name].qposadr[0]) for name in joint]
         self.wheel_v = [int(joint[name].dofadr[0]) for name in joint]
         self.motor_v = [int(self.model.joint(name).dofadr[0]) for name in motor]
-        brake = min(20.0, 0.9 * float(self.model.dof_M0[self.wheel_v].min()) / TIMESTEP)  # N m s/rad: stable
-        for _ in range(round(1.0 / TIMESTEP)):
+        brake = min(20.0, 0.9 * float(self.model.dof_M0[self.wheel_v].min()) / contact.timestep)  # N m s/rad: stable
+        for _ in range(round(1.0 / contact.timestep)):
             self.data.qfrc_applied[self.wheel_v] = -brake * self.data.qvel[self.wheel_v]  # brakes on
             mujoco.mj_step(self.model, self.data)
         self.rest = self.data.qpos.copy()
@@ -146,7 +146,7 @@ class Plant:
             applied[left_m] += left
             applied[right_m] += right
             torques[k] = left, right
-            mujoco.mj_step(model, data, SUBSTEPS)
+            mujoco.mj_step(model, data, self.substeps)
         return _record(chair, t, qpos, qvel, torques, self.wheel_q)
 
     def _place(self, start: tuple[float, float, float]) -> None:

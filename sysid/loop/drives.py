@@ -19,6 +19,7 @@ from whill_mjx.parameters import get_values, set_values
 from whill_mjx.types import parameters_of
 
 SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
+RECORD_DT = 0.025  # s between recorded states: bins of motion are ten times as long
 ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
 CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
 ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
@@ -142,7 +143,7 @@ class Drives:
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
-        batch, measured = make_batch(trials, dt)
+        batch, measured = make_batch(trials, dt, RECORD_DT)
         features = make_features(trials, self.features.width)
         courses = _courses(batch, self.courses.room, self.courses.shared)
         return Drives(trials, self.names, self.paths, batch, courses, measured, features,
@@ -177,7 +178,7 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     `width`: of the bins [s]; by default what the outside poses allow (`bin_width`).
     `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
     """
-    batch, measured = make_batch(trials, plant.dt)
+    batch, measured = make_batch(trials, plant.dt, RECORD_DT)
     names = tuple(names)
 
     def vehicle(values: Any) -> Any:

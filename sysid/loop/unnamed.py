@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.log import Trial
-from sysid.loop.drives import Drives, make_drives
+from sysid.loop.drives import RECORD_DT, Drives, make_drives
 from sysid.loop.tables import (
     Products,
     Table,
@@ -345,7 +345,7 @@ def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
 def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
     held-out ones too: nothing else tells it."""
-    batch, measured = make_batch(trials, result.plant.dt)
+    batch, measured = make_batch(trials, result.plant.dt, RECORD_DT)
     replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
     seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])
     error = np.square((np.asarray(seen.odometry) - measured.odometry) * measured.odometry_mask)[..., 3:]

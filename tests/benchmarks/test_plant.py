@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import plant
 from benchmarks.plant.__main__ import main
-from benchmarks.plant.chair import VEHICLES, Chair
+from benchmarks.plant.chair import COULOMB, SLOW, VEHICLES, Chair
 from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import channels, read
 from benchmarks.plant.effects import EFFECTS, in_proportion
@@ -31,6 +31,22 @@ def drive(messages, noise=0.0, effects=(), chair=None, start=(0.0, 0.0, 0.5), se
 
 def contents(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_skidding_tyre_gives_its_friction_times_its_load():
+    """Brakes that lock the rear wheels: m a = mu N, N = m (g x_front - a h) / wheelbase."""
+    grip, stop = Chair(friction=0.6), np.array([[0.0, 0, 0], [0.1, 0.9, 0], [2.5, 0, 0], [3.5, 0, 0]])
+    h, front = 0.151 + 0.1325, 0.45 - 0.145  # of the centre of mass above the floor, behind the front wheels [m]
+    expected = 0.6 * 9.81 * front / (0.45 + 0.6 * h)
+    braking = {}
+    for contact in (COULOMB, SLOW):
+        log = Plant(grip, contact).drive(stop, (0.0, 0.0, 0.0), [], Noise().scaled(0.0), np.random.default_rng(0))
+        wheel = np.gradient(log.encoder.mean(1), 0.004) * 0.1325
+        skids = (log.t > 2.55) & (log.speed[:, 0] > 0.15) & (log.speed[:, 0] - wheel > 0.08)
+        assert skids.sum() > 20
+        braking[contact] = -np.polyfit(log.t[skids], log.speed[skids, 0], 1)[0]
+    assert braking[COULOMB] == pytest.approx(expected, rel=0.04)
+    assert braking[SLOW] < braking[COULOMB]
 
 
 def test_constant_speed_is_free_of_chatter():

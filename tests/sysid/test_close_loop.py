@@ -308,7 +308,7 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
     assert error(alone) < error(before)
     beside = refit_poses(plain, before, iterations=4)
     added = {one.name for one in beside.effects} - {one.name for one in before.effects}
-    assert added == {"axle_pivot", "lateral_damping", "suspension", "sensor_delay"}
+    assert added == {"axle_pivot", "lateral_damping", "suspension", "sensor_delay", "wheel_inertia"}
     assert error(beside) < error(before) and float(beside.body.com_z) != float(before.body.com_z)
     assert {one.name for one in alone.effects} == {one.name for one in before.effects}
 

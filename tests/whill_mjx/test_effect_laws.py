@@ -298,6 +298,15 @@ def test_a_late_reading_is_that_of_an_earlier_time(delay):
 
 
 @quick
+def test_speeds_may_be_older_than_the_pose_they_come_with():
+    true = path(*SPEEDS)
+    late = run(make_effect("sensor_delay", delay=0.02, speed=0.015), true)
+    for field, age in (("x", 0.02), ("y", 0.02), ("yaw", 0.02), ("v", 0.035), ("omega", 0.035)):
+        expected = np.interp(TIMES[100:] - age, TIMES, np.asarray(getattr(true, field)))
+        np.testing.assert_allclose(getattr(late, field)[100:], expected, atol=1e-3, err_msg=field)
+
+
+@quick
 @pytest.mark.parametrize("offset", [-0.04, 0.04])
 def test_a_clock_offset_shifts_the_odometry_either_way(offset):
     true = path(*SPEEDS)

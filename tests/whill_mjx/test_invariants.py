@@ -193,7 +193,8 @@ def test_energy_never_grows_without_input():
                 mass, inertia, com = mass_distribution(model, params, motion.world)
                 under = footing(motion.world, motion.rotation, state.qpos[:3], spec.wheel_radius)
                 return {"rotation": motion.rotation, "mass": mass, "inertia": inertia, "com": com,
-                        "gravity": motion.world.gravity, "compression": spec.wheel_radius - under.height}  # fmt: skip
+                        "gravity": motion.world.gravity, "wheels": jnp.asarray(motion.world.wheel_inertia),
+                        "compression": spec.wheel_radius - under.height}  # fmt: skip
 
             return jax.lax.scan(record, state, jnp.zeros((60, 10, 2)))[1]
 
@@ -217,7 +218,7 @@ def mechanical_energy(model, qpos, qvel, seen):
     arm = np.einsum("...ij,...j->...i", seen["rotation"], seen["com"])
     speed = qvel[..., :3] + np.einsum("...ij,...j->...i", seen["rotation"], np.cross(rate, seen["com"]))
     mass = seen["mass"]
-    spinning = model.wheels.armature * (spin**2).sum(-1)
+    spinning = model.wheels.armature * seen["wheels"] * (spin**2).sum(-1)
     kinetic = mass * (speed**2).sum(-1) + (seen["inertia"] * rate**2).sum(-1) + spinning
     potential = -mass * (seen["gravity"] * (qpos[..., :3] + arm)).sum(-1)
     return kinetic / 2 + potential + seen["elastic"].sum(-1)

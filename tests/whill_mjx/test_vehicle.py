@@ -164,6 +164,38 @@ def test_springs_are_as_stiff_as_the_physics_step_carries():
     np.testing.assert_allclose(driven(0.02, 0.0003), driven(0.02, 0.0032), atol=1e-6)
 
 
+@pytest.mark.parametrize("dynamics", ["fused", "mjx"])
+def test_a_heavy_wheel_takes_longer_to_spin_up_where_nothing_grips(dynamics):
+    """T / J: on a floor without friction the chassis' mass does not count."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("wheel_inertia",))
+    names = ["slip_traction.mu", "torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "command_delay.delay"]
+    params = set_values(params, names, jnp.array([1e-6, 200.0, 0.0, 1.5, 0.0]))
+    model = build_model(spec, VehicleConfig(physics_dt=0.005, control_dt=0.05, dynamics=dynamics))
+    period = jax.jit(lambda vehicle: drive(model, vehicle, place(model, vehicle, 0.0, 0.0, 0.0), jnp.array([0.9, 0.0])))
+    for ratio in (1.0, 2.5):
+        spin = period(set_values(params, ["wheel_inertia.ratio"], jnp.array([ratio]))).qvel[6:8]
+        np.testing.assert_allclose(spin, 0.05 * 1.5 / (ratio * spec.wheel_inertia), rtol=0.01)
+
+
+def test_a_damped_chair_stops_nodding_sooner():
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("suspension",))
+    model = build_model(spec, VehicleConfig(physics_dt=0.0025, control_dt=0.02))
+    period = jax.jit(lambda vehicle, state: drive(model, vehicle, state, jnp.zeros(2)))
+
+    def swings(damping):
+        vehicle = set_values(params, ["suspension.sag", "suspension.damping"], jnp.array([0.01, damping]))
+        rest = place(model, vehicle, 0.0, 0.0, 0.0)
+        state, heights = dataclasses.replace(rest, qpos=rest.qpos.at[2].add(0.005)), []  # let go 5 mm above its rest
+        for _ in range(20):
+            state = period(vehicle, state)
+            heights.append(float(state.qpos[2] - rest.qpos[2]))
+        return -min(heights)  # how far it swings through
+
+    assert swings(0.1) > 0.0025 > swings(0.4) > 2e-4 > swings(0.95)
+
+
 def test_vmapped_instances_equal_a_loop_with_different_parameters():
     model, params, alone = compiled_period("whill_cr_physical")
     scales = jnp.array([0.8, 1.0, 1.2])

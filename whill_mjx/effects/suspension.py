@@ -13,7 +13,7 @@ from whill_mjx.types import World, parameter
 
 @struct.dataclass
 class Suspension(Effect):
-    """Each contact is a spring that a quarter of the weight compresses by s, with half the critical damping.
+    """Each contact is a spring that a quarter of the weight compresses by s, with zeta times the critical damping.
 
     When drive and brakes pull, a soft chair nods at sqrt(g / s) before its loads have shifted, and its wheels turn with
     the nodding: seen in their speed, it looks like a late command and a high gain. Springs stiffer than the physics
@@ -21,10 +21,11 @@ class Suspension(Effect):
     """
 
     name = "suspension"
-    typical = {"sag": (0.002, 0.01)}
+    typical = {"sag": (0.002, 0.01), "damping": (0.2, 1.0)}
     source = "estimate: below 1 mm for hard wheels, 2 mm for solid tyres, 5 mm for soft ones, 20 mm for a sprung chair"
     sag: jax.Array = parameter("m", 0.0003, 0.02, 0.005, "compression under a quarter of the weight, s")
+    damping: jax.Array = parameter("-", 0.1, 1.0, 0.5, "damping over the critical, zeta")
 
     def world(self, memory: tuple[()], world: World) -> tuple[tuple[()], World]:
         """World for a vehicle on other springs."""
-        return memory, replace(world, sag=self.sag)
+        return memory, replace(world, sag=self.sag, damping=self.damping)
