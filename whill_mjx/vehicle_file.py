@@ -30,6 +30,8 @@ from whill_mjx.types import Body, VehicleParams, parameters_of
 
 SCHEMA = 1
 KIND = "micromobility-vehicle"
+LATER = {"suspension.damping", "sensor_delay.speed"}
+"""Parameters that earlier files do not have: where they are absent they are neutral."""
 
 
 def save_vehicle(
@@ -157,7 +159,7 @@ def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any]) 
         if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
             raise ValueError(f"{path}: {holder}.{name} is {value!r}; it must be a number.")
         values[name] = float(value)
-    missing = set(known) - set(values)
+    missing = {name for name in set(known) - set(values) if f"{holder}.{name}" not in LATER}
     if missing:
         raise ValueError(f"{path}: {holder} lacks {', '.join(sorted(missing))}. Give a value and a unit for each.")
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), kind(**values))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import pytest
 
+from sysid.models import with_effects
 from whill_mjx.presets import preset
 from whill_mjx.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
@@ -52,6 +53,22 @@ def test_a_bad_file_is_refused_with_its_name_and_the_rule(saved, old, new, messa
     saved.write_text(text.replace(old, new, 1))
     with pytest.raises(ValueError, match=message):
         load_vehicle(saved)
+
+
+def test_a_file_from_before_a_parameter_was_added_has_it_neutral(tmp_path):
+    spec, params = preset("whill_cr_physical")
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, with_effects(params, ("suspension", "sensor_delay")))
+    text = path.read_text()
+    for name in ("damping", "speed"):
+        first = text.index(f"[effects.parameters.{name}]")
+        text = text[:first] + text[first:].partition("\n\n")[2]
+    assert "parameters.damping" not in text and "parameters.sag" in text and "parameters.delay" in text
+    path.write_text(text)
+    effects = {effect.name: effect for effect in load_vehicle(path)[1].effects}
+    assert float(effects["suspension"].damping) == 0.5 and float(effects["sensor_delay"].speed) == 0.0
+    path.write_text(text.replace("[effects.parameters.sag]", "[effects.parameters.damping]"))
+    with pytest.raises(ValueError, match="suspension"):
+        load_vehicle(path)
 
 
 def test_a_missing_file_tells_how_to_make_one(tmp_path):
