@@ -14,7 +14,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from sysid import command_line, frames, gradient, starts, tpe, uncertainty
+from sysid import command_line, frames, gradient, slopes, starts, tpe, uncertainty
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -326,7 +326,7 @@ def expected_steps(config: FitConfig) -> int:
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
-    elsewhere = FIRST + 5 * min(LOOK, iterations) if config.elsewhere else 0
+    elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
     return first + (iterations + elsewhere if config.method not in GLOBAL else 0)
 
 
