@@ -7,7 +7,7 @@
     python -m benchmarks.fit --parts many_starts --work runs/fit                # any that was stopped. On a GPU
     python -m benchmarks.fit --parts coverage starts tpe searches many_starts --collect --work runs/fit  # the figures
 
-On one core a synthetic log takes 55 s, one of the plant 2 min, a start 5 min, a search by features 5 min and by TPE or
+On one core a synthetic log takes 150 s, one of the plant 4 min, a start 5 min, a search by features 5 min and by TPE or
 CMA-ES 1 min, the 500 trials of TPE half a minute and four such searches one by one 75 s; the first process compiles
 for all, 90 s and 3 GB for each kind of log.
 Writes benchmarks/results/fit.json and, for drive and mrclam, measured.json. A "gain" is the share of
