@@ -227,7 +227,7 @@ def fit_ours(log: Log, settings: Peer) -> tuple[Curve, dict[str, float], float]:
     def search(objective: Any) -> np.ndarray:
         if settings.known:
             return gradient.fit(objective, space, iterations=settings.iterations, robust=True).u
-        points = starts.draw(objective, [0], 0)
+        points = starts.draw(objective, [0], log.spec.track, 0)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS)
         return gradient_search(objective, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
 

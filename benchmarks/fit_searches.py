@@ -75,20 +75,20 @@ def start_job(
         return {**stage(), "seconds": time.perf_counter() - began}
 
     def draw() -> dict[str, Any]:
-        return {"u": starts.draw(problem.objective, [index], seed, progress=report)[0].tolist()}
+        return {"u": starts.draw(problem.objective, [index], track, seed, progress=report)[0].tolist()}
 
     def features() -> dict[str, Any]:
         found = starts.fit(problem.objective, np.array([drawn["u"]]), track, FEATURE_ITERATIONS, report)
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
-    def poses() -> dict[str, Any]:
-        found, _, _ = gradient_search(problem.objective, problem.space, np.array([coarse["u"]]), iterations,
-                                      FitConfig(), report)
+    def whitened() -> dict[str, Any]:
+        told = make_features_objective(problem.objective, track).renewed(np.array(coarse["u"]))
+        found, _, _ = gradient_search(told, problem.space, np.array([coarse["u"]]), iterations, FitConfig(), report)
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
     drawn = staged(folder / f"{label}_drawn.json", lambda: timed(draw))
     coarse = staged(folder / f"{label}_features.json", lambda: timed(features))
-    fine = timed(poses)
+    fine = timed(whitened)
     return {"cost": fine["cost"], "coarse_cost": coarse["cost"], "u": fine["u"], "start": drawn["u"],
             "names": list(problem.space.names), "evaluations": coarse["evaluations"] + fine["evaluations"],
             "seconds": sum(one["seconds"] for one in (drawn, coarse, fine))}
@@ -164,7 +164,7 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int) -> 
     """Costs and seconds of `count` starts at once, each drawn, fitted to features and then to poses; and of the whole
     default search, which goes on from the best of them and looks elsewhere."""
     report, began = reporter(f"{count} starts"), time.perf_counter()
-    points = starts.draw(problem.objective, range(count), 0, progress=report)
+    points = starts.draw(problem.objective, range(count), track, 0, progress=report)
     drawn = time.perf_counter()
     coarse = starts.fit(problem.objective, points, track, FEATURE_ITERATIONS, report)
     fitted = time.perf_counter()

@@ -21,7 +21,8 @@ from sysid.log import Trial
 from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
 
 INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
-SETS = 4  # parameter sets replayed together there: one compilation serves them all
+SETS = 4  # parameter sets replayed together there: one compilation serves all tries of a search
+MANY = 64  # sets from which as many are replayed together as fill the cache, by half as fast again: one more compilation
 
 
 class CourseReplay:
@@ -53,18 +54,24 @@ class CourseReplay:
                         odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
-        self._replay, self._compiled = Replay(plant, whole, set_values), False
+        self._replay, self._compiled = Replay(plant, whole, set_values), set[int]()
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
         if not on_processor():
             return self._spread(self._replay.simulate(values), motion=True)
-        rows, count = int(np.clip(INSTANCES // self.courses, 1, SETS)), len(values)
-        values = np.concatenate([values, np.repeat(values[-1:], -count % rows, axis=0)])
-        parts = on_all_cores(lambda i: self._spread(self._replay.simulate(values[i : i + rows]), motion=True),
-                             range(0, len(values), rows), self._compiled)
-        self._compiled = True
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+        full, parts = int(np.clip(INSTANCES // self.courses, 1, MANY)), []
+        few = min(full, SETS)
+        whole = len(values) // full * full if len(values) >= MANY else 0
+        for rows, some in ((full, values[:whole]), (few, values[whole:])):
+            padded = np.concatenate([some, np.repeat(values[-1:], -len(some) % rows, axis=0)])
+            found = on_all_cores(lambda i, rows=rows, padded=padded: self._spread(  # type: ignore[misc]
+                self._replay.simulate(padded[i : i + rows], rows), motion=True), range(0, len(padded), rows),
+                rows in self._compiled)
+            if found:
+                self._compiled.add(rows)
+                parts.append(jax.tree.map(lambda *leaves, size=len(some): np.concatenate(leaves)[:size], *found))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from sysid import command_line, frames, gradient, slopes, starts, tpe, uncertainty
+from sysid.feature_objective import make_features_objective
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -29,7 +30,7 @@ from sysid.models import (
     set_parameters,
     with_effects,
 )
-from sysid.objective import Noise, Objective, estimate_noise
+from sysid.objective import Noise, Objective, Told, estimate_noise
 from sysid.prior import SPREAD, Prior, make_prior
 from sysid.profiles import Profile, check_names, profile
 from sysid.report import error_rows, parameter_table, table, write_html, write_report
@@ -167,26 +168,30 @@ def fit_log(
                        method="cmaes" if config.method == "cmaes" else "tpe")
         points = np.concatenate([points[:1], scan.starts])[:count]
     elif config.method == "features":
-        points = starts.draw(objective, range(config.starts), config.seed, progress=progress)
+        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
+    told: Told = objective
+    if config.method == "features":
+        told = make_features_objective(objective, log.spec.track).renewed(points[0])
     if config.vehicle is not None and config.method not in GLOBAL:
-        share = uncertainty.inflation(objective, points[0])
-        objective = replace(objective, prior=replace(make_prior(space, given.intervals, config.spread), share=share))
+        share = uncertainty.inflation(told, points[0])
+        told = replace(told, prior=replace(make_prior(space, given.intervals, config.spread), share=share))  # type: ignore[type-var]
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, objective, profiles = gradient_search(objective, space, points, iterations, config, progress)
+        search, told, profiles = gradient_search(told, space, points, iterations, config, progress)
         u, final_cost = search.u, search.cost
-        first = objective.residuals(space.to_unit(space.initial)[None])
-        initial_cost = float(gradient.robust_cost(first, config.robust)[0]) / objective.counted
-    known = uncertainty.estimate(objective, u, robust=config.robust and config.method not in GLOBAL)
-    traced = profile(objective, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+        first = told.residuals(space.to_unit(space.initial)[None])
+        initial_cost = float(gradient.robust_cost(first, config.robust)[0]) / told.counted
+    known = uncertainty.estimate(told, u, robust=config.robust and config.method not in GLOBAL)
+    traced = profile(told, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, objective.prior, model, tuple(traced), given.frame)
+               profiles, time.perf_counter() - began, plant, told.prior, model, tuple(traced), given.frame)
 
 
 @dataclass(frozen=True)
@@ -233,6 +238,9 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         params = preset_params(log.spec, config.preset) if params is None else params
         params = with_effects(params, (*config.effects, *(() if given else measured_effects(params, log.spec, trials))))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+    plant = replace(plant, frame=frame)
+    if frame is not None and frames.AGE in space.names and frames.AGE not in config.parameters:
+        space = space.without(frames.AGE, "speeds are those of the odometry's frames")
     objective = make_objective(plant, params, space, trials, estimate_noise(frames.at_frames(log.training, frame)))
     return Problem(plant, params, space, objective, intervals, model, frame)
 

@@ -25,6 +25,7 @@ CHUNK = 2.0  # s of one trial that the first search takes together
 PHASES = 8  # that are tried
 FINER = 8  # times so many in the last search
 TRIALS = 12  # that are looked at
+AGE = "sensor_delay.speed"  # what stands for the frames of speeds where they do not show
 EXPLAINED = 0.5  # share of the squared steps that frames must explain
 SAME = 0.01  # of them: what two rates may differ by and be as good
 

@@ -95,7 +95,7 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
         return ()
     rolling: tuple[str, ...] = ("suspension",)
     if spec.drive != "skid":
-        loss = ("rolling_resistance_speed",) if losses else ()
+        loss = ("wheel_damping",) if losses else ()
         rolling = ("axle_pivot", "lateral_damping", *loss, "suspension", "wheel_inertia")
     both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
     return (*rolling, "sensor_delay") if both else rolling

@@ -58,6 +58,32 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates")
 
 
+class Told(Protocol):
+    """`Objective`, or `sysid.feature_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def trials(self) -> tuple[Trial, ...]: ...
+
+    @property
+    def prior(self) -> Prior | None: ...
+
+    @property
+    def counted(self) -> int: ...
+
+    def residuals(self, u: np.ndarray) -> np.ndarray: ...
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def renewed(self, u: np.ndarray) -> Any: ...
+
+    def pieces(self, count: int) -> np.ndarray: ...
+
+    def own_frame(self, residual: np.ndarray) -> np.ndarray: ...
+
+
 class Replays(Protocol):
     """`sysid.rollout.Replay`, or what stands in for it."""
 
@@ -139,7 +165,7 @@ class Objective:
     def residuals(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
         """(N, B, K) whitened residuals; masked samples are 0. K counts pose, odometry and start-pose terms."""
         residual, _ = self._whiten(self.simulate(u) if simulated is None else simulated, None)
-        return residual if self.prior is None else _append(residual, self.prior.residual(u))
+        return residual if self.prior is None else append_prior(residual, self.prior.residual(u))
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K) and their derivatives by u (N, B, K, P)."""
@@ -150,7 +176,28 @@ class Objective:
         if self.prior is None:
             return residual, jacobian
         slope = np.tile(np.diag(self.prior.slope), (len(u), 1, 1))
-        return _append(residual, self.prior.residual(u)), _append(jacobian, slope)
+        return append_prior(residual, self.prior.residual(u)), append_prior(jacobian, slope)
+
+    def renewed(self, u: np.ndarray) -> Objective:
+        """The same with the noise that u (P,) leaves, where it was not known."""
+        return self.with_noise(self.residual_noise(u)) if self.noise.source == "defaults" else self
+
+    def pieces(self, count: int) -> np.ndarray:
+        """(K,) in which of so many pieces of its drive each residual is, errors of starts apart."""
+        tables = (self.measured.pose, self.measured.odometry)
+        piece = np.concatenate([np.repeat(np.arange(table.shape[1]) * count // max(table.shape[1], 1), table.shape[2])
+                                for table in tables])
+        return piece
+
+    def own_frame(self, residual: np.ndarray) -> np.ndarray:
+        """(B, K) residuals of pose and odometry; those of the outside position along and across the start's heading."""
+        tables = (self.measured.pose, self.measured.odometry)
+        sizes = [table[0].size for table in tables]
+        pose = residual[:, : sizes[0]].reshape(tables[0].shape)
+        yaw = np.array([trial.start.yaw for trial in self.trials])[:, None]
+        x, y = pose[..., 0], pose[..., 1]
+        turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
+        return np.concatenate([*turned, residual[:, sizes[0] : sum(sizes)]], axis=1)
 
     def residual_noise(self, u: np.ndarray) -> Noise:
         """Noise re-estimated as the size of the residual (robustly) at one point u (P,)."""
@@ -263,7 +310,7 @@ def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np
     return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
 
 
-def _append(table: np.ndarray, more: np.ndarray) -> np.ndarray:
+def append_prior(table: np.ndarray, more: np.ndarray) -> np.ndarray:
     """Table (N, B, K, ...) with more (N, P, ...) behind the columns of its first trial and zeros behind the others'."""
     xp = namespace(table)
     behind = added(xp.zeros((*table.shape[:2], *more.shape[1:])), (slice(None), 0), more)

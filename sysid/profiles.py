@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid import gradient
-from sysid.objective import Objective
+from sysid.objective import Told
 from sysid.result import Progress
 from sysid.space import Space
 from sysid.uncertainty import Uncertainty
@@ -60,7 +60,7 @@ class Profile:
 
 
 def profile(
-    objective: Objective, u: np.ndarray, known: Uncertainty, names: Sequence[str], *, points: int = POINTS,
+    objective: Told, u: np.ndarray, known: Uncertainty, names: Sequence[str], *, points: int = POINTS,
     iterations: int = ITERATIONS, robust: bool = False, progress: Progress | None = None,
 ) -> list[Profile]:
     """Profile likelihoods at the fitted point u (P,), all points of a grid searched together.
@@ -129,7 +129,7 @@ def crossings(values: np.ndarray, statistic: np.ndarray, threshold: float) -> tu
     return cross(range(middle - 1, -1, -1)), cross(range(middle + 1, len(values)))
 
 
-def _scale(objective: Objective, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -> np.ndarray:
+def _scale(objective: Told, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -> np.ndarray:
     """(P,) by how much squares over-count: sandwich variance over that of independent residuals of variance 1."""
     _, jacobian = (array[0] for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)

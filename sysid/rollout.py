@@ -24,7 +24,7 @@ from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
-from whill_mjx.effects import PoseDelay, SensorDelay
+from whill_mjx.effects import OdometryLag, PoseDelay, SensorDelay
 from whill_mjx.specs import VehicleSpec
 
 WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
@@ -52,6 +52,9 @@ class Plant:
     """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
     substeps: Callable[[Any, Any, jax.Array], Any] | None = None
     """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
+    frame: float | None = None
+    """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed once
+    a frame."""
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
@@ -191,9 +194,9 @@ class Replay:
         other.__dict__ = {**self.__dict__, "_batch": batch}
         return other
 
-    def simulate(self, values: np.ndarray) -> Simulated:
-        """Replay with each of values (N, P); leaves gain the axis N in front."""
-        return self._call(self._simulate, values)
+    def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
+        """Replay with each of values (N, P); leaves gain the axis N in front. `size`: rows that are computed."""
+        return self._call(self._simulate, values, size)
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""
@@ -203,10 +206,10 @@ class Replay:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
         return self._call(self._jacobian, values)
 
-    def _call(self, function: Any, values: np.ndarray) -> Any:
+    def _call(self, function: Any, values: np.ndarray, size: int | None = None) -> Any:
         count = len(values)
         sizes = self._sizes[function]
-        size = min((size for size in sizes if size >= count), default=count)
+        size = size or min((size for size in sizes if size >= count), default=count)
         sizes.add(size)
         padded = np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
         output = function(jnp.asarray(padded, jnp.result_type(float)), self._batch)
@@ -241,6 +244,7 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
         return state, plant.observe(state)
 
     params, latency = _without_latency(params)
+    params, lag = _without_lag(params) if plant.frame else (params, None)
     state = plant.place(params, start)
     if warm_up:
         state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
@@ -250,6 +254,8 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     gap = plant.dt * command.shape[1]
+    if lag is not None and plant.frame:
+        path = path.at[:, SPEEDS].set(_framed(path[:, SPEEDS], lag, plant.frame, gap))
     if latency is not None:
         path = path.at[:, ODOMETRY].set(_late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
@@ -270,6 +276,44 @@ def _without_latency(params: Any) -> tuple[Any, tuple[jax.Array, jax.Array] | No
         return params, None
     return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), (
         last[0].delay, last[0].delay + last[0].speed)
+
+
+def _without_lag(params: Any) -> tuple[Any, jax.Array | None]:
+    """The vehicle without the low-pass of its reported speeds, where that comes last, and its time constant [s]."""
+    effects = params.effects if hasattr(params, "effects") else ()
+    last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
+    if not last or getattr(last[0], "name", "") != OdometryLag.name:
+        return params, None
+    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0].time_constant
+
+
+def _framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float) -> jax.Array:
+    """Speeds (R, 2) as an odometry reports them that is computed once a period [s], of true ones every `dt` [s].
+
+    What counts of an encoder tell is the mean over the period; the low-pass goes on by one step in each. Given as if
+    there were a frame at every record: rows are taken at the times of their frames.
+    """
+    ways = jnp.concatenate([jnp.zeros((1, 2), speeds.dtype), jnp.cumsum((speeds[1:] + speeds[:-1]) / 2 * dt, axis=0)])
+    back = period / dt
+    whole = math.floor(back + 1e-6)
+    part = max(back - whole, 0.0)
+
+    def before(values: jax.Array) -> jax.Array:
+        """Values one period ago; the first ones last for ever before them."""
+        padded = jnp.concatenate([jnp.repeat(values[:1], whole + 1, axis=0), values])
+        return padded[1 : 1 + len(values)] * (1 - part) + padded[: len(values)] * part
+
+    # Before its first record the vehicle goes on as it begins: at rest, or at the start's speeds.
+    means = speeds[0] + (ways - before(ways)) / period - speeds[0] * jnp.minimum(jnp.arange(len(ways)) / back, 1.0)[:, None]
+    keep = jnp.exp(-period / jnp.maximum(time_constant, 1e-6))
+
+    def step(past: jax.Array, mean: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """One record: `past` (whole + 1, 2) are the filtered speeds of the records before it, newest first."""
+        old = past[whole - 1] * (1 - part) + past[whole] * part
+        new = mean + keep * (old - mean)
+        return jnp.concatenate([new[None], past[:-1]]), new
+
+    return jax.lax.scan(step, jnp.repeat(speeds[:1], whole + 1, axis=0), means)[1]
 
 
 def _late(path: jax.Array, latency: tuple[jax.Array, jax.Array], dt: float) -> jax.Array:

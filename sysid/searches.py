@@ -117,7 +117,7 @@ def trace(
             scan = tpe.fit(watched, space, evaluations=short, seed=seed, cost="weighted", best=1, progress=progress)
             points = np.concatenate([points[:1], scan.starts])
         if method == "features":
-            points = starts.draw(watched, range(start_count), seed)
+            points = starts.draw(watched, range(start_count), track, seed)
             points = starts.fit(watched, points, track, iterations, progress).u[None]
         # As a fit does it, delays included; squares for all, so that the costs are of one kind.
         gradient_search(watched, space, points, iterations, FitConfig(robust=False), progress)

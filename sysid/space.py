@@ -76,10 +76,16 @@ class Space:
         return replace(self, names=tuple(keep), low=self.low[index], high=self.high[index],
                        initial=self.initial[index], log=self.log[index])
 
+    def without(self, name: str, reason: str) -> Space:
+        """The space in which one parameter keeps its value."""
+        kept = self.subset([one for one in self.names if one != name])
+        return replace(kept, fixed=(*self.fixed, (name, reason)))
+
 
 # Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
 FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
            "torque_drive.limit": (1 / 10, 30.0)}
+LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-forward make up for it
 
 
 def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
@@ -87,9 +93,10 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
     a centre of mass between the axles."""
     scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
               for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
+    load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
     middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
-    return {**scaled, "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
-            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
+    return {**scaled, "torque_drive.kff": (0.0, LOSS * load), "wheel_damping.damping": (0.0, LOSS * load),
+            "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4), "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
 
 
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid.gradient import HUBER, huber_weight, robust_cost
 from sysid.metrics import replicate_groups
-from sysid.objective import Objective
+from sysid.objective import Told
 from sysid.sandwich import Variance, sandwich
 from sysid.slopes import average_slopes, likely
 
@@ -75,7 +75,7 @@ class Uncertainty:
 
 
 def estimate(
-    objective: Objective, u: np.ndarray, confidence: float = CONFIDENCE, robust: bool = False
+    objective: Told, u: np.ndarray, confidence: float = CONFIDENCE, robust: bool = False
 ) -> Uncertainty:
     """Intervals of the parameters at the fitted point u (P,).
 
@@ -108,7 +108,7 @@ def estimate(
     within = sandwich(scores.reshape(-1, space.size), blocks.reshape(-1, space.size, space.size), inverse)
     groups = _manoeuvres(objective)
     across = None
-    if shared_error(_own_frame(objective, residual), groups) < CHANCE:
+    if shared_error(objective.own_frame(residual), groups) < CHANCE:
         sums = np.eye(groups.max() + 1)[groups].T  # (C, B)
         across = sandwich(sums @ scores.sum(1), np.einsum("cb,bpq->cpq", sums, blocks.sum(1)), inverse)
     known = inverse @ weak @ inverse * share  # what the prior's own error adds
@@ -132,7 +132,7 @@ def estimate(
     return Uncertainty(tuple(estimates), information, directions, covariance, deviation, quantile)
 
 
-def inflation(objective: Objective, u: np.ndarray) -> float:
+def inflation(objective: Told, u: np.ndarray) -> float:
     """How many times the squared residuals count what they tell: their sum over neighbours against that one by one."""
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
@@ -160,18 +160,7 @@ def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
     return float((1 + (drawn >= pairs.sum()).sum()) / (1 + FLIPS))
 
 
-def _own_frame(objective: Objective, residual: np.ndarray) -> np.ndarray:
-    """(B, K) residuals of pose and odometry; those of the outside position along and across the start's heading."""
-    tables = (objective.measured.pose, objective.measured.odometry)
-    sizes = [table[0].size for table in tables]
-    pose = residual[:, : sizes[0]].reshape(tables[0].shape)
-    yaw = np.array([trial.start.yaw for trial in objective.trials])[:, None]
-    x, y = pose[..., 0], pose[..., 1]
-    turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
-    return np.concatenate([*turned, residual[:, sizes[0] : sum(sizes)]], axis=1)
-
-
-def _manoeuvres(objective: Objective) -> np.ndarray:
+def _manoeuvres(objective: Told) -> np.ndarray:
     """(B,) which trials are replicates of one another, as a number for each."""
     numbers = np.arange(len(objective.trials))
     place = {id(trial): i for i, trial in enumerate(objective.trials)}
@@ -212,16 +201,14 @@ def _width(variance: np.ndarray, freedom: np.ndarray) -> np.ndarray:
 
 
 def _pieces(
-    objective: Objective, jacobian: np.ndarray, residual: np.ndarray, told: np.ndarray
+    objective: Told, jacobian: np.ndarray, residual: np.ndarray, told: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """J^T r (B, PIECES, P) and J^T J (B, PIECES, P, P) of pieces of trials, all channels of a piece together.
 
     Args:
         told: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss tell no curvature.
     """
-    tables = (objective.measured.pose, objective.measured.odometry)
-    piece = np.concatenate([np.repeat(np.arange(table.shape[1]) * PIECES // max(table.shape[1], 1), table.shape[2])
-                            for table in tables])
+    piece = objective.pieces(PIECES)
     piece = np.pad(piece, (0, residual.shape[1] - len(piece)))  # errors of the start belong to the first piece
     parts = [np.flatnonzero(piece == k) for k in range(PIECES)]
     scores = [np.einsum("bkp,bk->bp", jacobian[:, part], residual[:, part]) for part in parts]

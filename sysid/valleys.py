@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid import gradient, slopes
-from sysid.objective import Objective
+from sysid.objective import Told
 from sysid.result import FitResult, Progress
 from sysid.space import Space
 
@@ -25,17 +25,17 @@ VALLEY = 0.05  # share of the cost by which another delay may be worse and still
 FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
 DEAR, FAR = 10.0, 12
 """Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
-FIRST, KEPT, LOOK = 1, 4, 3
+FIRST, KEPT, LOOK = 1, 2, 3
 """Iterations from all of these, how many are searched further, and iterations after which one must be better."""
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
 
 
 def gradient_search(
-    objective: Objective, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
+    objective: Told, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
     progress: Progress | None,
-) -> tuple[FitResult, Objective, list[tuple[str, np.ndarray, np.ndarray]]]:
-    """LM from all starts. Noise scales that are mere defaults are replaced by the residual's size, and LM continues.
+) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
+    """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
     What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
@@ -46,14 +46,15 @@ def gradient_search(
     Nothing of this is done without `config.elsewhere`.
     """
 
-    def search(objective: Objective, starts: np.ndarray, iterations: int) -> FitResult:
+    def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
         return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
                             progress=progress)
 
-    result = search(objective, starts, iterations)
-    if objective.noise.source == "defaults":
-        objective = objective.with_noise(objective.residual_noise(result.u))
-        result = search(objective, result.starts, iterations)
+    def renew(objective: Told, result: FitResult) -> tuple[Told, FitResult]:
+        again = objective.renewed(result.u)
+        return (objective, result) if again is objective else (again, search(again, result.starts, iterations))
+
+    objective, result = renew(objective, search(objective, starts, iterations))
     follow = partial(search, objective)
     if config.elsewhere:
         result = _from_ends(follow, objective, result, iterations, config.robust)
@@ -72,6 +73,9 @@ def gradient_search(
             other = followed[apart][costs[apart].argmin()]
             result = _from_elsewhere(follow, result, other[None], iterations)
     deeper = config.elsewhere
+    if deeper:
+        objective, result = renew(objective, replace(result, starts=result.u[None]))
+        follow = partial(search, objective)
     while deeper:
         result = slopes.descend(objective, result, config.robust, config.seed, progress)
         floor = result.cost
@@ -81,7 +85,7 @@ def gradient_search(
 
 
 def _from_ends(
-    search: Callable[[np.ndarray, int], FitResult], objective: Objective, result: FitResult, iterations: int,
+    search: Callable[[np.ndarray, int], FitResult], objective: Told, result: FitResult, iterations: int,
     robust: bool,
 ) -> FitResult:
     """The result with where searches from those ends of ranges lead that cost little."""

@@ -63,6 +63,8 @@ class World:
     sag: jax.Array | float = 0.005  # () m, compression of each contact under a quarter of the weight
     damping: jax.Array | float = 0.5  # () of the contacts, over the critical
     wheel_inertia: jax.Array | float = 1.0  # () spin inertia of the driven wheels over the nominal
+    sprung: bool = struct.field(pytree_node=False, default=False)
+    """Whether loads are those at the end of a physics step, which any springs allow, or those at its start."""
 
 
 @struct.dataclass
@@ -113,6 +115,8 @@ class Motion:
     contact_vx: jax.Array  # (4,) forward speed of the chassis at the contact patches [m/s]
     contact_vy: jax.Array  # (4,) leftward speed at the contact patches [m/s]
     normal_force: jax.Array  # (4,) suspension force at the contact patches [N]
+    spring_force: jax.Array  # (4,) the same, where a spring would pull as well [N]
+    normal_speed: jax.Array  # (4,) of the chassis at the contact patches, away from the ground [m/s]
     spin: jax.Array  # (2,) speed of the driven wheels, left and right [rad/s]
     drive_torque: jax.Array  # (2,) motor torque on the driven wheels [N m]; zero for the paper's drive
     yielding: Yielding  # of that torque

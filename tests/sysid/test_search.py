@@ -382,7 +382,7 @@ def test_a_fit_gives_a_differential_drive_with_slip_losses_that_rise_with_speed(
 
     physical = preset_params(WHILL_CR, "physical")
     added = measured_effects(physical, WHILL_CR, ())
-    assert {"rolling_resistance_speed", "suspension", "wheel_inertia"} <= set(added)
-    assert set(added) - set(measured_effects(physical, WHILL_CR, (), losses=False)) == {"rolling_resistance_speed"}
+    assert {"suspension", "wheel_damping", "wheel_inertia"} <= set(added)
+    assert set(added) - set(measured_effects(physical, WHILL_CR, (), losses=False)) == {"wheel_damping"}
     assert measured_effects(preset_params(WARTHOG, "physical"), WARTHOG, ()) == ("suspension",)
     assert measured_effects(preset_params(WHILL_CR, "paper"), WHILL_CR, ()) == ()

@@ -22,7 +22,7 @@ from whill_mjx.vehicle import add_payload, drive, measure, nominal_world, place
 
 DRIVES = {"pid_drive", "torque_drive"}  # no disturbances: without them nothing drives
 BASE = {"air_drag", "axle_pivot", "forward_slip", "lateral_damping", "odometry_lag", "rolling_contact",
-        "rolling_resistance", "slip_traction", "suspension", "wheel_inertia"}  # fmt: skip
+        "rolling_resistance", "slip_traction", "suspension", "wheel_damping", "wheel_inertia"}  # fmt: skip
 OUTSIDE = {"pose_delay"}  # act on whole recorded paths: test_effect_pose_delay.py
 CATALOGUE = sorted(set(EFFECTS) - DRIVES - OUTSIDE)
 NAMED = {

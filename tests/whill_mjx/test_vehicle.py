@@ -142,8 +142,9 @@ def test_suspension_carries_the_weight_and_shifts_it_towards_the_centre_of_mass(
     assert load[0] > load[1]  # centre of mass to the left
 
 
-def test_springs_are_as_stiff_as_the_physics_step_carries():
-    """Springs of 0.3 mm swing at 181 1/s: steps of 20 ms would let wheels hop, and the chair slide past its stop."""
+def test_physics_steps_of_any_length_carry_springs_of_any_stiffness():
+    """Springs of 0.3 mm swing at 181 1/s, those of 20 um at 700: with loads of the start of the step, steps of 20 ms
+    would let wheels hop, and the chair slide past its stop."""
     spec, params = preset("whill_cr_physical")
     params = with_effects(params, ("suspension",))
 
@@ -157,11 +158,43 @@ def test_springs_are_as_stiff_as_the_physics_step_carries():
                 state = period(vehicle, state, jnp.array(command))
         return np.asarray(reference_pose(model, state.qpos))
 
-    fine = driven(0.0025, 0.0003)
-    for dt, atol in ((0.005, 1e-3), (0.01, 2e-3), (0.02, 5e-3), (0.04, 0.03)):
-        np.testing.assert_allclose(driven(dt, 0.0003), fine, atol=atol)
-    assert np.abs(driven(0.005, 0.0003) - driven(0.005, 0.0032)).max() > 1e-4  # steps of 5 ms carry them
-    np.testing.assert_allclose(driven(0.02, 0.0003), driven(0.02, 0.0032), atol=1e-6)
+    for sag in (0.0003, 0.00002):
+        fine = driven(0.00125, sag)
+        for dt, atol in ((0.005, 1.5e-3), (0.01, 3e-3), (0.02, 8e-3), (0.04, 0.03)):
+            np.testing.assert_allclose(driven(dt, sag), fine, atol=atol)
+    assert np.abs(driven(0.02, 0.0003) - driven(0.02, 0.0032)).max() > 1e-4  # they are not the same
+
+
+def test_stiff_springs_shift_the_load_at_once_by_what_the_pull_asks_for():
+    """m a h / L of the load, with h of the centre of mass above the ground, in the first step of a full pull."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("suspension",))
+    params = set_values(params, ["suspension.sag", "body.com_z", "command_delay.delay"], jnp.array([2e-5, 0.1, 0.0]))
+    model = build_model(spec)
+    state = place(model, params, 0.0, 0.0, 0.0)
+    _, _, rest = forces(model, params, state, jnp.zeros(2))
+    _, force, pulled = forces(model, params, state, jnp.array([1.0, 0.0]))
+    height, mass = spec.wheel_radius + 0.1, float(params.body.mass)
+    expected = float(force[0]) * height / spec.wheelbase
+    shifted = float((pulled.normal_force - rest.normal_force)[:2].sum())
+    assert 100.0 < float(force[0]) < 0.8 * mass * 9.81
+    np.testing.assert_allclose(shifted, expected, rtol=0.15)
+    np.testing.assert_allclose(float(pulled.normal_force.sum()), mass * 9.81, rtol=0.03)
+
+
+def test_bearings_stop_a_wheel_that_nothing_else_holds():
+    """J s' = -d s on a floor without friction: exp(-d t / J)."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("wheel_damping", "suspension"))
+    names = ["slip_traction.mu", "torque_drive.kp", "torque_drive.ki", "wheel_damping.damping"]
+    params = set_values(params, names, jnp.array([0.0, 0.0, 0.0, 0.05]))
+    model = build_model(spec)
+    state = place(model, params, 0.0, 0.0, 0.0)
+    state = state.replace(qvel=state.qvel.at[6:8].set(4.0))
+    for _ in range(20):
+        state = drive(model, params, state, jnp.zeros(2))
+    decay = np.exp(-0.05 / spec.wheel_inertia * 20 * model.config.control_dt)
+    np.testing.assert_allclose(state.qvel[6:8], 4.0 * decay, atol=0.02)
 
 
 @pytest.mark.parametrize("dynamics", ["fused", "mjx"])

@@ -50,6 +50,7 @@ from whill_mjx.effects.track_width import TrackWidth
 from whill_mjx.effects.traction_limit import TractionLimit
 from whill_mjx.effects.turn_efficiency import TurnEfficiency
 from whill_mjx.effects.unnamed import Unnamed
+from whill_mjx.effects.wheel_damping import WheelDamping
 from whill_mjx.effects.wheel_inertia import WheelInertia
 from whill_mjx.effects.wheel_radius_difference import WheelRadiusDifference
 from whill_mjx.effects.wind import Wind
@@ -105,6 +106,7 @@ EFFECTS: dict[str, type[Effect]] = {
         TractionLimit,
         TurnEfficiency,
         Unnamed,
+        WheelDamping,
         WheelInertia,
         WheelRadiusDifference,
         Wind,

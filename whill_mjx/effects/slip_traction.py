@@ -31,8 +31,8 @@ class SlipTraction(Effect):
     typical = {"mu": (0.2, 0.9), "slip_speed": (0.005, 0.1), "side_slip_speed": (0.02, 0.1), "mu_free": (0.0, 0.1)}
     source = "estimate: 0.6 to 0.9 dry, 0.2 to 0.4 wet"
     mu: jax.Array = parameter("-", 0.05, 1.5, 0.0, "friction coefficient of driven wheels")
-    slip_speed: jax.Array = parameter("m/s", 0.001, 2.0, 0.05, "sliding speed along the wheel of half grip, s0")
-    side_slip_speed: jax.Array = parameter("m/s", 0.02, 2.0, 0.05, "sliding speed across the wheel of half grip, s0_y")
+    slip_speed: jax.Array = parameter("m/s", 0.0005, 2.0, 0.05, "sliding speed along the wheel of half grip, s0")
+    side_slip_speed: jax.Array = parameter("m/s", 0.001, 2.0, 0.05, "sliding speed across the wheel of half grip, s0_y")
     mu_free: jax.Array = parameter("-", 0.0, 1.0, 0.0, "sideways friction coefficient of passive wheels")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
@@ -46,7 +46,7 @@ class SlipTraction(Effect):
         relaxation, yielding = motion.dt / motion.wheel_inertia, motion.yielding
         slope = yielding.factor * yielding.slope
         unlimited = yielding.factor * (yielding.slack + yielding.slope * yielding.foreseen)  # [N m] at spin 0
-        free_spin = motion.spin + relaxation * motion.drive_torque
+        free_spin = motion.spin + relaxation * (motion.drive_torque + motion.others.spin_torque)
         ahead = look_ahead(motion)
         forward = ahead.forward
         for _ in range(ROUNDS):

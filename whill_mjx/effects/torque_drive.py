@@ -39,7 +39,10 @@ class DriveMemory:
 
 @struct.dataclass
 class TorqueDrive(Effect):
-    """T = clip(kp e + ki integral of e, +-limit) with e = v_target / r - spin.
+    """T = clip(kp e + ki integral of e + kff v_target / r, +-limit) with e = v_target / r - spin.
+
+    The feed-forward kff makes up for bearings that resist with speed. A controller that is sampled every T seconds has
+    one of ki T / 2: its integral counts every jump of the wanted speed half a sample too long.
 
     e and its integral are those in the middle of the physics step, with the acceleration that this torque gives to
     rolling wheels under the load of the step before: a controller that acts all the time, not once in a step. Where a
@@ -53,12 +56,14 @@ class TorqueDrive(Effect):
     """
 
     name = "torque_drive"
-    typical = {"kp": (2.0, 20.0), "ki": (2.0, 30.0), "limit": (8.0, 30.0)}
+    typical = {"kp": (2.0, 20.0), "ki": (2.0, 30.0), "limit": (8.0, 30.0), "kff": (0.0, 0.2)}
     source = "estimate, for the chair"
     kp: jax.Array = parameter("N m s/rad", 0.1, 200.0, 0.0, "proportional gain")
     ki: jax.Array = parameter("N m/rad", 0.0, 500.0, 0.0, "integral gain")
     limit: jax.Array = parameter("N m", 1.0, 2000.0, float("inf"), "largest torque of one side")
     windup: jax.Array = parameter("-", 0.0, 1.0, 0.0, "rate of the integral while the torque is at its limit")
+
+    kff: jax.Array = parameter("N m s/rad", 0.0, 50.0, 0.0, "feed-forward of the wanted speed")
 
     def init(self) -> DriveMemory:
         none = jnp.zeros(2)
@@ -72,13 +77,14 @@ class TorqueDrive(Effect):
         response = spin_response(motion)
         damping = 1 / (1 + half * self.kp * response)
         last = memory.last
-        gain_of_target = lambda change: by_mode((self.kp + half * self.ki) * change, damping)  # noqa: E731
+        gain_of_target = lambda change: by_mode((self.kp + half * self.ki + self.kff) * change, damping)  # noqa: E731
         integral = memory.integral + motion.dt * self.jump(last, target, gain_of_target)
         # What else than the torque changes the spin [rad/s^2]; bounded, as a wheel that spins up has little inertia.
         largest = self.limit * response.max()
         load = jnp.clip(memory.begun * (motion.spin - memory.expected) / motion.dt, -largest, largest)
-        # T = kp (e - half (response T + load)) + ki (integral + half e), solved for T.
-        wanted = by_mode(self.kp * (error - half * load) + self.ki * (integral + half * error), damping)
+        # T = kp (e - half (response T + load)) + ki (integral + half e) + kff target, solved for T.
+        wanted = self.kp * (error - half * load) + self.ki * (integral + half * error) + self.kff * target
+        wanted = by_mode(wanted, damping)
         torque = jnp.clip(wanted, -self.limit, self.limit)
         gain = by_mode(torque, response)
         acceleration = gain + load
