@@ -87,8 +87,8 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
 
     Speeds and poses tell forces only per mass: the model's mass is nominal, so that its torques and its inertias are
     the chair's times the ratio of the masses. The model's controller acts all the time; the chair's is sampled and
-    holds its torque, which is as quick as a continuous one of a higher gain. Its integral counts every jump of the wanted
-    speed half a tick too long, which is a feed-forward of that speed (Euler and Maclaurin).
+    holds its torque, which is as quick as a continuous one of a higher gain. Its integral counts every jump of the
+    wanted speed half a tick too long, which is a feed-forward of that speed (Euler and Maclaurin).
     """
     from benchmarks.plant.base import TICK
     from benchmarks.plant.chair import build

@@ -22,7 +22,7 @@ from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
 
 INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
 SETS = 4  # parameter sets replayed together there: one compilation serves all tries of a search
-MANY = 64  # sets from which as many are replayed together as fill the cache, by half as fast again: one more compilation
+MANY = 64  # sets from which as many are replayed together as fill the cache: half as fast again, compiled apart
 
 
 class CourseReplay:
@@ -61,17 +61,22 @@ class CourseReplay:
         if not on_processor():
             return self._spread(self._replay.simulate(values), motion=True)
         full, parts = int(np.clip(INSTANCES // self.courses, 1, MANY)), []
-        few = min(full, SETS)
         whole = len(values) // full * full if len(values) >= MANY else 0
-        for rows, some in ((full, values[:whole]), (few, values[whole:])):
-            padded = np.concatenate([some, np.repeat(values[-1:], -len(some) % rows, axis=0)])
-            found = on_all_cores(lambda i, rows=rows, padded=padded: self._spread(  # type: ignore[misc]
-                self._replay.simulate(padded[i : i + rows], rows), motion=True), range(0, len(padded), rows),
-                rows in self._compiled)
-            if found:
-                self._compiled.add(rows)
-                parts.append(jax.tree.map(lambda *leaves, size=len(some): np.concatenate(leaves)[:size], *found))
+        for rows, some in ((full, values[:whole]), (min(full, SETS), values[whole:])):
+            if len(some):
+                parts.append(self._on_cores(some, rows))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    def _on_cores(self, values: np.ndarray, rows: int) -> Simulated:
+        """Replay with each of values (N, P), so many `rows` at a time on each core."""
+        padded = np.concatenate([values, np.repeat(values[-1:], -len(values) % rows, axis=0)])
+
+        def part(first: int) -> Simulated:
+            return self._spread(self._replay.simulate(padded[first : first + rows], rows), motion=True)
+
+        parts = on_all_cores(part, range(0, len(padded), rows), rows in self._compiled)
+        self._compiled.add(rows)
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(values)], *parts)
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""

@@ -62,7 +62,7 @@ class Recorded(Replay):
     def __init__(self, replay: Replay, values: np.ndarray):
         self.seen, self.slope = replay.jacobian(values[None])
 
-    def simulate(self, values: np.ndarray) -> Simulated:
+    def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
         return self.seen
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:

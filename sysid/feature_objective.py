@@ -1,10 +1,10 @@
 """What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself leave.
 
 Disturbances push a vehicle off its course, and a pose adds up all of them: errors of whole poses are correlated over a
-drive, and least squares of them let a few late ones outvote what every moment tells. Motion within a bin of a quarter of
-a second, seen from the vehicle itself, has errors that hardly reach beyond it; a vector autoregression makes them white
-(`sysid.loop.noise`), and where wheels are pulled hard, bins count by the noise that they have there. Least squares of
-those are generalised least squares: no estimate is better, and intervals are what curvature says. Source: Aitken (1936).
+drive, and least squares of them let a few late ones outvote what every moment tells. Motion within a bin of a quarter
+of a second, seen from the vehicle itself, has errors that hardly reach beyond it; a vector autoregression makes them
+white (`sysid.loop.noise`), and where wheels are pulled hard, bins count by the noise that they have there. Least
+squares of those are generalised least squares: intervals are what curvature says. Source: Aitken (1936).
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def make_features_objective(objective: Objective, track: float) -> FeatureObject
     Args:
         track: of the vehicle [m].
     """
-    features = make_features(objective.trials, bin_width(objective.trials))
+    features = make_features(objective.trials, bin_width(objective.trials), counted=True)
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)
     return FeatureObjective(objective.replay, objective.space, objective.trials, track, features, target, features.mask,

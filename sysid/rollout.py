@@ -53,8 +53,8 @@ class Plant:
     substeps: Callable[[Any, Any, jax.Array], Any] | None = None
     """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
     frame: float | None = None
-    """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed once
-    a frame."""
+    """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
+    once a frame."""
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
@@ -304,7 +304,8 @@ def _framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: floa
         return padded[1 : 1 + len(values)] * (1 - part) + padded[: len(values)] * part
 
     # Before its first record the vehicle goes on as it begins: at rest, or at the start's speeds.
-    means = speeds[0] + (ways - before(ways)) / period - speeds[0] * jnp.minimum(jnp.arange(len(ways)) / back, 1.0)[:, None]
+    known = jnp.minimum(jnp.arange(len(ways)) / back, 1.0)[:, None]  # share of the period since then
+    means = (ways - before(ways)) / period + speeds[0] * (1 - known)
     keep = jnp.exp(-period / jnp.maximum(time_constant, 1e-6))
 
     def step(past: jax.Array, mean: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -96,7 +96,8 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
     middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
     return {**scaled, "torque_drive.kff": (0.0, LOSS * load), "wheel_damping.damping": (0.0, LOSS * load),
-            "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4), "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
+            "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
+            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
 
 
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:

@@ -50,11 +50,13 @@ def gradient_search(
         return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
                             progress=progress)
 
-    def renew(objective: Told, result: FitResult) -> tuple[Told, FitResult]:
+    def renew(objective: Told, result: FitResult, starts: np.ndarray) -> tuple[Told, FitResult]:
+        """With the noise that the result leaves, searched again from starts (S, P) where that changes it."""
         again = objective.renewed(result.u)
-        return (objective, result) if again is objective else (again, search(again, result.starts, iterations))
+        return (objective, result) if again is objective else (again, search(again, starts, iterations))
 
-    objective, result = renew(objective, search(objective, starts, iterations))
+    result = search(objective, starts, iterations)
+    objective, result = renew(objective, result, result.starts)
     follow = partial(search, objective)
     if config.elsewhere:
         result = _from_ends(follow, objective, result, iterations, config.robust)
@@ -74,7 +76,9 @@ def gradient_search(
             result = _from_elsewhere(follow, result, other[None], iterations)
     deeper = config.elsewhere
     if deeper:
-        objective, result = renew(objective, replace(result, starts=result.u[None]))
+        given = result
+        objective, result = renew(objective, result, result.u[None])
+        result = replace(result, starts=given.starts, start_costs=given.start_costs, order=given.order)
         follow = partial(search, objective)
     while deeper:
         result = slopes.descend(objective, result, config.robust, config.seed, progress)

@@ -316,7 +316,8 @@ def suspension(
 def carried_sag(model: VehicleModel, world: World) -> jax.Array:
     """The sag [m]; where loads are those at the start of the step, at least the one that physics steps of this length
     carry: 0.2 mm at 5 ms, 3.2 mm at 20 ms."""
-    return world.sag if world.sprung else jnp.maximum(world.sag, LEAST_SAG * model.config.physics_dt**2)
+    least = 0.0 if world.sprung else LEAST_SAG * model.config.physics_dt**2
+    return jnp.maximum(world.sag, least)
 
 
 def generalised_force(motion: Motion, wrench: Wrench) -> jax.Array:

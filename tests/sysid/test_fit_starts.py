@@ -10,10 +10,10 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid import gradient, starts
 from sysid.courses import CourseReplay, make_courses
+from sysid.feature_objective import FeatureObjective, make_features_objective
 from sysid.fit import with_effects
 from sysid.objective import Objective, estimate_noise
 from sysid.rollout import Replay, make_batch
-from sysid.starts import FeatureObjective, make_features_objective
 from whill_mjx.effects import make_effect
 from whill_mjx.parameters import describe, get_values
 from whill_mjx.presets import preset_params
@@ -32,7 +32,7 @@ def poses(unicycle_log) -> Objective:
 
 @pytest.fixture(scope="module")
 def features(poses) -> FeatureObjective:
-    return make_features_objective(poses)
+    return make_features_objective(poses, WHILL_CR.track)
 
 
 @pytest.mark.parametrize("anywhere", [True, False])
@@ -81,9 +81,9 @@ def test_random_starts_in_features_agree_and_lie_where_the_poses_fit_best(poses)
 
 
 def test_a_drawn_start_is_near_the_truth_and_does_not_depend_on_the_others(poses):
-    drawn = starts.draw(poses, [0, 1, 2], seed=3, scan=16)
+    drawn = starts.draw(poses, [0, 1, 2], WHILL_CR.track, seed=3, scan=16)
     np.testing.assert_array_equal(drawn[0], poses.space.to_unit(poses.space.initial))
-    np.testing.assert_allclose(starts.draw(poses, [2], seed=3, scan=16)[0], drawn[2], atol=1e-3)
+    np.testing.assert_allclose(starts.draw(poses, [2], WHILL_CR.track, seed=3, scan=16)[0], drawn[2], atol=1e-3)
     np.testing.assert_allclose(poses.space.to_values(drawn[1:]), [TRUTH, TRUTH], rtol=0.2)
 
 

@@ -10,8 +10,6 @@ from conftest import unicycle_objective
 
 from sysid import gradient, uncertainty
 from sysid.log import Command, Start, Trial
-from sysid.objective import Noise
-from sysid.rollout import Measured
 from sysid.sandwich import sandwich
 from sysid.space import Space
 
@@ -28,10 +26,6 @@ class Linear:
         # Twos are replicates: 0_1, 0_2, 1_1, ...
         self.trials = tuple(drive(i // 2, i % 2 + 1) for i in range(len(design)))
         self.prior = None
-        mask = np.ones((*design.shape[:2], 1))
-        none = np.zeros((len(design), 0, 3))
-        self.measured = Measured(none, none, 0 * mask, mask)
-        self.noise = Noise(np.ones(3), np.ones(5), "residuals")
         self._design, self._errors = design, errors
         self.counted = errors.size
 
@@ -40,6 +34,13 @@ class Linear:
 
     def jacobian(self, u):
         return self.residuals(u), np.tile(self._design, (len(u), 1, 1, 1))
+
+    def pieces(self, count):
+        samples = self._design.shape[1]
+        return np.arange(samples) * count // samples
+
+    def own_frame(self, residual):
+        return residual
 
 
 def drive(manoeuvre: int, replicate: int) -> Trial:

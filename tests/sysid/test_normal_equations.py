@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import gradient, normal_equations, objective, starts
+from sysid import feature_objective, gradient, normal_equations, objective, starts
 from sysid.courses import CourseReplay
 from sysid.differences import DifferenceReplay
+from sysid.feature_objective import make_features_objective
 from sysid.normal_equations import NormalEquations, make_equations
 from sysid.objective import Objective, estimate_noise
 from sysid.prior import Prior
-from sysid.starts import make_features_objective
 
 SETS = np.array([[0.4, 0.5, 0.6], [0.6, 0.4, 0.3], [1.0, 0.45, 0.5]])
 """One of them at a bound, where differences are one-sided."""
@@ -32,7 +32,7 @@ def poses(unicycle_log) -> Objective:
 def on_accelerator(monkeypatch):
     """Objectives take a processor for one, and fill calls up to two sets."""
     monkeypatch.setattr(normal_equations, "on_processor", lambda: False)
-    for module in (objective, starts):
+    for module in (objective, feature_objective):
         monkeypatch.setattr(module, "make_equations", lambda one: (
             NormalEquations(one, least=2) if hasattr(one.replay, "traced") else None))
 
@@ -40,7 +40,7 @@ def on_accelerator(monkeypatch):
 @pytest.mark.parametrize("robust", [False, True])
 @pytest.mark.parametrize("kind", ["poses", "features", "with a prior"])
 def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robust):
-    one = {"poses": poses, "features": make_features_objective(poses),
+    one = {"poses": poses, "features": make_features_objective(poses, 0.5),
            "with a prior": dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.01)))}[kind]
     equations = NormalEquations(one, least=1)
     value, slope, hessian = equations.quadratic(SETS, robust)
@@ -71,7 +71,7 @@ def test_a_search_with_sums_ends_where_one_with_residuals_does(poses, on_acceler
 
 
 def test_starts_are_drawn_and_fitted_in_features_alike(poses, on_accelerator):
-    points = starts.draw(dataclasses.replace(poses), range(3), seed=0, scan=16)
+    points = starts.draw(dataclasses.replace(poses), range(3), 0.5, seed=0, scan=16)
     assert points.shape == (3, 3)
     found = starts.fit(dataclasses.replace(poses), points, 0.5, iterations=10)
     np.testing.assert_allclose(poses.space.to_values(found.u), TRUTH, rtol=0.15)
@@ -98,7 +98,7 @@ def test_calls_are_filled_up_to_what_was_compiled(poses):
 
 
 def test_other_noise_is_weighed_without_compiling_again(poses):
-    first = make_features_objective(poses)
+    first = make_features_objective(poses, 0.5)
     louder = dataclasses.replace(first, whitener=first.whitener.scaled(2.0))
     one, other = NormalEquations(first, least=3), NormalEquations(louder, least=3)
     np.testing.assert_allclose(one.costs(SETS), 4 * other.costs(SETS), rtol=1e-4)

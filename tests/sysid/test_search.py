@@ -25,7 +25,9 @@ class TwoValleys:
     steep: float
     """How much it costs that the first parameter stays behind the second."""
     counted = 1
-    noise = Noise(np.ones(3), np.ones(5), "replicates")
+    def renewed(self, u):
+        return self
+
 
     def residuals(self, u):
         behind, x = self.steep * (u[:, 0] - u[:, 1]), u[:, 1]
@@ -58,7 +60,9 @@ class NeverMet:
     """A gain and the limit of what it drives: while the limit is above all that is driven nothing tells of it."""
 
     counted = 1
-    noise = Noise(np.ones(3), np.ones(5), "replicates")
+    def renewed(self, u):
+        return self
+
     t = np.linspace(0.0, 1.0, 12)
 
     def _driven(self, u):
@@ -88,7 +92,9 @@ class Folded:
     from a = 0.385 to 0.415."""
 
     counted = 1
-    noise = Noise(np.ones(3), np.ones(5), "replicates")
+    def renewed(self, u):
+        return self
+
 
     def residuals(self, u):
         a, b = u[:, 0], u[:, 1]
