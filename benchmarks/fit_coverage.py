@@ -129,7 +129,8 @@ def job(label: str, iterations: int, compiled: Path) -> dict[str, Any]:
     fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))
     rows = {one.name: {"truth": truth[one.name], "value": one.value, "low": one.low, "high": one.high,
                        "identifiable": one.identifiable} for one in fit.uncertainty.estimates if one.name in truth}
-    return {"parameters": rows, "cost": fit.cost, "seconds": fit.seconds}
+    values = dict(zip(fit.space.names, fit.space.to_values(fit.u).tolist(), strict=True))
+    return {"parameters": rows, "values": values, "cost": fit.cost, "seconds": fit.seconds}
 
 
 def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, dict[str, Any]]:

@@ -19,7 +19,7 @@ from sysid import gradient
 from sysid.arrays import namespace
 from sysid.differences import STEP
 from sysid.log import Trial
-from sysid.loop.features import Features, bin_width, make_features
+from sysid.loop.features import ENOUGH, Features, bin_width, make_features
 from sysid.loop.noise import (
     ORDER,
     Whitener,
@@ -56,6 +56,16 @@ class FeatureObjective:
     whitener: Whitener
     prior: Prior | None = None
     """Its P residuals are the last ones of the first trial."""
+
+    @property
+    def enough(self) -> bool:
+        """Whether bins show most of what was measured: a pose that comes every other second is in none."""
+        for column, streams in ((0, [t.odometry for t in self.trials]), (2, [t.ground_truth for t in self.trials])):
+            has = np.array([stream is not None for stream in streams])
+            bins = np.array([trial.duration for trial in self.trials])[has].sum() / self.features.width
+            if has.any() and (self.features.mask[has, :, column] > 0).sum() < ENOUGH * bins:
+                return False
+        return True
 
     @property
     def counted(self) -> int:

@@ -57,8 +57,8 @@ class FitConfig:
     preset: Literal["paper", "physical"] = "physical"
     """Base model whose parameters are fitted."""
     method: Literal["features", "lm", "tpe", "cmaes", "both"] = "features"
-    """features: gradient search on motion in short bins, then on poses. lm: on poses at once. tpe, cmaes: global
-    search. both: a short global search that gives the gradient search on poses its starts."""
+    """features: gradient search on motion in short bins, whitened in the end. lm: on poses. tpe, cmaes: global search.
+    both: a short global search that gives the gradient search on poses its starts."""
     trials: int = 192
     """Parameter sets that the global search tries."""
     storage: str = ""
@@ -69,7 +69,7 @@ class FitConfig:
     """Starts of the gradient search: the initial values, and random ones (features: each the best of many) or the best
     of the global search (both: at least one of them)."""
     iterations: int = 40
-    """Iterations of the gradient search on poses."""
+    """Iterations of the gradient search, after the first one on features."""
     elsewhere: bool = True
     """Whether the gradient search also starts far away along ranges where that costs little, from other delays, and
     from random points close to its end."""
@@ -118,7 +118,7 @@ class Fit:
     u: np.ndarray  # (P,) fitted unit coordinates
     initial_cost: float
     cost: float
-    """Mean squared residual in noise scales (large ones counted linearly); J in metres after a global search."""
+    """Mean squared white residual (large ones counted linearly); J in metres after a global search."""
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
@@ -173,7 +173,8 @@ def fit_log(
         points = coarse.u[None]
     told: Told = objective
     if config.method == "features":
-        told = make_features_objective(objective, log.spec.track).renewed(points[0])
+        binned = make_features_objective(objective, log.spec.track)
+        told = binned.renewed(points[0]) if binned.enough else objective
     if config.vehicle is not None and config.method not in GLOBAL:
         share = uncertainty.inflation(told, points[0])
         told = replace(told, prior=replace(make_prior(space, given.intervals, config.spread), share=share))  # type: ignore[type-var]

@@ -3,7 +3,10 @@
 Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. Trials are
 independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive. What
 replicates share is no noise but what the model gets wrong about a manoeuvre; where they share more than chance would
-have it, manoeuvres are the independent blocks. Where too few trials tell a parameter, or where they happen to differ
+have it, manoeuvres are the independent blocks. Errors may also be shared at a place of
+their drive alone: where wheels break away, the mean of many drives is not the drive without disturbances. The pieces of a
+manoeuvre, all its replicates together, are blocks of a second kind, and no error is less than either kind has it.
+Where too few trials tell a parameter, or where they happen to differ
 less than pieces of them do, blocks are pieces of trials, and errors are no less than those of independent samples.
 Slopes are averaged over the errors (`sysid.slopes`): by differences over a fixed share of their ranges, delays are told
 half as well as they are, and friction, slip and torque limits up to one and a half times.
@@ -111,11 +114,17 @@ def estimate(
     if shared_error(objective.own_frame(residual), groups) < CHANCE:
         sums = np.eye(groups.max() + 1)[groups].T  # (C, B)
         across = sandwich(sums @ scores.sum(1), np.einsum("cb,bpq->cpq", sums, blocks.sum(1)), inverse)
+    places = None
+    if len(groups) > groups.max() + 1:
+        sums, flat = np.eye(groups.max() + 1)[groups].T, (-1, space.size)
+        places = sandwich(np.einsum("cb,bkp->ckp", sums, scores).reshape(flat),
+                          np.einsum("cb,bkpq->ckpq", sums, blocks).reshape(*flat, space.size), inverse)
     known = inverse @ weak @ inverse * share  # what the prior's own error adds
-    deviation, freedom = _choose(between, within, across, np.diag(inverse @ hessian @ inverse) * variance)
+    deviation, freedom = _choose(between, within, across, places, np.diag(inverse @ hessian @ inverse) * variance)
     deviation = np.sqrt(deviation**2 + np.diag(known))
     quantile = stats.t.ppf((1 + confidence) / 2, freedom)
-    covariance = max((one.covariance for one in (between, within, across) if one is not None), key=np.trace) + known
+    found = [one.covariance for one in (between, within, across, places) if one is not None]
+    covariance = max(found, key=np.trace) + known
     information, directions = np.linalg.eigh(hessian / scale)
     estimates = []
     for index, name in enumerate(space.names):
@@ -170,7 +179,7 @@ def _manoeuvres(objective: Told) -> np.ndarray:
 
 
 def _choose(
-    between: Variance, within: Variance, across: Variance | None, independent: np.ndarray
+    between: Variance, within: Variance, across: Variance | None, places: Variance | None, independent: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors (P,) and their degrees of freedom: between trials where they know it, or else within them.
 
@@ -179,6 +188,7 @@ def _choose(
     Args:
         between, within: trials are the blocks, or pieces of them.
         across: manoeuvres are the blocks, where the model is wrong about them; then no error is less than that.
+        places: pieces of manoeuvres are the blocks, where there are replicates; no interval is narrower than that.
         independent: (P,) variances if all samples were independent.
     """
     enough = (between.freedom >= ENOUGH) & (between.told > 0.5)
@@ -190,6 +200,12 @@ def _choose(
         wrong = (across.told > 0.5) & (np.diag(across.covariance) > variance)
         variance = np.where(wrong, np.diag(across.covariance), variance)
         freedom = np.where(wrong, across.freedom, freedom)
+    if places is not None:
+        drives = np.diag(places.covariance)
+        shared = (places.told > 0.5) & (places.freedom >= ENOUGH)
+        shared &= _width(drives, places.freedom) > _width(variance, freedom)
+        variance = np.where(shared, drives, variance)
+        freedom = np.where(shared, places.freedom, freedom)
     return np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
