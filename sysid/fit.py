@@ -46,6 +46,7 @@ from whill_mjx.presets import preset_params
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
+TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count what they tell
 FEATURE_ITERATIONS = 20
 GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
 
@@ -174,7 +175,8 @@ def fit_log(
     told: Told = objective
     if config.method == "features":
         binned = make_features_objective(objective, log.spec.track)
-        told = binned.renewed(points[0]) if binned.enough else objective
+        if binned.enough and not whole_drives_tell_more(objective, points, config, progress):
+            told = binned.renewed(points[0])
     if config.vehicle is not None and config.method not in GLOBAL:
         share = uncertainty.inflation(told, points[0])
         told = replace(told, prior=replace(make_prior(space, given.intervals, config.spread), share=share))  # type: ignore[type-var]
@@ -193,6 +195,20 @@ def fit_log(
     fitted = set_parameters(params, space.names, values)
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
                profiles, time.perf_counter() - began, plant, told.prior, model, tuple(traced), given.frame)
+
+
+def whole_drives_tell_more(
+    objective: Objective, points: np.ndarray, config: FitConfig, progress: Progress | None = None
+) -> bool:
+    """Whether the errors of whole poses are those of their sensors alone, from sample to sample, so that least squares
+    of them are efficient. Disturbances add up along a drive: their errors go together, and motion in bins tells more.
+
+    Args:
+        points: (1, P) where the search on features ended; a few steps on poses lead on from there.
+    """
+    near = gradient.fit(objective, objective.space, starts=points[:1], iterations=TRIED, robust=config.robust,
+                        progress=progress)
+    return uncertainty.inflation(objective, near.u) < TOGETHER
 
 
 @dataclass(frozen=True)
@@ -334,7 +350,7 @@ def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes, unless searches from elsewhere lead on."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
+    first = {"features": FEATURE_ITERATIONS * 3 // 2 + TRIED, "lm": 0}.get(config.method, scan)
     elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
     return first + (iterations + elsewhere if config.method not in GLOBAL else 0)
 

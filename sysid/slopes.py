@@ -23,6 +23,8 @@ AT_ONCE = 2**23  # residuals, of points that are replayed together
 REFLECTIONS = 8  # passes over the walls of the box; what is outside still then is moved inwards
 REACH = 0.08
 """Standard deviation in unit coordinates, at most, over which is averaged: further away lie other valleys."""
+EXACT = 1e-9
+"""Cost at least, in squared noise scales: a model that is met to the last bit still has an ellipsoid."""
 ROUNDS, MISSES, WORTH = 16, 3, 2e-4
 """Of a descent at most, and after how many in a row it ends that lower the cost by less than that share."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
@@ -40,7 +42,7 @@ def average_slopes(
     """
     size, random = len(u), np.random.default_rng(seed)
     axes = np.concatenate([np.linalg.qr(random.standard_normal((size, size)))[0] for _ in range(ROTATIONS)])
-    steps = np.sqrt(size) * axes @ np.linalg.cholesky(covariance).T  # as far out as errors are on average
+    steps = np.sqrt(size) * axes @ _root(covariance).T  # as far out as errors are on average
     moves = within(u, np.concatenate([steps, -steps]), covariance)
     weights = np.linalg.pinv(np.column_stack([moves, np.ones(len(moves))]))[:size]  # (P, N)
     residual = objective.residuals(u[None])[0]
@@ -49,6 +51,15 @@ def average_slopes(
         part = slice(first, first + count)
         slopes += np.einsum("pn,nbk->bkp", weights[:, part], objective.residuals(u + moves[part]))
     return residual, slopes
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """R (P, P) with R R^T the covariance."""
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:  # by rounding, where some parameters are known far better than others
+        value, vector = np.linalg.eigh(covariance)
+        return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -69,7 +80,7 @@ def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarr
 def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
     """Covariance (P, P) of errors in unit coordinates, for residuals with these derivatives (B, K, P)."""
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
-    return np.linalg.inv(hessian / variance + np.eye(len(hessian)) / REACH**2)
+    return np.linalg.inv(hessian / max(variance, EXACT) + np.eye(len(hessian)) / REACH**2)
 
 
 def descend(

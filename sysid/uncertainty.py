@@ -3,11 +3,11 @@
 Residuals of a driving log are autocorrelated, so the usual (J^T J)^-1 understates the errors several times. Trials are
 independent drives: the variance is that of their sums (`sysid.sandwich`), whatever the correlation within a drive. What
 replicates share is no noise but what the model gets wrong about a manoeuvre; where they share more than chance would
-have it, manoeuvres are the independent blocks. Errors may also be shared at a place of
-their drive alone: where wheels break away, the mean of many drives is not the drive without disturbances. The pieces of a
-manoeuvre, all its replicates together, are blocks of a second kind, and no error is less than either kind has it.
-Where too few trials tell a parameter, or where they happen to differ
-less than pieces of them do, blocks are pieces of trials, and errors are no less than those of independent samples.
+have it, manoeuvres are the independent blocks. Errors may also be shared at a place of their drives alone: where wheels
+break away, the mean of many drives is not the drive without disturbances. The pieces of a manoeuvre, all its replicates
+together, are blocks of a second kind, and no error is less than either kind has it. Where too few trials tell a
+parameter, or where they happen to differ less than pieces of them do, blocks are pieces of trials, and errors are no
+less than those of independent samples.
 Slopes are averaged over the errors (`sysid.slopes`): by differences over a fixed share of their ranges, delays are told
 half as well as they are, and friction, slip and torque limits up to one and a half times.
 """

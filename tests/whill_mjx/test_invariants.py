@@ -134,7 +134,7 @@ def test_a_drive_with_mirrored_parameters_and_commands_is_the_mirror_image(group
     _, _, seen, _ = driven(group)
     right, left = seen[-2], seen[-1]
     signs = np.array([1, -1, -1, 1, 1, -1, -1, 1, -1, -1])
-    assert np.abs(right[:, 1]).max() > 0.005
+    assert np.abs(right[:, 1]).max() > 0.002  # it does turn
     np.testing.assert_allclose(left * signs, right, atol=1e-9)
 
 
