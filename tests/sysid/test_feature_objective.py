@@ -10,7 +10,9 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid import gradient
 from sysid.courses import CourseReplay
+from sysid.differences import DifferenceReplay
 from sysid.feature_objective import make_features_objective
+from sysid.fit import FitConfig, whole_drives_tell_more
 from sysid.objective import Objective, estimate_noise
 from sysid.prior import Prior
 
@@ -18,11 +20,24 @@ U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
 
 @pytest.fixture(scope="module")
-def features(unicycle_log):
+def poses(unicycle_log) -> Objective:
     trials = unicycle_log.training
     replay = CourseReplay(unicycle_plant(), trials, lambda values: values)
-    poses = Objective(replay, UNICYCLE_SPACE, trials, replay.measured, estimate_noise(trials))
+    return Objective(DifferenceReplay(replay, UNICYCLE_SPACE), UNICYCLE_SPACE, trials, replay.measured,
+                     estimate_noise(trials))
+
+
+@pytest.fixture(scope="module")
+def features(poses):
     return make_features_objective(poses, 0.5)
+
+
+def test_whole_drives_are_fitted_where_their_errors_do_not_add_up(poses):
+    assert whole_drives_tell_more(poses, U_TRUTH[None], FitConfig())
+    random, measured = np.random.default_rng(0), poses.measured
+    pushed = measured.pose + np.cumsum(0.01 * random.standard_normal(measured.pose.shape), axis=1)
+    adding = dataclasses.replace(poses, measured=dataclasses.replace(measured, pose=pushed))
+    assert not whole_drives_tell_more(adding, U_TRUTH[None], FitConfig())
 
 
 def test_at_the_truth_the_noise_that_is_left_has_unit_size(features):

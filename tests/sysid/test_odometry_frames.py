@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -89,3 +90,24 @@ def test_a_log_that_says_nothing_of_steady_motion_has_no_frames():
               for trial, _ in (driven(ROWS, 0.02, seed=seed) for seed in range(4))]
     assert find_period(speeds) is None and find_period([]) is None
     assert at_frames(speeds, 0.02) == tuple(speeds)
+
+
+@pytest.mark.parametrize("period", [0.02, 0.025])
+def test_speeds_of_frames_are_means_over_them_low_passed_once_a_frame(period):
+    """Against the recursion itself, as an odometry runs it, at the frames of a drive that starts in motion."""
+    from sysid.rollout import _framed
+
+    dt, time_constant = 0.01, 0.042
+    t = np.arange(400) * dt
+    speeds = np.column_stack([0.4 + 0.3 * np.sin(3 * t), np.cos(2 * t)])
+    ways = np.column_stack([0.4 * t + 0.1 * (1 - np.cos(3 * t)), np.sin(2 * t) / 2])
+    frame = np.arange(1, int(t[-1] / period)) * period
+    at = np.column_stack([np.interp(np.r_[0.0, frame], t, column) for column in ways.T])
+    means, kept, expected = np.diff(at, axis=0) / period, speeds[0], []
+    keep = np.exp(-period / time_constant)
+    for mean in means:
+        kept = keep * kept + (1 - keep) * mean
+        expected.append(kept)
+    told = np.asarray(_framed(jnp.asarray(speeds), jnp.asarray(time_constant), period, dt))
+    seen = np.column_stack([np.interp(frame, t, column) for column in told.T])
+    np.testing.assert_allclose(seen, expected, atol=2e-3)
