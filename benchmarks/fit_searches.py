@@ -17,7 +17,6 @@ import numpy as np
 from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import gradient, starts, tpe
-from sysid.courses import MANY
 from sysid.feature_objective import make_features_objective
 from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem
 from sysid.log import Log, load_log
@@ -56,7 +55,6 @@ def compile_replay(objective: Objective) -> None:
     """Compile what the searches replay: sets at once, and one derivative."""
     point = objective.space.to_unit(objective.space.initial)[None]
     objective.residuals(np.tile(point, (LOCKSTEP, 1)))
-    objective.residuals(np.tile(point, (MANY, 1)))
     objective.jacobian(point)
 
 

@@ -19,14 +19,18 @@ def on_processor() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def cores() -> int:
+    """How many of the host's cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part], compiled: bool = True) -> list[_Done]:
     """What `work` gives for each of `parts`, in their order; as many run side by side as the host has cores.
 
     Args:
         compiled: otherwise the first goes ahead alone and compiles what the others use.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = min(cores, len(parts))
+    workers = min(cores(), len(parts))
     if workers < 2:
         return [work(part) for part in parts]
     ahead = [] if compiled else [work(parts[0])]

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.arrays import namespace
-from sysid.cores import on_all_cores, on_processor
+from sysid.cores import cores, on_all_cores, on_processor
 from sysid.log import Trial
 from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
 
-INSTANCES = 80  # drives replayed together on a processor: a working set that fits its cache
-SETS = 4  # parameter sets replayed together there: one compilation serves all tries of a search
-MANY = 64  # sets from which as many are replayed together as fill the cache: half as fast again, compiled apart
+INSTANCES = 512  # drives replayed together on a processor, at most: more are no faster, one by one, than these
+SETS = 4  # parameter sets replayed together there where a search tries a few
+FULL = 0.5  # share of the rows for a Jacobian's differences from which they are used
 
 
 class CourseReplay:
@@ -60,12 +60,10 @@ class CourseReplay:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
         if not on_processor():
             return self._spread(self._replay.simulate(values), motion=True)
-        full, parts = int(np.clip(INSTANCES // self.courses, 1, MANY)), []
-        whole = len(values) // full * full if len(values) >= MANY else 0
-        for rows, some in ((full, values[:whole]), (min(full, SETS), values[whole:])):
-            if len(some):
-                parts.append(self._on_cores(some, rows))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        # Rows are of two numbers, each of which is compiled once: for a few tries, and for a Jacobian's differences.
+        few = max(min(SETS, INSTANCES // self.courses), 1)
+        many = max(min(-(-(2 * values.shape[1] + 1) // cores()), INSTANCES // self.courses), few)
+        return self._on_cores(values, many if len(values) >= FULL * many else few)
 
     def _on_cores(self, values: np.ndarray, rows: int) -> Simulated:
         """Replay with each of values (N, P), so many `rows` at a time on each core."""

@@ -173,19 +173,28 @@ class Replay:
     def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
         """`set_values` turns values (P,) into the vehicle's parameters."""
 
-        def one(values: jax.Array, batch: Batch) -> Simulated:
-            return simulate(plant, set_values(values), batch)
+        def rows(values: jax.Array, batch: Batch) -> Simulated:
+            """Each set on each trial, in one row of instances: loops over a single axis fill a processor's vectors."""
+            sets, trials = len(values), len(batch.start)
 
-        def one_jacobian(values: jax.Array, batch: Batch) -> tuple[Simulated, Simulated]:
+            def tiled(leaf: jax.Array) -> jax.Array:
+                return jnp.tile(leaf, (sets, *(1,) * (leaf.ndim - 1)))
+
+            one = jax.vmap(lambda value, trial: _simulate_one(plant, set_values(value), trial))
+            found = one(jnp.repeat(values, trials, axis=0), jax.tree.map(tiled, batch))
+            return jax.tree.map(lambda leaf: leaf.reshape(sets, trials, *leaf.shape[1:]), found)
+
+        def jacobian(values: jax.Array, batch: Batch) -> tuple[Simulated, Simulated]:
             """Values and their derivatives along each parameter: forward mode, directions batched."""
-            tangents = jnp.eye(values.shape[0], dtype=values.dtype)
-            output, derivative = jax.vmap(
-                lambda tangent: jax.jvp(lambda v: one(v, batch), (values,), (tangent,)), out_axes=(None, -1))(tangents)
-            return output, derivative
+            tangents = jnp.eye(values.shape[1], dtype=values.dtype)
+
+            def along(tangent: jax.Array) -> tuple[Simulated, Simulated]:
+                return jax.jvp(lambda v: rows(v, batch), (values,), (jnp.broadcast_to(tangent, values.shape),))
+
+            return jax.vmap(along, out_axes=(None, -1))(tangents)
 
         self._batch = batch
-        self._simulate = jax.jit(jax.vmap(one, in_axes=(0, None)))
-        self._jacobian = jax.jit(jax.vmap(one_jacobian, in_axes=(0, None)))
+        self._simulate, self._jacobian = jax.jit(rows), jax.jit(jacobian)
         self._sizes: dict[Any, set[int]] = {self._simulate: set(), self._jacobian: set()}
 
     def on(self, batch: Batch) -> Replay:
