@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.cores import on_all_cores
 from sysid.log import Trial
 from sysid.metrics import command_in_force
 
@@ -35,7 +36,7 @@ class Stretches:
     """Steady driving of one trial or of several."""
 
     t: np.ndarray  # (S, ROWS) s
-    rest: np.ndarray  # (S, ROWS, ROWS) what is left of values at t beside the nearest parabola
+    parabola: np.ndarray  # (S, ROWS, 3) orthonormal columns: the parabolas over t
     steps: np.ndarray  # (S, ROWS) ways or turns over their mean speed, without the parabola [s]
     weight: np.ndarray  # (S, 1) that speed [m/s or rad/s]
     trial: np.ndarray  # (S,) number of the trial
@@ -63,7 +64,7 @@ def find_period(trials: Sequence[Trial]) -> float | None:
     if not known:
         return None
     part = Stretches(*(np.concatenate([getattr(one, name) for one in known]) for name in
-                       ("t", "rest", "steps", "weight", "trial")))
+                       ("t", "parabola", "steps", "weight", "trial")))
     spacing = float(np.median(np.diff(part.t)))
     if len(part.t) < STRETCHES or spacing <= SHORTEST:
         return None
@@ -104,16 +105,17 @@ def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> St
     if not len(t) or not (np.diff(t) > 0).all():
         return None
     powers = (t - t[:, :1])[..., None] ** np.arange(3)
-    rest = np.eye(ROWS) - powers @ np.linalg.pinv(powers)
+    parabola = np.linalg.qr(powers)[0]
     for value in (np.r_[0.0, np.cumsum(way)], stream.yaw):
         along = value[rows]
         speed = (along[:, -1] - along[:, 0]) / (t[:, -1] - t[:, 0])
-        steps = np.einsum("sij,sj->si", rest, along) / np.where(speed == 0.0, 1.0, speed)[:, None]
+        bent = (parabola @ (parabola.swapaxes(1, 2) @ along[..., None]))[..., 0]
+        steps = (along - bent) / np.where(speed == 0.0, 1.0, speed)[:, None]
         fast = (np.abs(speed) > LEAST) & (np.abs(steps).max(1) < (np.inf if largest is None else largest))
         steps = steps[fast]
-        found.append((t[fast], rest[fast], steps, np.abs(speed[fast, None])))
-    t, rest, steps, weight = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Stretches(t, rest, steps, weight, np.full(len(t), number)) if len(t) else None
+        found.append((t[fast], parabola[fast], steps, np.abs(speed[fast, None])))
+    t, parabola, steps, weight = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Stretches(t, parabola, steps, weight, np.full(len(t), number)) if len(t) else None
 
 
 def unexplained(part: Stretches, period: float, group: np.ndarray, phases: int = PHASES) -> float:
@@ -134,8 +136,9 @@ def ages_of(t: np.ndarray, period: float, phase: np.ndarray | float) -> np.ndarr
 
 def _left(part: Stretches, period: float, phases: np.ndarray) -> np.ndarray:
     """Squared ways (K, S) that frames of each phase leave."""
-    told = np.einsum("sij,ksj->ksi", part.rest, ages_of(part.t, period, phases[:, None, None]))
-    return np.square(part.weight * (part.steps + told)).sum(2)
+    along = part.steps + ages_of(part.t, period, phases[:, None, None])  # (K, S, ROWS); steps have no parabola in them
+    curve = np.einsum("sjc,ksj->ksc", part.parabola, along)
+    return part.weight[:, 0] ** 2 * (np.square(along).sum(2) - np.square(curve).sum(2))
 
 
 def _best_rate(
@@ -143,8 +146,8 @@ def _best_rate(
 ) -> tuple[float, float, float]:
     """Of rates (N,) [1/s], the one that leaves least in groups (S,) of stretches, and between which all are as good."""
     order = np.argsort(group, kind="stable")
-    part = Stretches(*(getattr(part, name)[order] for name in ("t", "rest", "steps", "weight", "trial")))
-    left = np.array([unexplained(part, 1 / rate, group[order], phases) for rate in rates])
+    part = Stretches(*(getattr(part, name)[order] for name in ("t", "parabola", "steps", "weight", "trial")))
+    left = np.array(on_all_cores(lambda rate: unexplained(part, 1 / rate, group[order], phases), rates))
     worse = np.flatnonzero(left > left.min() + SAME * np.square(part.weight * part.steps).sum())
     best = int(np.argmin(left))
     first, last = max(worse[worse < best], default=-1) + 1, min(worse[worse > best], default=len(rates)) - 1
