@@ -35,7 +35,7 @@ PLANT_LENGTH = 11.0  # s that are driven of each of them
 REPLICATES = 6
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
 MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension", "wheel_damping", "wheel_inertia")
-USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
+USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "torque_drive.period": 0.004, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
          "sensor_delay.delay": 0.01, "sensor_delay.speed": 0.005, "wheel_damping.damping": 0.1,
          "wheel_inertia.ratio": 2.0}
 SPREAD = 0.15  # of the logarithm of a value from log to log
@@ -86,8 +86,7 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     """The values of the physical model that a chair of the contact plant has.
 
     Speeds and poses tell forces only per mass: the model's mass is nominal, so that its torques and its inertias are
-    the chair's times the ratio of the masses. The model's controller acts all the time; the chair's is sampled and
-    holds its torque, which is as quick as a continuous one of a higher gain. Its integral counts every jump of the
+    the chair's times the ratio of the masses. The chair's controller is sampled: its integral counts every jump of the
     wanted speed half a tick too long, which is a feed-forward of that speed (Euler and Maclaurin).
     """
     from benchmarks.plant.base import TICK
@@ -105,9 +104,7 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     wheel = model.body("wheel_left").id
     spin = float(model.body_inertia[wheel].max() + chair.armature)  # of one wheel
     ratio = spec.mass / mass.sum()
-    load = mass.sum() / 2 * np.mean(chair.radius) ** 2 + spin  # [kg m^2] that one side's torque moves
-    held = -np.log(1 - chair.kp * TICK / load) / (chair.kp * TICK / load)  # of two controllers with the same pole
-    return {"torque_drive.kp": chair.kp * held * ratio, "torque_drive.ki": chair.ki * held * ratio,
+    return {"torque_drive.kp": chair.kp * ratio, "torque_drive.ki": chair.ki * ratio, "torque_drive.period": TICK,
             "torque_drive.kff": chair.ki * TICK / 2 * ratio, "wheel_damping.damping": chair.damping * ratio,
             "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": yaw * ratio,
             "wheel_inertia.ratio": spin * ratio / spec.wheel_inertia,

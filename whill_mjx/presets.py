@@ -120,7 +120,8 @@ def physical(spec: VehicleSpec) -> VehicleParams:
         (
             with_values(CommandDelay, delay=0.02),
             with_values(
-                TorqueDrive, kp=15.0 * load, ki=20.0 * load, limit=4.0 * load / spec.wheel_radius, windup=0.5, kff=0.0
+                TorqueDrive, kp=15.0 * load, ki=20.0 * load, limit=4.0 * load / spec.wheel_radius, windup=0.5, kff=0.0,
+                period=0.0
             ),
             with_values(SlipTraction, mu=0.8, slip_speed=0.02, side_slip_speed=0.05, mu_free=0.0 if skid else 0.02),
             with_values(YawScrub, torque=0.01 * spec.mass * spec.track),

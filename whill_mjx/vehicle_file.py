@@ -30,7 +30,7 @@ from whill_mjx.types import Body, VehicleParams, parameters_of
 
 SCHEMA = 1
 KIND = "micromobility-vehicle"
-LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff"}
+LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period"}
 """Parameters that earlier files do not have: where they are absent they are neutral."""
 
 

@@ -22,7 +22,8 @@ class Last:
 
     target: jax.Array  # (2,) [rad/s]
     before: jax.Array  # (2,) target of the step before that [rad/s]
-    error: jax.Array  # (2,) in the middle of the step [rad/s]
+    spin: jax.Array  # (2,) in the middle of the step [rad/s]
+    error: jax.Array  # (2,) there [rad/s]
     wanted: jax.Array  # (2,) torque without its limit [N m]
     crossing: jax.Array  # (2,) by how much that torque changed within the step [N m]
 
@@ -41,8 +42,9 @@ class DriveMemory:
 class TorqueDrive(Effect):
     """T = clip(kp e + ki integral of e + kff v_target / r, +-limit) with e = v_target / r - spin.
 
-    The feed-forward kff makes up for bearings that resist with speed. A controller that is sampled every T seconds has
-    one of ki T / 2: its integral counts every jump of the wanted speed half a sample too long.
+    A controller that runs every `period` seconds and holds its torque meanwhile knows a spin that is half a period old
+    on average: that of kp's e is. Its integral counts every jump of the wanted speed half a period too long, which is a
+    feed-forward kff of ki period / 2; another makes up for bearings that resist with speed.
 
     e and its integral are those in the middle of the physics step, with the acceleration that this torque gives to
     rolling wheels under the load of the step before: a controller that acts all the time, not once in a step. Where a
@@ -64,10 +66,11 @@ class TorqueDrive(Effect):
     windup: jax.Array = parameter("-", 0.0, 1.0, 0.0, "rate of the integral while the torque is at its limit")
 
     kff: jax.Array = parameter("N m s/rad", 0.0, 50.0, 0.0, "feed-forward of the wanted speed")
+    period: jax.Array = parameter("s", 0.0, 0.01, 0.0, "between two runs of a controller that is sampled")
 
     def init(self) -> DriveMemory:
         none = jnp.zeros(2)
-        return DriveMemory(none, none, jnp.zeros(()), Last(none, none, none, none, jnp.ones(2)))
+        return DriveMemory(none, none, jnp.zeros(()), Last(none, none, none, none, none, jnp.ones(2)))
 
     def actuation(self, memory: DriveMemory, drive: Drive, motion: Motion) -> tuple[DriveMemory, Drive]:
         """Adds the motor torque (2,) [N m]."""
@@ -75,26 +78,30 @@ class TorqueDrive(Effect):
         target = drive.target / motion.wheel_radius
         error = target - motion.spin
         response = spin_response(motion)
-        damping = 1 / (1 + half * self.kp * response)
         last = memory.last
+        # Half a period before the middle of this step the spin was between those in the middle of this step and of the
+        # one before.
+        old = memory.begun * jnp.minimum(self.period / (2 * motion.dt), 1.0)
+        damping = 1 / (1 + (1 - old) * half * self.kp * response)
         gain_of_target = lambda change: by_mode((self.kp + half * self.ki + self.kff) * change, damping)  # noqa: E731
         integral = memory.integral + motion.dt * self.jump(last, target, gain_of_target)
         # What else than the torque changes the spin [rad/s^2]; bounded, as a wheel that spins up has little inertia.
         largest = self.limit * response.max()
         load = jnp.clip(memory.begun * (motion.spin - memory.expected) / motion.dt, -largest, largest)
         # T = kp (e - half (response T + load)) + ki (integral + half e) + kff target, solved for T.
-        wanted = self.kp * (error - half * load) + self.ki * (integral + half * error) + self.kff * target
+        known = target - old * last.spin - (1 - old) * (motion.spin + half * load)
+        wanted = self.kp * known + self.ki * (integral + half * error) + self.kff * target
         wanted = by_mode(wanted, damping)
         torque = jnp.clip(wanted, -self.limit, self.limit)
         gain = by_mode(torque, response)
         acceleration = gain + load
         # The wanted torque crosses the limit at the rate kp * acceleration.
         crossing = jnp.maximum(self.kp * jnp.abs(acceleration) * motion.dt, TINY)
-        done = Last(target, last.target, error - half * acceleration, wanted, crossing)
+        done = Last(target, last.target, motion.spin + half * acceleration, error - half * acceleration, wanted, crossing)
         rate = self.rate(done.error, wanted, crossing)
         after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
         foreseen = motion.spin + motion.dt * (by_mode(wanted, response) + load)
-        yielding = Yielding(foreseen, self.kp / 2 * jnp.ones(2), wanted - torque, -self.limit - torque,
+        yielding = Yielding(foreseen, (1 - old) * self.kp / 2 * jnp.ones(2), wanted - torque, -self.limit - torque,
                             self.limit - torque, jnp.ones(2))
         return after, replace(drive, torque=drive.torque + torque, yielding=yielding)
 
