@@ -37,7 +37,7 @@ REPLICATES = 6
 MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension", "wheel_damping", "wheel_inertia")
 USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "torque_drive.period": 0.004, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
          "sensor_delay.delay": 0.01, "sensor_delay.speed": 0.005, "wheel_damping.damping": 0.1,
-         "wheel_inertia.ratio": 2.0}
+         "wheel_inertia.ratio": 2.0, "wheel_inertia.reaction": 0.5}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted
@@ -108,6 +108,7 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
             "torque_drive.kff": chair.ki * TICK / 2 * ratio, "wheel_damping.damping": chair.damping * ratio,
             "torque_drive.limit": chair.torque_limit * ratio, "body.yaw_inertia": yaw * ratio,
             "wheel_inertia.ratio": spin * ratio / spec.wheel_inertia,
+            "wheel_inertia.reaction": float(model.body_inertia[wheel].max()) / spin,
             "body.com_x": spec.rear_x + float(middle[0]), "body.com_y": float(middle[1]),
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 

@@ -63,6 +63,7 @@ class World:
     sag: jax.Array | float = 0.005  # () m, compression of each contact under a quarter of the weight
     damping: jax.Array | float = 0.5  # () of the contacts, over the critical
     wheel_inertia: jax.Array | float = 1.0  # () spin inertia of the driven wheels over the nominal
+    wheel_reaction: jax.Array | float = 0.0  # () share of it whose momentum the chassis takes up
     sprung: bool = struct.field(pytree_node=False, default=False)
     """Whether loads are those at the end of a physics step, which any springs allow, or those at its start."""
 

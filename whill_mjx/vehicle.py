@@ -155,7 +155,8 @@ def load_law(model: VehicleModel, params: VehicleParams, motion: Motion) -> Call
     matrix = jnp.diag(jnp.stack([total, inertia[0], inertia[1]])) + hold * (rows[:, None] * rows[None]).sum(-1)
     start = motion.spring_force - stiffness * dt * motion.normal_speed  # if the speeds did not change
     weight = total * (motion.rotation.T @ world.gravity)[2]
-    turned = wheels.inertia / (wheels.inertia + wheels.armature * world.wheel_inertia)  # share that turns the chassis
+    spun = wheels.armature * world.wheel_inertia
+    turned = (wheels.inertia + world.wheel_reaction * spun) / (wheels.inertia + spun)  # share that turns the chassis
 
     def loads(others: Wrench) -> jax.Array:
         back = turned * (motion.drive_torque + others.spin_torque).sum()
@@ -245,7 +246,8 @@ def nominal_world(model: VehicleModel) -> World:
     )
     sag = jnp.asarray(STATIC_SAG, jnp.result_type(float))
     return World(geometry, gravity=jnp.array([0.0, 0.0, -GRAVITY]), wind=jnp.zeros(3), sag=sag,
-                 damping=jnp.asarray(DAMPING_RATIO, sag.dtype), wheel_inertia=jnp.ones((), sag.dtype))
+                 damping=jnp.asarray(DAMPING_RATIO, sag.dtype), wheel_inertia=jnp.ones((), sag.dtype),
+                 wheel_reaction=jnp.zeros((), sag.dtype))
 
 
 def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
@@ -323,8 +325,9 @@ def carried_sag(model: VehicleModel, world: World) -> jax.Array:
 def generalised_force(motion: Motion, wrench: Wrench) -> jax.Array:
     """qfrc_applied (8,): force in the world frame, torque about the origin in the chassis frame, wheel torques."""
     force = motion.rotation @ jnp.stack([wrench.fx, wrench.fy, wrench.fz])
-    torque = jnp.stack([wrench.tx, wrench.ty, wrench.tz])
-    return jnp.concatenate([force, torque, motion.drive_torque + wrench.spin_torque])
+    spinning = motion.drive_torque + wrench.spin_torque
+    torque = jnp.stack([wrench.tx, wrench.ty - motion.world.wheel_reaction * spinning.sum(), wrench.tz])
+    return jnp.concatenate([force, torque, spinning])
 
 
 def advance_odometry(odometry: Odometry, spin: jax.Array, model: VehicleModel) -> Odometry:

@@ -30,7 +30,8 @@ from whill_mjx.types import Body, VehicleParams, parameters_of
 
 SCHEMA = 1
 KIND = "micromobility-vehicle"
-LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period"}
+LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period",
+         "wheel_inertia.reaction"}
 """Parameters that earlier files do not have: where they are absent they are neutral."""
 
 

@@ -14,7 +14,7 @@ import pytest
 from sysid.models import with_effects
 from whill_mjx.config import VehicleConfig
 from whill_mjx.kinematics import body_twist, reference_pose, rotation_from_quaternion
-from whill_mjx.model import build_model, mujoco_model
+from whill_mjx.model import box_inertia, build_model, mujoco_model
 from whill_mjx.parameters import describe, get_values, set_values
 from whill_mjx.presets import preset, preset_params
 from whill_mjx.specs import SPECS, WARTHOG, WHILL_CR, VehicleSpec, find_spec
@@ -209,6 +209,22 @@ def test_a_heavy_wheel_takes_longer_to_spin_up_where_nothing_grips(dynamics):
     for ratio in (1.0, 2.5):
         spin = period(set_values(params, ["wheel_inertia.ratio"], jnp.array([ratio]))).qvel[6:8]
         np.testing.assert_allclose(spin, 0.05 * 1.5 / (ratio * spec.wheel_inertia), rtol=0.01)
+
+
+@pytest.mark.parametrize("dynamics", ["fused", "mjx"])
+@pytest.mark.parametrize("reaction", [0.0, 0.4, 1.0])
+def test_a_chair_in_the_air_turns_against_what_its_wheels_are_spun_up_by(reaction, dynamics):
+    """Its angular momentum stays 0: what the wheels themselves carry of it the chassis has with the opposite sign."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("suspension", "wheel_inertia"))
+    params = set_values(params, ["wheel_inertia.ratio", "wheel_inertia.reaction"], jnp.array([2.0, reaction]))
+    model = build_model(spec, VehicleConfig(dynamics=dynamics))
+    state = place(model, params, 0.0, 0.0, 0.0)
+    state = dataclasses.replace(state, qpos=state.qpos.at[2].add(5.0))
+    state = jax.jit(lambda state: drive(model, params, state, jnp.array([1.0, 0.0])))(state)
+    wheels = reaction * 2.0 * spec.wheel_inertia * float(state.qvel[6:8].sum())
+    assert float(state.qvel[6]) > 5.0
+    np.testing.assert_allclose(float(state.qvel[4]) * box_inertia(spec)[1], -wheels, atol=1e-4)
 
 
 def test_a_damped_chair_stops_nodding_sooner():
