@@ -40,7 +40,7 @@ from benchmarks.fit_jobs import (
 from benchmarks.fit_measured import drive, mrclam
 from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, show_parameters
 from benchmarks.harness import device_name, figure, record
-from sysid.fit import Fit, FitConfig, fit_log, make_objective, make_problem
+from sysid.fit import Fit, FitConfig, fit_log, fitted_plant, make_objective, make_problem
 from sysid.log import Log, load_log
 from sysid.searches import Judge
 
@@ -152,7 +152,7 @@ def planted(settings: Benchmark) -> None:
     # What the fit takes as known (such as the height of the centre of mass) is as it takes it.
     truth = set_values(start, space.names, get_values(preset_params(WHILL_CR, "paper_optimised"), space.names))
     with tempfile.TemporaryDirectory() as folder:
-        log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, replicates=2))
+        log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, replicates=2, plant=fitted_plant(WHILL_CR)))
     fit = fit_log(log, FitConfig(preset="paper", iterations=settings.iterations))
     one = evaluate(fit, log.held_out)["summary"]["held_out"]["ground_truth"]["trajectory"]
     inside = [estimate.low <= value <= estimate.high for estimate, value in zip(

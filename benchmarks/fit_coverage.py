@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
-from sysid.fit import FitConfig, fit_log, make_problem
+from sysid.fit import FitConfig, fit_log, fitted_plant, make_problem
 from sysid.log import Log, load_log
 from sysid.models import with_effects
 from sysid.space import Space, make_space, searched
@@ -64,7 +64,7 @@ def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
     values = draw_truth(space, np.random.default_rng([seed, 90]))
     truth = set_values(start, space.names, jnp.asarray(values))
     path = write_dataset(folder / "log", WHILL_CR, truth, manoeuvres=MANOEUVRES, held_out=(), replicates=REPLICATES,
-                         seed=seed)
+                         seed=seed, plant=fitted_plant(WHILL_CR))
     return load_log(path), dict(zip(space.names, np.asarray(get_values(truth, space.names), float).tolist(),
                                     strict=True))
 

@@ -18,7 +18,7 @@ from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import gradient, starts, tpe
 from sysid.feature_objective import make_features_objective
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, fitted_plant
 from sysid.log import Log, load_log
 from sysid.objective import HUGE, Objective
 from sysid.searches import Judge, Trace, arrivals, trace, write
@@ -48,7 +48,8 @@ def find_log(name: str, shared: Path, trials: int = 18) -> Log:
     from whill_mjx.specs import WHILL_CR
 
     with tempfile.TemporaryDirectory() as folder:
-        return load_log(write_dataset(Path(folder) / "planted", WHILL_CR, preset_params(WHILL_CR, "physical")))
+        return load_log(write_dataset(Path(folder) / "planted", WHILL_CR, preset_params(WHILL_CR, "physical"),
+                                      plant=fitted_plant(WHILL_CR)))
 
 
 def compile_replay(objective: Objective) -> None:

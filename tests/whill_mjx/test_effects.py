@@ -85,6 +85,16 @@ def test_slip_force_never_exceeds_the_friction_circle():
     assert np.hypot(float(wrench.fx), float(wrench.fy)) <= 0.6 * driven_load * 1.001
 
 
+@pytest.mark.parametrize("along, across", [(0.002, 0.05), (0.02, 0.02), (0.05, 0.001)])
+def test_a_wheel_that_slides_is_held_against_the_way_that_it_slides(along, across):
+    """Coulomb's law, however differently stiff a creeping wheel is along and across."""
+    motion = motion_at(v=0.5, sideways=0.1).replace(spin=jnp.zeros(2), dt=1e-6)
+    values = {"mu": 0.6, "slip_speed": along, "side_slip_speed": across, "mu_free": 0.0}
+    _, wrench = SlipTraction(**{name: jnp.array(value) for name, value in values.items()}).force((), motion)
+    driven_load = float(motion.normal_force[:2].sum())
+    np.testing.assert_allclose([wrench.fx, wrench.fy], -0.6 * driven_load * np.array([5.0, 1.0]) / 26**0.5, rtol=0.02)
+
+
 def test_acceleration_limit_ramps_the_command():
     limit = AccelerationLimit(linear=jnp.array(1.7), angular=jnp.array(3.0))
     memory = limit.init()

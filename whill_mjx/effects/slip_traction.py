@@ -18,10 +18,13 @@ TINY = 1e-6  # [N], keeps the ratio defined where nothing grips
 
 @struct.dataclass
 class SlipTraction(Effect):
-    """Slip force of driven wheels, on a friction circle: F = mu N q / sqrt(1 + |q|^2), q = (s_x / s0, s_y / s0_y).
+    """Slip force of driven wheels, within a friction circle: F_i = mu N s_i / sqrt(s0_i^2 + |s|^2), i along and across.
 
     s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact; s0 and s0_y are the sliding speeds along
-    and across the wheel at which the force has 1/sqrt(2) of its limit. The wheel gets the reaction -r F_x. Both
+    and across the wheel at which the force has 1/sqrt(2) of its limit. A wheel that creeps is as stiff each way as
+    these say; one that slides is held by mu N against the way that it slides (Coulomb), whatever they are: with each
+    s_i measured by its own s0_i, a skid that is hardly sideways would be held sideways. The wheel gets the reaction
+    -r F_x. Both
     are advanced implicitly: F is taken at the speeds that wheels and chassis will have after the step, so that any s0
     and s0_y are stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
     """
@@ -51,9 +54,10 @@ class SlipTraction(Effect):
         forward = ahead.forward
         for _ in range(ROUNDS):
             # Forces of the form stiffness * sliding, the stiffness taken at the sliding of the previous round.
-            share = grip / jnp.sqrt(1 + (slide_x / self.slip_speed) ** 2 + (slide_y / self.side_slip_speed) ** 2)  # [N]
-            stiffness = share / self.slip_speed  # [N s/m]
-            sideways = share / self.side_slip_speed + carried / jnp.sqrt(slide_y**2 + self.side_slip_speed**2)
+            sliding = slide_x**2 + slide_y**2
+            stiffness = grip / jnp.sqrt(self.slip_speed**2 + sliding)  # [N s/m]
+            across = grip / jnp.sqrt(self.side_slip_speed**2 + sliding)
+            sideways = across + carried / jnp.sqrt(slide_y**2 + self.side_slip_speed**2)
             # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v'), put into the force C (r w' - v'). The
             # torque is T + unlimited - slope w', or at a limit.
             total = per_side(stiffness)
@@ -67,11 +71,11 @@ class SlipTraction(Effect):
             forward, left = held(motion, ahead, total / pulled, radius * wanted, per_axle(sideways))
             spin = (wanted + relaxation / stays * radius * total * forward) / pulled
             slide_x, slide_y = to_contacts(radius * spin - forward), -to_axles(left)
-        forward, left = stiffness * slide_x, share * slide_y / self.side_slip_speed
+        forward, left = stiffness * slide_x, across * slide_y
         # A wheel that a large torque spins up within the step would leave the friction circle.
         excess = jnp.maximum(1.0, jnp.sqrt(forward**2 + left**2 + TINY) / (grip + TINY))
         forward, left = forward / excess, left / excess
-        left = left + (sideways - share / self.side_slip_speed) * slide_y
+        left = left + (sideways - across) * slide_y
         wrench = contact_wrench(motion, forward, left)
         reaction = -radius * per_side(forward)
         change, _ = yielding.change((free_spin + relaxation * (unlimited + reaction)) / (1 + relaxation * slope))
