@@ -93,8 +93,8 @@ class Benchmark:
     seeds: tuple[int, ...] = (2000, 2001, 2002)
     """Days of the contact plant (`benchmarks.plant`)."""
     physics_dt: float = 0.005
-    """Physics step of the fits of measured sets, of TPE and of many starts at once [s]: searches find the same valleys with
-    twice the step of a fit, which ends with its own."""
+    """Physics step of the fits of measured sets, of TPE and of many starts at once [s]: searches find the same valleys
+    with twice the step of a fit, which ends with its own."""
     presets: tuple[Literal["paper", "physical"], ...] = ("physical", "paper")
     """Base models."""
 

@@ -35,9 +35,9 @@ PLANT_LENGTH = 11.0  # s that are driven of each of them
 REPLICATES = 6
 """With fewer, there are no more trials than parameters, and the intervals come from pieces of the trials alone."""
 MORE = ("axle_pivot", "lateral_damping", "sensor_delay", "suspension", "wheel_damping", "wheel_inertia")
-USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "torque_drive.period": 0.004, "axle_pivot.freedom": 0.5, "lateral_damping.c_front": 0.5,
-         "sensor_delay.delay": 0.01, "sensor_delay.speed": 0.005, "wheel_damping.damping": 0.1,
-         "wheel_inertia.ratio": 2.0, "wheel_inertia.reaction": 0.5}
+USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "torque_drive.period": 0.004, "axle_pivot.freedom": 0.5,
+         "lateral_damping.c_front": 0.5, "sensor_delay.delay": 0.01, "sensor_delay.speed": 0.005,
+         "wheel_damping.damping": 0.1, "wheel_inertia.ratio": 2.0, "wheel_inertia.reaction": 0.5}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted

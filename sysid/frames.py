@@ -147,7 +147,7 @@ def _best_rate(
     """Of rates (N,) [1/s], the one that leaves least in groups (S,) of stretches, and between which all are as good."""
     order = np.argsort(group, kind="stable")
     part = Stretches(*(getattr(part, name)[order] for name in ("t", "parabola", "steps", "weight", "trial")))
-    left = np.array(on_all_cores(lambda rate: unexplained(part, 1 / rate, group[order], phases), rates))
+    left = np.array(on_all_cores(lambda rate: unexplained(part, 1 / rate, group[order], phases), rates.tolist()))
     worse = np.flatnonzero(left > left.min() + SAME * np.square(part.weight * part.steps).sum())
     best = int(np.argmin(left))
     first, last = max(worse[worse < best], default=-1) + 1, min(worse[worse > best], default=len(rates)) - 1

@@ -97,7 +97,8 @@ class TorqueDrive(Effect):
         acceleration = gain + load
         # The wanted torque crosses the limit at the rate kp * acceleration.
         crossing = jnp.maximum(self.kp * jnp.abs(acceleration) * motion.dt, TINY)
-        done = Last(target, last.target, motion.spin + half * acceleration, error - half * acceleration, wanted, crossing)
+        spin = motion.spin + half * acceleration
+        done = Last(target, last.target, spin, error - half * acceleration, wanted, crossing)
         rate = self.rate(done.error, wanted, crossing)
         after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
         foreseen = motion.spin + motion.dt * (by_mode(wanted, response) + load)
