@@ -83,8 +83,8 @@ def test_values_of_the_contact_plant_are_per_nominal_inertia():
     light, heavy = (fit_coverage.plant_values(Chair(mass=mass), WHILL_CR) for mass in (54.0, 108.0))
     assert heavy["torque_drive.kp"] == pytest.approx(light["torque_drive.kp"] / 2, rel=0.1)
     assert light["torque_drive.ki"] / light["torque_drive.kp"] == pytest.approx(Chair().ki / Chair().kp)
-    # A controller that holds its torque for a tick is a few percent quicker than a continuous one of its gain.
-    assert 1.01 < light["torque_drive.kp"] / light["torque_drive.limit"] * 14.0 / 9.0 < 1.06
+    assert light["torque_drive.kp"] / light["torque_drive.limit"] == pytest.approx(Chair().kp / Chair().torque_limit)
+    assert light["torque_drive.period"] == 0.004  # s, a tick of its controller
     assert light["command_delay.delay"] == 0.02 and light["body.com_y"] == pytest.approx(0.0, abs=1e-6)
     assert 0.1 < light["body.com_z"] < 0.167  # wheels are lower than the frame's 0.167 m above the axle
     # The centre of mass is ahead of the driven axle by a bit less than that of the frame alone.
