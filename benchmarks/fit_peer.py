@@ -1,16 +1,17 @@
 """The fit against MuJoCo's own `mujoco.sysid` on the same log, the same parameters and the same machine.
 
     python -m benchmarks.fit_peer --trials 6
-    python -m benchmarks.fit_peer --known          # ours knows what is not fitted from another day
+    python -m benchmarks.fit_peer --preset         # ours does not know what is not fitted, as the peer does
 
 needs the packages of `pip install mujoco[sysid]`. The log is driven by the contact plant on one of its days.
 `mujoco.sysid` is given the plant's own model in MJCF, with a native PI speed controller (a velocity servo and an
-integrating one, limited at the joint), the nominal values of all else, and its own threads; ours the physical vehicle
-from its preset, by the search of `sysid.fit` without options. With `--known` ours has all else from a fit to another
-day, as a vehicle file has it, and searches by Levenberg and Marquardt alone, as the peer does. Both fit the
-controller's gains and limit, the yaw inertia and where the centre of mass is, and know the delay of a command. The
-clock of each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for
-the one whose model is nearer to the truth that is long before its own end, which is told as well.
+integrating one, limited at the joint), the plant's nominal values of all else, and its own threads; ours the physical
+vehicle with all else from a fit to another day, as a vehicle file has it, or, with `--preset`, as nobody has fitted
+it yet. Both fit the controller's gains and limit, the yaw inertia and where the centre of mass is, to poses and
+speeds, from the preset's values of these, by Levenberg and Marquardt, and know the delay of a command. The clock of
+each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for the
+one whose model is nearer to the truth that is long before its own end, which is told as well. Beside it stands the
+search of `sysid.fit` without options, which looks for other valleys too (`default_search`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from benchmarks.harness import figure, record
 from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
 from sysid import gradient, starts
+from sysid.feature_objective import make_features_objective
 from sysid.fit import FEATURE_ITERATIONS, FitConfig, fit_log, make_problem
 from sysid.log import Log, Trial, load_log
 from sysid.metrics import command_in_force
@@ -56,8 +58,8 @@ class Peer:
     """Fitted trials: the first of three replicates of six manoeuvres of 22 s."""
     seed: int = 3
     """Day of the contact plant."""
-    known: bool = False
-    """Ours knows the parameters that are not fitted from another day, as the peer does from the plant."""
+    preset: bool = False
+    """Ours has the preset's values of what is not fitted, not those of another day; the peer those of the plant."""
     other_day: int = 4
     """The day that it knows them from."""
     iterations: int = 40
@@ -218,28 +220,36 @@ def compare(model: mujoco.MjModel, wheels: Sequence[int], log: Log, trial: Trial
                             for stream, name, values in columns])
 
 
-def fit_ours(log: Log, settings: Peer) -> tuple[Curve, dict[str, float], float]:
-    """Fit, compiled before; its error at every better point, values, seconds of compiling."""
-    problem = make_problem(log, FitConfig(parameters=NAMES), known_vehicle(log, settings) if settings.known else None)
+def fit_ours(log: Log, settings: Peer) -> tuple[Curve, Curve, dict[str, float], float]:
+    """Fits, compiled before; their errors at every better point (of the search by Levenberg and Marquardt, and of the
+    one without options), values of the former, seconds of compiling for it."""
+    problem = make_problem(log, FitConfig(parameters=NAMES), None if settings.preset else known_vehicle(log, settings))
     objective, space = problem.objective, problem.space
     judge = Judge(problem, replace(log, trials=tuple(replace(trial, held_out=True) for trial in log.training)))
 
-    def search(objective: Any) -> np.ndarray:
-        if settings.known:
-            return gradient.fit(objective, space, iterations=settings.iterations, robust=True).u
+    def on_poses(objective: Any) -> np.ndarray:
+        return gradient.fit(objective, space, iterations=settings.iterations, robust=True).u
+
+    def by_default(objective: Any) -> np.ndarray:
         points = starts.draw(objective, [0], log.spec.track, 0)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS)
-        return gradient_search(objective, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
+        told = make_features_objective(objective, log.spec.track).renewed(coarse.u)
+        return gradient_search(told, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
 
-    began = time.perf_counter()
-    search(objective)  # compiles all that the search calls
-    first = time.perf_counter() - began
-    recorder = Recorder(objective.replay, objective)
-    u = search(replace(objective, replay=recorder))
-    times = [one[1] for one in recorder.best]
-    errors = judge.error(np.stack([one[3] for one in recorder.best]))
-    curve = [*zip(times, errors.tolist(), strict=True), (recorder.seconds, float(judge.error(u[None])[0]))]
-    return curve, dict(zip(space.names, space.to_values(u).tolist(), strict=True)), first - recorder.seconds
+    def timed(search: Callable[[Any], np.ndarray]) -> tuple[Curve, np.ndarray, float]:
+        began = time.perf_counter()
+        search(objective)  # compiles all that the search calls
+        first = time.perf_counter() - began
+        recorder = Recorder(objective.replay, objective)
+        u = search(replace(objective, replay=recorder))
+        errors = judge.error(np.stack([one[3] for one in recorder.best]))
+        curve = [*zip([one[1] for one in recorder.best], errors.tolist(), strict=True),
+                 (recorder.seconds, float(judge.error(u[None])[0]))]
+        return curve, u, first - recorder.seconds
+
+    curve, u, compiling = timed(on_poses)
+    default, _, _ = timed(by_default)
+    return curve, default, dict(zip(space.names, space.to_values(u).tolist(), strict=True)), compiling
 
 
 def known_vehicle(log: Log, settings: Peer) -> Any:
@@ -272,7 +282,7 @@ def main(settings: Peer) -> None:
     log = drive(settings.seed)
     names = [trial.name for trial in log.trials][: settings.trials]
     log = log.select(lambda trial: trial.name in names)
-    ours, values, compiling = fit_ours(log, settings)
+    ours, default, values, compiling = fit_ours(log, settings)
     theirs, their_values = fit_peer(log, settings)
     goal = EQUAL * max(min(error for _, error in curve) for curve in (ours, theirs))
     mine, peer = arrival(ours, goal), arrival(theirs, goal)
@@ -285,9 +295,11 @@ def main(settings: Peer) -> None:
         "peer_ours_error": figure([min(error for _, error in ours)], "m"),
         "peer_mujoco_sysid_seconds_to_own_best": figure([own_arrival(theirs)], "s"),
         "peer_ours_seconds_to_own_best": figure([own_arrival(ours)], "s"),
+        "peer_ours_error_default_search": figure([min(error for _, error in default)], "m"),
+        "peer_ours_seconds_to_own_best_default_search": figure([own_arrival(default)], "s"),
         "peer_trials": figure([float(len(log.trials))], "count"),
     }
-    figures = {name + ("_known" if settings.known else ""): one for name, one in figures.items()}
+    figures = {name + ("_preset" if settings.preset else ""): one for name, one in figures.items()}
     record("fit", CLAIM, figures)
     for name, one in figures.items():
         print(f"{name:44} {one['value']:10.4f} {one['unit']}")
