@@ -243,10 +243,11 @@ def spins_with_a_sampled_controller(kp, ki, period, target, inertia, steps, dt):
     return np.array(spins)[round(dt / fine) - 1 :: round(dt / fine)]
 
 
+@pytest.mark.parametrize("dt", [0.0025, 0.005])
 @pytest.mark.parametrize("period", [0.002, 0.004, 0.01])
-def test_a_controller_that_is_sampled_acts_on_the_spin_of_half_a_period_ago(period):
-    kp, ki, steps, inertia = 9.0, 12.0, 60, 0.02 + 52 / 2 * 0.1325**2
-    motion, target = motion_at(), jnp.array([1.0, 1.0])
+def test_a_controller_that_is_sampled_acts_on_the_spin_of_half_a_period_ago(period, dt):
+    kp, ki, steps, inertia = 9.0, 12.0, round(0.3 / dt), 0.02 + 52 / 2 * 0.1325**2
+    motion, target = dataclasses.replace(motion_at(), dt=dt), jnp.array([1.0, 1.0])
     expected = spins_with_a_sampled_controller(kp, ki, period, 1.0 / 0.1325, inertia, steps, motion.dt)
 
     def error(period, kff):

@@ -23,6 +23,7 @@ class Last:
     target: jax.Array  # (2,) [rad/s]
     before: jax.Array  # (2,) target of the step before that [rad/s]
     spin: jax.Array  # (2,) in the middle of the step [rad/s]
+    earlier: jax.Array  # (2,) in the middle of the step before that [rad/s]
     error: jax.Array  # (2,) there [rad/s]
     wanted: jax.Array  # (2,) torque without its limit [N m]
     crossing: jax.Array  # (2,) by how much that torque changed within the step [N m]
@@ -70,7 +71,7 @@ class TorqueDrive(Effect):
 
     def init(self) -> DriveMemory:
         none = jnp.zeros(2)
-        return DriveMemory(none, none, jnp.zeros(()), Last(none, none, none, none, none, jnp.ones(2)))
+        return DriveMemory(none, none, jnp.zeros(()), Last(none, none, none, none, none, none, jnp.ones(2)))
 
     def actuation(self, memory: DriveMemory, drive: Drive, motion: Motion) -> tuple[DriveMemory, Drive]:
         """Adds the motor torque (2,) [N m]."""
@@ -79,9 +80,10 @@ class TorqueDrive(Effect):
         error = target - motion.spin
         response = spin_response(motion)
         last = memory.last
-        # Half a period before the middle of this step the spin was between those in the middle of this step and of the
-        # one before.
-        old = memory.begun * jnp.minimum(self.period / (2 * motion.dt), 1.0)
+        # Half a period before the middle of this step the spin was between those in the middle of two of the last steps.
+        age = memory.begun * self.period / (2 * motion.dt)
+        old, older = jnp.minimum(age, 1.0), jnp.clip(age - 1.0, 0.0, 1.0)
+        before = last.spin + older * (last.earlier - last.spin)
         damping = 1 / (1 + (1 - old) * half * self.kp * response)
         gain_of_target = lambda change: by_mode((self.kp + half * self.ki + self.kff) * change, damping)  # noqa: E731
         integral = memory.integral + motion.dt * self.jump(last, target, gain_of_target)
@@ -89,7 +91,7 @@ class TorqueDrive(Effect):
         largest = self.limit * response.max()
         load = jnp.clip(memory.begun * (motion.spin - memory.expected) / motion.dt, -largest, largest)
         # T = kp (e - half (response T + load)) + ki (integral + half e) + kff target, solved for T.
-        known = target - old * last.spin - (1 - old) * (motion.spin + half * load)
+        known = target - old * before - (1 - old) * (motion.spin + half * load)
         wanted = self.kp * known + self.ki * (integral + half * error) + self.kff * target
         wanted = by_mode(wanted, damping)
         torque = jnp.clip(wanted, -self.limit, self.limit)
@@ -98,7 +100,8 @@ class TorqueDrive(Effect):
         # The wanted torque crosses the limit at the rate kp * acceleration.
         crossing = jnp.maximum(self.kp * jnp.abs(acceleration) * motion.dt, TINY)
         spin = motion.spin + half * acceleration
-        done = Last(target, last.target, spin, error - half * acceleration, wanted, crossing)
+        earlier = motion.spin + memory.begun * (last.spin - motion.spin)
+        done = Last(target, last.target, spin, earlier, error - half * acceleration, wanted, crossing)
         rate = self.rate(done.error, wanted, crossing)
         after = DriveMemory(integral + rate * motion.dt, motion.spin + gain * motion.dt, jnp.ones(()), done)
         foreseen = motion.spin + motion.dt * (by_mode(wanted, response) + load)
