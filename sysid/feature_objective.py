@@ -30,7 +30,7 @@ from sysid.loop.noise import (
     roughness,
 )
 from sysid.normal_equations import NormalEquations, make_equations
-from sysid.objective import HUGE, Objective, Replays, append_prior
+from sysid.objective import HUGE, Objective, Replays, append_prior, arrays_prior, prior_arrays
 from sysid.prior import Prior
 from sysid.rollout import Simulated
 from sysid.space import Space
@@ -92,16 +92,18 @@ class FeatureObjective:
     @property
     def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay."""
-        return self.target, self.mask, self.whitener.scale, self.whitener.coefficients, self.whitener.inverse
+        filters = self.whitener
+        return (self.target, self.mask, filters.scale, filters.coefficients, filters.inverse, prior_arrays(self.prior))
 
     @property
     def kind(self) -> Any:
         """As in `sysid.normal_equations`."""
-        return FeatureObjective, None if self.prior is None else (*self.prior.mean, *self.prior.sd, self.prior.share)
+        return FeatureObjective, self.prior is None
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> FeatureObjective:
         """The same with other `arrays`."""
-        return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:]))
+        return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:5]),
+                       prior=arrays_prior(arrays[5]))
 
     @cached_property
     def equations(self) -> NormalEquations | None:
@@ -171,4 +173,4 @@ def make_features_objective(objective: Objective, track: float) -> FeatureObject
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)
     return FeatureObjective(objective.replay, objective.space, objective.trials, track, features, target, features.mask,
-                            first_scales(target, features.mask, groups))
+                            first_scales(target, features.mask, groups), objective.prior)

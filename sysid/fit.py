@@ -31,7 +31,7 @@ from sysid.models import (
     with_effects,
 )
 from sysid.objective import Noise, Objective, Told, estimate_noise
-from sysid.prior import SPREAD, Prior, make_prior
+from sysid.prior import SPREAD, Prior, bounds_alone, make_prior
 from sysid.profiles import Profile, check_names, profile
 from sysid.report import error_rows, parameter_table, table, write_html, write_report
 from sysid.report_json import make_report, provenance
@@ -125,6 +125,7 @@ class Fit:
     seconds: float
     plant: Plant
     prior: Prior | None = None
+    """Of an earlier vehicle file."""
     model: Model | None = None
     """What was fitted in place of the simulator's vehicle."""
     likelihoods: tuple[Profile, ...] = ()
@@ -173,14 +174,9 @@ def fit_log(
         points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
-    told: Told = objective
-    if config.method == "features":
-        binned = make_features_objective(objective, log.spec.track)
-        if binned.enough and not whole_drives_tell_more(objective, points, config, progress):
-            told = binned.renewed(points[0])
-    if config.vehicle is not None and config.method not in GLOBAL:
-        share = uncertainty.inflation(told, points[0])
-        told = replace(told, prior=replace(make_prior(space, given.intervals, config.spread), share=share))  # type: ignore[type-var]
+    told, share = choose(objective, points[0], log.spec.track, config, progress)
+    earlier = make_prior(space, given.intervals, config.spread) if config.vehicle is not None else bounds_alone(space)
+    told = replace(told, prior=replace(earlier, share=share))  # type: ignore[type-var]
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
@@ -195,21 +191,31 @@ def fit_log(
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, told.prior, model, tuple(traced), given.frame)
+               profiles, time.perf_counter() - began, plant, told.prior if config.vehicle is not None else None, model, tuple(traced), given.frame)
 
 
-def whole_drives_tell_more(
-    objective: Objective, points: np.ndarray, config: FitConfig, progress: Progress | None = None
-) -> bool:
-    """Whether the errors of whole poses are those of their sensors alone, from sample to sample, so that least squares
-    of them are efficient. Disturbances add up along a drive: their errors go together, and motion in bins tells more.
+def choose(
+    objective: Objective, u: np.ndarray, track: float, config: FitConfig, progress: Progress | None = None
+) -> tuple[Told, float]:
+    """What a search ends on, and how many times its squares count what they tell: whole poses, or motion in bins.
+
+    Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
+    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins tells more.
 
     Args:
-        points: (1, P) where the search on features ended; a few steps on poses lead on from there.
+        u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
+        track: of the vehicle [m].
     """
-    near = gradient.fit(objective, objective.space, starts=points[:1], iterations=TRIED, robust=config.robust,
+    if config.method in GLOBAL:
+        return objective, 1.0
+    near = gradient.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
                         progress=progress)
-    return uncertainty.inflation(objective, near.u) < TOGETHER
+    share = uncertainty.inflation(objective, near.u)
+    binned = make_features_objective(objective, track)
+    if config.method != "features" or not binned.enough or share < TOGETHER:
+        return objective, share
+    binned = binned.renewed(u)
+    return binned, uncertainty.inflation(binned, u)
 
 
 @dataclass(frozen=True)
@@ -260,6 +266,7 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
     if frame is not None and frames.AGE in space.names and frames.AGE not in config.parameters:
         space = space.without(frames.AGE, "speeds are those of the odometry's frames")
     objective = make_objective(plant, params, space, trials, estimate_noise(frames.at_frames(log.training, frame)))
+    objective = replace(objective, prior=bounds_alone(space))
     return Problem(plant, params, space, objective, intervals, model, frame)
 
 
@@ -357,9 +364,9 @@ def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes, unless searches from elsewhere lead on."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    first = {"features": FEATURE_ITERATIONS * 3 // 2 + TRIED, "lm": 0}.get(config.method, scan)
+    first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
     elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
-    return first + (iterations + elsewhere if config.method not in GLOBAL else 0)
+    return first + (TRIED + iterations + elsewhere if config.method not in GLOBAL else 0)
 
 
 @dataclass(frozen=True, kw_only=True)

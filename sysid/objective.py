@@ -121,18 +121,19 @@ class Objective:
         return pose, odometry
 
     @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+    def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay and `kind`."""
-        return self.noise.pose, self.noise.odometry
+        return self.noise.pose, self.noise.odometry, prior_arrays(self.prior)
 
     @property
     def kind(self) -> tuple[Any, ...]:
         """As in `sysid.normal_equations`."""
-        return Objective, None if self.prior is None else (*self.prior.mean, *self.prior.sd, self.prior.share)
+        return Objective, self.prior is None
 
-    def with_arrays(self, arrays: tuple[Any, Any]) -> Objective:
+    def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
         """The same with other `arrays`."""
-        return self.with_noise(replace(self.noise, pose=arrays[0], odometry=arrays[1]))
+        noise = replace(self.noise, pose=arrays[0], odometry=arrays[1])
+        return replace(self, noise=noise, prior=arrays_prior(arrays[2]))
 
     @cached_property
     def equations(self) -> NormalEquations | None:
@@ -308,6 +309,21 @@ def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np
     """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
     weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
     return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
+
+
+def prior_arrays(prior: Prior | None) -> tuple[Any, ...]:
+    """The numbers of a prior, for a compiled function."""
+    return () if prior is None else (prior.mean, prior.sd, prior.share)
+
+
+def arrays_prior(arrays: tuple[Any, ...]) -> Prior | None:
+    """The prior of such numbers."""
+    return Prior(*arrays) if arrays else None
+
+
+def without_prior(objective: Told, table: np.ndarray) -> np.ndarray:
+    """Table (B, K, ...) of the measurements alone."""
+    return table if objective.prior is None else table[:, : -objective.space.size]
 
 
 def append_prior(table: np.ndarray, more: np.ndarray) -> np.ndarray:

@@ -1,4 +1,9 @@
-"""What a vehicle file says of a vehicle before its next log is fitted."""
+"""What is known of a vehicle before its log is fitted: the bounds of its parameters, or a vehicle file.
+
+A parameter of which a log says next to nothing would follow folds of the cost to an end of its range, and take along
+what the log tells only together with it. Bounds alone, as a normal distribution as wide as they are, hold it back; what
+a log tells they hardly move.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +38,17 @@ class Prior:
     @property
     def slope(self) -> np.ndarray:
         """(P,) derivative of the residual."""
-        return np.sqrt(self.share) / self.sd
+        return self.share**0.5 / self.sd
 
     @property
     def precision(self) -> np.ndarray:
         """(P, P), as it is weighed."""
         return np.diag(self.slope**2)
+
+
+def bounds_alone(space: Space) -> Prior:
+    """Nothing but the bounds is known: as wide as a uniform distribution within them."""
+    return Prior(np.full(space.size, 0.5), np.full(space.size, UNKNOWN))
 
 
 def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], spread: float = SPREAD) -> Prior:

@@ -25,8 +25,9 @@ REACH = 0.08
 """Standard deviation in unit coordinates, at most, over which is averaged: further away lie other valleys."""
 EXACT = 1e-9
 """Cost at least, in squared noise scales: a model that is met to the last bit still has an ellipsoid."""
-ROUNDS, MISSES, WORTH = 16, 3, 2e-4
-"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share."""
+ROUNDS, MISSES, WORTH = 24, 3, 2e-4
+"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share, or by less than
+one residual's mean square of all: with more estimates still move by a share of their errors."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
 SIZES = (1.0, 0.3)
 """Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""
@@ -103,7 +104,7 @@ def descend(
         history.append(cost)
         if progress is not None:
             progress(1, f"cost {cost:.4g}")
-        misses = 0 if cost < before * (1 - WORTH) else misses + 1
+        misses = 0 if cost < before * (1 - min(WORTH, 1 / objective.counted)) else misses + 1
         if misses == MISSES:
             break
     return replace(result, u=u, cost=cost, history=np.concatenate([result.history, history]),

@@ -20,7 +20,7 @@ import numpy as np
 
 from sysid.gradient import HUBER, huber_weight, robust_cost
 from sysid.metrics import replicate_groups
-from sysid.objective import Told
+from sysid.objective import Told, without_prior
 from sysid.sandwich import Variance, sandwich
 from sysid.slopes import average_slopes, likely
 
@@ -92,8 +92,7 @@ def estimate(
     size = float(robust_cost(residual[None], robust)[0]) / objective.counted
     for _ in range(PASSES):
         residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
-    if objective.prior is not None:  # not a measurement: it comes back as a precision
-        residual, jacobian = residual[:, : -space.size], jacobian[:, : -space.size]
+    residual, jacobian = (without_prior(objective, one) for one in (residual, jacobian))  # it is no measurement
     told = jacobian
     if robust:
         told = jacobian * (np.abs(residual) <= HUBER)[..., None]
@@ -143,7 +142,7 @@ def estimate(
 
 def inflation(objective: Told, u: np.ndarray) -> float:
     """How many times the squared residuals count what they tell: their sum over neighbours against that one by one."""
-    residual, jacobian = (array[0] for array in objective.jacobian(u[None]))
+    residual, jacobian = (without_prior(objective, array[0]) for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
     pieces = _pieces(objective, jacobian, residual * huber_weight(residual), jacobian)[0].reshape(-1, len(u))
     told = np.diag(hessian) > 1e-9 * np.diag(hessian).max()

@@ -11,8 +11,8 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 from sysid import gradient
 from sysid.courses import CourseReplay
 from sysid.differences import DifferenceReplay
-from sysid.feature_objective import make_features_objective
-from sysid.fit import FitConfig, whole_drives_tell_more
+from sysid.feature_objective import FeatureObjective, make_features_objective
+from sysid.fit import FitConfig, choose
 from sysid.objective import Objective, estimate_noise
 from sysid.prior import Prior
 
@@ -33,11 +33,15 @@ def features(poses):
 
 
 def test_whole_drives_are_fitted_where_their_errors_do_not_add_up(poses):
-    assert whole_drives_tell_more(poses, U_TRUTH[None], FitConfig())
+    told, share = choose(poses, U_TRUTH, 0.5, FitConfig())
+    assert told is poses and share < 2.0
     random, measured = np.random.default_rng(0), poses.measured
     pushed = measured.pose + np.cumsum(0.01 * random.standard_normal(measured.pose.shape), axis=1)
     adding = dataclasses.replace(poses, measured=dataclasses.replace(measured, pose=pushed))
-    assert not whole_drives_tell_more(adding, U_TRUTH[None], FitConfig())
+    told, less = choose(adding, U_TRUTH, 0.5, FitConfig())
+    assert isinstance(told, FeatureObjective)
+    told, share = choose(adding, U_TRUTH, 0.5, FitConfig(method="lm"))
+    assert told is adding and share > 3.0 and share > 2 * less  # squares of poses count so much more than they tell
 
 
 def test_at_the_truth_the_noise_that_is_left_has_unit_size(features):

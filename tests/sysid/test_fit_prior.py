@@ -5,13 +5,18 @@ from __future__ import annotations
 import dataclasses
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import TRUTH, UNICYCLE_SPACE
+from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid import fit as fit_module
 from sysid import gradient, uncertainty
-from sysid.prior import UNKNOWN, Prior, make_prior, moved
+from sysid.courses import CourseReplay
+from sysid.differences import DifferenceReplay
+from sysid.objective import Objective, estimate_noise
+from sysid.prior import UNKNOWN, Prior, bounds_alone, make_prior, moved
+from sysid.space import Space
 from whill_mjx.presets import preset_params
 from whill_mjx.specs import WHILL_CR
 from whill_mjx.vehicle_file import save_vehicle
@@ -41,6 +46,26 @@ def test_a_weak_prior_yields_to_the_log_and_a_sharp_one_holds(objective):
     for one, other in zip(held.estimates, free.estimates, strict=True):
         assert one.high - one.low < 0.5 * (other.high - other.low)
     assert uncertainty.inflation(objective, ends[0]) >= 1.0
+
+
+def test_what_no_drive_tells_stays_in_the_middle_of_its_bounds_and_takes_nothing_along(unicycle_log):
+    """`extra` only adds to tau_v: what the log tells is their sum."""
+    def with_extra(values):
+        return jnp.array([values[0] + 0.1 * values[3], values[1], values[2]])
+
+    trials = unicycle_log.training
+    replay = CourseReplay(unicycle_plant(), trials, with_extra)
+    space = Space((*UNICYCLE_SPACE.names, "extra"), np.append(UNICYCLE_SPACE.low, 0.0),
+                  np.append(UNICYCLE_SPACE.high, 1.0), np.append(UNICYCLE_SPACE.initial, 0.0),
+                  np.append(UNICYCLE_SPACE.log, False))
+    free = Objective(DifferenceReplay(replay, space), space, trials, replay.measured, estimate_noise(trials))
+    held = dataclasses.replace(free, prior=bounds_alone(space))
+    found = space.to_values(gradient.fit(held, space, iterations=20, tolerance=1e-6).u)
+    assert found[3] == pytest.approx(0.5, abs=0.15)
+    assert found[0] + 0.1 * found[3] == pytest.approx(TRUTH[0], abs=0.01)
+    known = uncertainty.estimate(held, space.to_unit(found)).estimates
+    assert not known[3].identifiable
+    assert known[0].low < TRUTH[0] - 0.08 and known[0].high > TRUTH[0] - 0.02  # extra may be anything from 0 to 1
 
 
 @pytest.mark.quick
