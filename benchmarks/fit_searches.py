@@ -17,8 +17,7 @@ import numpy as np
 from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import gradient, starts, tpe
-from sysid.feature_objective import make_features_objective
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, fitted_plant
+from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, choose, fitted_plant
 from sysid.log import Log, load_log
 from sysid.objective import HUGE, Objective
 from sysid.searches import Judge, Trace, arrivals, trace, write
@@ -84,7 +83,7 @@ def start_job(
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
     def whitened() -> dict[str, Any]:
-        told = make_features_objective(problem.objective, track).renewed(np.array(coarse["u"]))
+        told = choose(problem.objective, np.array(coarse["u"]), track, FitConfig(), report)
         found, _, _ = gradient_search(told, problem.space, np.array([coarse["u"]]), iterations, FitConfig(), report)
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
@@ -163,18 +162,18 @@ def summarise_tpe(
 
 
 def many_starts(problem: Problem, track: float, count: int, iterations: int) -> dict[str, Any]:
-    """Costs and seconds of `count` starts at once, each drawn, fitted to features and then to poses; and of the whole
-    default search, which goes on from the best of them and looks elsewhere."""
+    """Costs and seconds of `count` starts at once, each drawn, fitted to features, and then to what the default search
+    ends on; and of that search as a whole, which goes on from the best of them and looks elsewhere."""
     report, began = reporter(f"{count} starts"), time.perf_counter()
     points = starts.draw(problem.objective, range(count), track, 0, progress=report)
     drawn = time.perf_counter()
     coarse = starts.fit(problem.objective, points, track, FEATURE_ITERATIONS, report)
     fitted = time.perf_counter()
+    told = choose(problem.objective, coarse.u, track, FitConfig(), report)
     ends = np.concatenate([coarse.u[None], coarse.starts[1:]])
-    fine = gradient.fit(problem.objective, problem.space, starts=ends, iterations=iterations, robust=True,
-                        progress=report)
+    fine = gradient.fit(told, problem.space, starts=ends, iterations=iterations, robust=True, progress=report)
     seconds = time.perf_counter() - began
-    found, _, _ = gradient_search(problem.objective, problem.space, fine.u[None], iterations, FitConfig(), report)
+    found, _, _ = gradient_search(told, problem.space, fine.u[None], iterations, FitConfig(), report)
     return {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
             "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn,
             "whole": time.perf_counter() - began, "whole_cost": found.cost}

@@ -169,7 +169,7 @@ def make_features_objective(objective: Objective, track: float) -> FeatureObject
     Args:
         track: of the vehicle [m].
     """
-    features = make_features(objective.trials, bin_width(objective.trials), counted=True)
+    features = make_features(objective.trials, bin_width(objective.trials))
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)
     return FeatureObjective(objective.replay, objective.space, objective.trials, track, features, target, features.mask,

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from sysid import command_line, frames, gradient, slopes, starts, tpe, uncertainty
-from sysid.feature_objective import make_features_objective
+from sysid.feature_objective import FeatureObjective, make_features_objective
 from sysid.log import Log, Trial
 from sysid.measured import load_any
 from sysid.metrics import Prediction
@@ -174,9 +174,9 @@ def fit_log(
         points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
-    told, share = choose(objective, points[0], log.spec.track, config, progress)
-    earlier = make_prior(space, given.intervals, config.spread) if config.vehicle is not None else bounds_alone(space)
-    told = replace(told, prior=replace(earlier, share=share))  # type: ignore[type-var]
+    if config.vehicle is not None:
+        objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
+    told: Told = choose(objective, points[0], log.spec.track, config, progress)
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
@@ -190,14 +190,16 @@ def fit_log(
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
+    earlier = told.prior if config.vehicle is not None else None
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, told.prior if config.vehicle is not None else None, model, tuple(traced), given.frame)
+               profiles, time.perf_counter() - began, plant, earlier, model, tuple(traced), given.frame)
 
 
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, progress: Progress | None = None
-) -> tuple[Told, float]:
-    """What a search ends on, and how many times its squares count what they tell: whole poses, or motion in bins.
+) -> Told:
+    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
+    tell.
 
     Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
     efficient. Disturbances add up along a drive: then their errors go together, and motion in bins tells more.
@@ -207,15 +209,16 @@ def choose(
         track: of the vehicle [m].
     """
     if config.method in GLOBAL:
-        return objective, 1.0
+        return objective
     near = gradient.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
                         progress=progress)
     share = uncertainty.inflation(objective, near.u)
+    told: Objective | FeatureObjective = objective
     binned = make_features_objective(objective, track)
-    if config.method != "features" or not binned.enough or share < TOGETHER:
-        return objective, share
-    binned = binned.renewed(u)
-    return binned, uncertainty.inflation(binned, u)
+    if config.method == "features" and binned.enough and share > TOGETHER:
+        told = binned.renewed(u)
+        share = uncertainty.inflation(told, u)
+    return told if told.prior is None else replace(told, prior=replace(told.prior, share=share))
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ REACH = 0.08
 EXACT = 1e-9
 """Cost at least, in squared noise scales: a model that is met to the last bit still has an ellipsoid."""
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
-"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share, or by less than
-one residual's mean square of all: with more estimates still move by a share of their errors."""
+"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share, or the sum of
+squares by less than one of them: with more, estimates still move by a share of their errors."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
 SIZES = (1.0, 0.3)
 """Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""

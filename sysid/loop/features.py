@@ -20,10 +20,9 @@ BIN = 0.25  # s
 CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.yaw")
 """Mean reported speeds, and displacement over a bin divided by its length [m/s, rad/s].
 
-The pose that the odometry adds up is left out: it tells no more than the reported speeds, and where a vehicle
-updates it in steps of its own clock, those steps would be taken for motion. Where rows are at the times of those steps
-it may be had as well (`make_features`): it has no low-pass."""
-COUNTED = ("odometry.forward", "odometry.yaw")
+The pose that the odometry adds up is left out: where a vehicle updates it in steps of its own clock, those steps would
+be taken for motion. Where rows are at the times of those steps it is exact to a fraction of a millimetre, more than any
+model of skidding wheels: fits with it foretold held-out drives worse (docs/fit.md)."""
 MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
 LONG_AGO = -1e6  # s
 MAX_WIDE_GAP = 1.0  # the same of wider bins, where the outside pose comes seldom anyway
@@ -60,8 +59,6 @@ class Features:
     start: np.ndarray  # (B, 3) pose at t = 0, the sample before the first one where it is a measurement
     mask: np.ndarray  # (B, K, 5) 1 where measured
     middle: np.ndarray  # (K,) time of each bin's middle [s]
-    counted: _Edges | None = None
-    """Of the pose that the odometry adds up, where it is compared: 2 more channels."""
 
     def of(self, values: Measured | Simulated) -> np.ndarray:
         """Features (..., B, K, 5); what was not measured is 0."""
@@ -73,10 +70,7 @@ class Features:
         speeds = (total[..., row, self.last, :] - total[..., row, self.first, :]) / count
         start = np.broadcast_to(self.start[:, None], (*pose.shape[:-2], 1, 3))
         pose = xp.concatenate([start, pose], axis=-2)
-        found = [speeds, _motion(self.pose.at(pose)) / self.width]
-        if self.counted is not None:
-            found.append(_motion(self.counted.at(odometry[..., :3]))[..., [0, 2]] / self.width)
-        return xp.concatenate(found, axis=-1) * self.mask
+        return xp.concatenate([speeds, _motion(self.pose.at(pose)) / self.width], axis=-1) * self.mask
 
 
 def bin_width(trials: Sequence[Trial]) -> float:
@@ -106,12 +100,8 @@ def pose_times(trial: Trial) -> np.ndarray:
     return np.concatenate([[0.0 if trial.start.measured and len(t) and t[0] > 0 else LONG_AGO], t])
 
 
-def make_features(trials: tuple[Trial, ...], width: float = BIN, counted: bool = False) -> Features:
-    """The feature map of trials that are padded as in `sysid.rollout.make_batch`.
-
-    Args:
-        counted: the pose that the odometry adds up is compared as well.
-    """
+def make_features(trials: tuple[Trial, ...], width: float = BIN) -> Features:
+    """The feature map of trials that are padded as in `sysid.rollout.make_batch`."""
     bins = max(int(np.floor(trial.duration / width + 1e-6)) for trial in trials)
     edge = np.arange(bins + 1) * width
     start = np.array([[t.start.x, t.start.y, t.start.yaw] for t in trials])
@@ -124,13 +114,8 @@ def make_features(trials: tuple[Trial, ...], width: float = BIN, counted: bool =
     first = np.stack([np.searchsorted(t, edge[:-1] - 1e-9) for t in odometry_t])
     last = np.stack([np.searchsorted(t, edge[1:] - 1e-9) for t in odometry_t])
     sampled = last > first
-    shown, adds_up = [sampled, sampled, pose.known, pose.known, pose.known], None
-    if counted:
-        has = [t.odometry is not None and t.odometry.x is not None and t.odometry.yaw is not None for t in trials]
-        adds_up = _edges([t if one else np.zeros(0) for t, one in zip(odometry_t, has, strict=True)], edge)
-        shown += [adds_up.known, adds_up.known]
-    mask = np.stack(shown, axis=-1).astype(float)
-    return Features(width, pose, first, last, start, mask, (edge[:-1] + edge[1:]) / 2, adds_up)
+    mask = np.stack([sampled, sampled, pose.known, pose.known, pose.known], axis=-1).astype(float)
+    return Features(width, pose, first, last, start, mask, (edge[:-1] + edge[1:]) / 2)
 
 
 def _edges(times: list[np.ndarray], edge: np.ndarray) -> _Edges:

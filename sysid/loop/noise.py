@@ -140,7 +140,7 @@ def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) 
     """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
     part = deviations(target, groups)
     inside = [i for group in groups if len(group) > 1 for i in group]
-    scale = np.array(USUAL)[np.r_[:5, 0:2][: target.shape[-1]]]
+    scale = np.array(USUAL)
     if len(inside) >= 3:
         count = np.maximum(mask[inside].sum((0, 1)), 1)
         found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)

@@ -80,7 +80,7 @@ class TorqueDrive(Effect):
         error = target - motion.spin
         response = spin_response(motion)
         last = memory.last
-        # Half a period before the middle of this step the spin was between those in the middle of two of the last steps.
+        # Half a period before the middle of this step the spin was between those in the middle of two recent steps.
         age = memory.begun * self.period / (2 * motion.dt)
         old, older = jnp.minimum(age, 1.0), jnp.clip(age - 1.0, 0.0, 1.0)
         before = last.spin + older * (last.earlier - last.spin)
