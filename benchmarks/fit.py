@@ -78,6 +78,8 @@ class Benchmark:
     """Starts of the gradient searches among them."""
     many: int = fit_searches.STARTS
     """Starts at once of many_starts."""
+    whole: bool = True
+    """Whether many_starts goes on from the best of them with the rest of the default search."""
     terrains: tuple[Literal["asphalt", "sand", "pooled"], ...] = ("asphalt", "sand", "pooled")
     """Fits of the DRIVE runs."""
     windows: int = 100
@@ -216,7 +218,8 @@ def many_starts(settings: Benchmark) -> None:
     problem = make_problem(log, FitConfig(physics_dt=settings.physics_dt))
 
     def search() -> dict[str, Any]:
-        return fit_searches.many_starts(problem, log.spec.track, settings.many, settings.iterations)
+        return fit_searches.many_starts(problem, log.spec.track, settings.many, settings.iterations,
+                                        settings.whole)
 
     first = search()["seconds"]
     print(f"first of {settings.repeats + 1} searches: {first:.1f} s", flush=True)
@@ -250,6 +253,10 @@ def starts(settings: Benchmark) -> None:
     if settings.collect:
         results = read_results(folder)
         if results:
+            log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)
+            ends = np.array([one["u"] for one in results])
+            costs = fit_searches.common_costs(make_problem(log, FitConfig()), log.spec.track, ends)
+            results = [{**one, "cost": float(cost)} for one, cost in zip(results, costs, strict=True)]
             figures = on_device(fit_searches.summarise_starts(results, "" if name == "plant" else f"{name}_"), results)
             record("fit", CLAIM, figures)
             show(figures)

@@ -17,6 +17,7 @@ import numpy as np
 from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid import gradient, starts, tpe
+from sysid.feature_objective import make_features_objective
 from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, choose, fitted_plant
 from sysid.log import Log, load_log
 from sysid.objective import HUGE, Objective
@@ -95,6 +96,22 @@ def start_job(
             "seconds": sum(one["seconds"] for one in (drawn, coarse, fine))}
 
 
+def common_costs(problem: Problem, track: float, ends: np.ndarray) -> np.ndarray:
+    """Costs (S,) of where searches ended (S, P), all in the noise that the best of them leaves.
+
+    Motion in bins is weighed by the noise of each search's own end, in which any end costs about 1.
+    """
+    best = -1
+    bins = make_features_objective(problem.objective, track)
+    costs = np.zeros(len(ends))
+    for _ in range(len(ends)):
+        before, best = best, int(costs.argmin())
+        if best == before:
+            break
+        costs = gradient.costs_of(bins.renewed(ends[best]), ends, robust=True)
+    return costs
+
+
 def summarise_starts(results: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, dict[str, Any]]:
     """How many starts end within SAME of the best cost, and within ten times that."""
     costs = np.array([one["cost"] for one in results])
@@ -161,9 +178,9 @@ def summarise_tpe(
     return figures
 
 
-def many_starts(problem: Problem, track: float, count: int, iterations: int) -> dict[str, Any]:
+def many_starts(problem: Problem, track: float, count: int, iterations: int, whole: bool = True) -> dict[str, Any]:
     """Costs and seconds of `count` starts at once, each drawn, fitted to features, and then to what the default search
-    ends on; and of that search as a whole, which goes on from the best of them and looks elsewhere."""
+    ends on; if `whole` also of that search as a whole, which goes on from the best of them and looks elsewhere."""
     report, began = reporter(f"{count} starts"), time.perf_counter()
     points = starts.draw(problem.objective, range(count), track, 0, progress=report)
     drawn = time.perf_counter()
@@ -173,10 +190,12 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int) -> 
     ends = np.concatenate([coarse.u[None], coarse.starts[1:]])
     fine = gradient.fit(told, problem.space, starts=ends, iterations=iterations, robust=True, progress=report)
     seconds = time.perf_counter() - began
+    done = {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
+            "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn}
+    if not whole:
+        return done
     found, _, _ = gradient_search(told, problem.space, fine.u[None], iterations, FitConfig(), report)
-    return {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
-            "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn,
-            "whole": time.perf_counter() - began, "whole_cost": found.cost}
+    return {**done, "whole": time.perf_counter() - began, "whole_cost": found.cost}
 
 
 def summarise_many(results: Sequence[Mapping[str, Any]], platform: str) -> dict[str, dict[str, Any]]:
@@ -185,10 +204,14 @@ def summarise_many(results: Sequence[Mapping[str, Any]], platform: str) -> dict[
     stem = "gpu_seconds" if platform == "gpu" else "cpu_seconds_32_starts"
     seconds = [float(one["seconds"]) for one in results]
     compiling = [float(one["first"]) - float(np.median(seconds)) for one in results]
-    arrived = [float((np.array(one["costs"]) <= one["whole_cost"] * (1 + SAME)).sum()) for one in results]
-    return {stem: figure(seconds, "s"), f"{stem}_compile": figure(compiling, "s"),
+    figures = {stem: figure(seconds, "s"), f"{stem}_compile": figure(compiling, "s")}
+    results = [one for one in results if "whole" in one]
+    if results:
+        arrived = [float((np.array(one["costs"]) <= one["whole_cost"] * (1 + SAME)).sum()) for one in results]
+        figures |= {
             f"{stem}_whole": figure([float(one["whole"]) for one in results], "s, other valleys looked for as well"),
             f"{stem}_arrived": figure(arrived, f"of {len(results[0]['costs'])} starts before that")}
+    return figures
 
 
 def curve_job(
