@@ -242,7 +242,7 @@ def coverage(settings: Benchmark) -> None:
         results = read_results(folder, f"{kind}_*")
         if results:
             figures = on_device(fit_coverage.summarise(results, prefix), results)
-            record("fit", CLAIM, figures)
+            record("fit", CLAIM, figures, replacing=tuple(f"{prefix}{stem}" for stem in fit_coverage.PER_PARAMETER))
             show(figures)
 
 

@@ -23,7 +23,7 @@ from benchmarks.harness import figure
 from sysid.fit import FitConfig, fit_log, fitted_plant, make_problem
 from sysid.log import Log, load_log
 from sysid.models import with_effects
-from sysid.space import Space, make_space, searched
+from sysid.space import NUISANCE, Space, make_space, searched
 from sysid.synthetic import write_dataset
 from whill_mjx.parameters import get_values, set_values
 from whill_mjx.presets import preset_params
@@ -40,6 +40,7 @@ USUAL = {"body.com_z": 0.1, "torque_drive.kff": 0.05, "torque_drive.period": 0.0
          "wheel_damping.damping": 0.1, "wheel_inertia.ratio": 2.0, "wheel_inertia.reaction": 0.5}
 SPREAD = 0.15  # of the logarithm of a value from log to log
 SHIFT = 0.02  # of the range, where a value may be zero or negative
+PER_PARAMETER = ("coverage_90_", "half_width_90_", "bias_", "identifiable_")
 TOLD = 0.5  # share of the logs in which a parameter must be identifiable to be counted
 
 
@@ -140,7 +141,7 @@ def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[st
     names = list(dict.fromkeys(name for one in results for name in one["parameters"]))
     for name in names:
         rows = [one["parameters"][name] for one in results if name in one["parameters"]]
-        told = [row for row in rows if row["identifiable"]]
+        told = [row for row in rows if row["identifiable"] and name not in NUISANCE]
         figures[f"{prefix}identifiable_{name}"] = figure([len(told) / len(rows)], "share")
         if not told:
             continue

@@ -55,7 +55,8 @@ def figure(repeats: list[float], unit: str, device: str | None = None) -> dict[s
 
 
 def record(
-    stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS, replacing: str | None = None
+    stem: str, claim: str, figures: dict[str, dict[str, Any]], folder: Path = RESULTS,
+    replacing: str | tuple[str, ...] | None = None,
 ) -> Path:
     """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept, but for
     those that begin with `replacing`: they are of an earlier run which had others. A figure measured elsewhere may tell

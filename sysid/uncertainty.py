@@ -23,6 +23,7 @@ from sysid.metrics import replicate_groups
 from sysid.objective import Told, without_prior
 from sysid.sandwich import Variance, sandwich
 from sysid.slopes import average_slopes, likely
+from sysid.space import NUISANCE
 
 CONFIDENCE = 0.90
 PIECES = 8
@@ -129,11 +130,13 @@ def estimate(
     for index, name in enumerate(space.names):
         low = space.to_values(u - quantile * deviation)[index]
         high = space.to_values(u + quantile * deviation)[index]
-        narrow = deviation[index] < UNIDENTIFIABLE * PRIOR_SD
-        remark = "" if narrow else "not identifiable: the log hardly narrows its bounds"
+        narrow = deviation[index] < UNIDENTIFIABLE * PRIOR_SD and name not in NUISANCE
+        remark = "" if narrow else f"not identifiable: {NUISANCE.get(name, 'the log hardly narrows its bounds')}"
         if narrow and min(u[index], 1 - u[index]) < WALL:
             remark = f"on its {'lower' if u[index] < 0.5 else 'upper'} bound"
-        if not narrow:
+        if name in NUISANCE:
+            low, high = space.low[index], space.high[index]
+        elif not narrow:
             low, high = min(low, space.high[index]), max(high, space.low[index])
         estimates.append(Estimate(name, float(space.initial[index]), float(space.to_values(u)[index]), float(low),
                                   float(high), bool(narrow), remark))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -156,3 +157,24 @@ def test_figures_are_said_to_be_of_the_device_that_did_the_jobs():
     assert on_device(figures, [{"device": "there"}])["a"]["device"] == "there"
     assert on_device(figures, [{}])["a"]["device"] == "here" and on_device(figures, [{}])["a"]["versions"] == {}
     assert on_device(figures, [{"versions": {"jax": "9"}}])["a"]["versions"] == {"jax": "9"}
+
+
+def test_ends_of_starts_are_compared_in_the_noise_of_the_best(monkeypatch):
+    """In its own noise every end costs 1: only one noise for all tells which is nearest the truth, 0.2."""
+    class Bins:
+        counted = 1
+
+        def __init__(self, noise=1.0):
+            self.noise = noise
+
+        def renewed(self, u):
+            return Bins(abs(float(u[0]) - 0.2))
+
+        def residuals(self, u):
+            return (u[:, None, :] - 0.2) / self.noise
+
+    monkeypatch.setattr(fit_searches, "make_features_objective", lambda *_: Bins())
+    ends = np.array([[0.5], [0.3], [0.25], [0.9]])
+    costs = fit_searches.common_costs(SimpleNamespace(objective=None), 0.5, ends)
+    np.testing.assert_allclose(costs[1:3], [4.0, 1.0])
+    assert costs.argmin() == 2 and costs[3] > costs[0] > 8.0

@@ -87,7 +87,7 @@ def test_a_step_of_the_loaded_vehicle_is_some_thousand_operations_on_some_hundre
     assert 1000 < base.operations < work.operations < 4000
     assert more.operations > base.operations and more.moved > base.moved  # another memory
     assert 0 < work.divisions < work.operations and 10 < work.transcendentals < 100
-    assert work.moved == pytest.approx(136 + 2 * 357 + 8)
+    assert work.moved == pytest.approx(136 + 2 * 365 + 8)
     assert work.limits["memory"] == pytest.approx(4.8e12 / work.moved)
     assert work.limits["issue"] < work.limits["arithmetic"]
 

@@ -183,3 +183,16 @@ def test_what_the_start_was_averaged_from_is_not_scored_again(unicycle_log):
         assert np.isnan(columns[name][0, :resting]).all() and np.isfinite(columns[name][0, resting])
     assert np.isfinite(columns["odometry.v"][0, 0])
     assert objective.counted < objective.measured.pose_mask.sum() + objective.measured.odometry_mask.sum()
+
+
+@pytest.mark.quick
+def test_a_nuisance_is_never_told_and_its_interval_is_its_bounds():
+    random = np.random.default_rng(5)
+    plain, other = (Linear(designs(np.random.default_rng(6)), correlated(random, 0.0)) for _ in range(2))
+    other._errors = plain._errors
+    other.space = dataclasses.replace(plain.space, names=("a", "torque_drive.period", "c"))
+    u = gradient.fit(plain, plain.space, iterations=4).u
+    usual, known = (uncertainty.estimate(one, u).estimates for one in (plain, other))
+    assert usual[1].identifiable and not known[1].identifiable and "not identifiable" in known[1].remark
+    assert (known[1].low, known[1].high) == (0.0, 1.0)
+    assert (known[0].low, known[2].high) == (usual[0].low, usual[2].high)
