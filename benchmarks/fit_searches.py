@@ -173,7 +173,7 @@ def summarise_tpe(
         figures["tpe500_j_sequential"] = figure([float(one["cost"]) for one in sequential], "m, sum over trials")
     if batched and sequential:
         ratio = figures["tpe500_j"]["value"] / figures["tpe500_j_sequential"]["value"]
-        figures["tpe500_j_over_sequential"] = figure([ratio], "-")
+        figures["tpe500_j_over_sequential"] = figures[f"tpe500_{platform}_j_over_sequential"] = figure([ratio], "-")
         figures["tpe500_within_5_percent"] = figure([float(ratio <= 1 + CLOSE)], "1 is yes")
     return figures
 
