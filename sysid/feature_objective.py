@@ -30,7 +30,7 @@ from sysid.loop.noise import (
     roughness,
 )
 from sysid.normal_equations import NormalEquations, make_equations
-from sysid.objective import HUGE, Objective, Replays, append_prior, arrays_prior, prior_arrays
+from sysid.objective import HUGE, Objective, Replays, append_prior
 from sysid.prior import Prior
 from sysid.rollout import Simulated
 from sysid.space import Space
@@ -93,17 +93,16 @@ class FeatureObjective:
     def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay."""
         filters = self.whitener
-        return (self.target, self.mask, filters.scale, filters.coefficients, filters.inverse, prior_arrays(self.prior))
+        return self.target, self.mask, filters.scale, filters.coefficients, filters.inverse, self.prior
 
     @property
     def kind(self) -> Any:
         """As in `sysid.normal_equations`."""
-        return FeatureObjective, self.prior is None
+        return FeatureObjective
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> FeatureObjective:
         """The same with other `arrays`."""
-        return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:5]),
-                       prior=arrays_prior(arrays[5]))
+        return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:5]), prior=arrays[5])
 
     @cached_property
     def equations(self) -> NormalEquations | None:

@@ -214,10 +214,11 @@ def choose(
                         progress=progress)
     share = uncertainty.inflation(objective, near.u)
     told: Objective | FeatureObjective = objective
-    binned = make_features_objective(objective, track)
-    if config.method == "features" and binned.enough and share > TOGETHER:
-        told = binned.renewed(u)
-        share = uncertainty.inflation(told, u)
+    if config.method == "features" and share >= TOGETHER:
+        binned = make_features_objective(objective, track)
+        if binned.enough:
+            told = binned.renewed(u)
+            share = uncertainty.inflation(told, u)
     return told if told.prior is None else replace(told, prior=replace(told.prior, share=share))
 
 

@@ -123,17 +123,17 @@ class Objective:
     @property
     def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay and `kind`."""
-        return self.noise.pose, self.noise.odometry, prior_arrays(self.prior)
+        return self.noise.pose, self.noise.odometry, self.prior
 
     @property
-    def kind(self) -> tuple[Any, ...]:
+    def kind(self) -> Any:
         """As in `sysid.normal_equations`."""
-        return Objective, self.prior is None
+        return Objective
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
         """The same with other `arrays`."""
         noise = replace(self.noise, pose=arrays[0], odometry=arrays[1])
-        return replace(self, noise=noise, prior=arrays_prior(arrays[2]))
+        return replace(self, noise=noise, prior=arrays[2])
 
     @cached_property
     def equations(self) -> NormalEquations | None:
@@ -309,16 +309,6 @@ def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np
     """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
     weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
     return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
-
-
-def prior_arrays(prior: Prior | None) -> tuple[Any, ...]:
-    """The numbers of a prior, for a compiled function."""
-    return () if prior is None else (prior.mean, prior.sd, prior.share)
-
-
-def arrays_prior(arrays: tuple[Any, ...]) -> Prior | None:
-    """The prior of such numbers."""
-    return Prior(*arrays) if arrays else None
 
 
 def without_prior(objective: Told, table: np.ndarray) -> np.ndarray:

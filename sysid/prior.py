@@ -8,10 +8,10 @@ a log tells they hardly move.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from flax import struct
 
 from sysid.space import Space
 
@@ -22,7 +22,7 @@ UNKNOWN = 0.29  # of the range: standard deviation of a parameter of which only 
 QUANTILE = 1.645  # of the normal distribution, of the 90 % intervals in vehicle files
 
 
-@dataclass(frozen=True)
+@struct.dataclass
 class Prior:
     """Normal distribution of the unit coordinates."""
 

@@ -252,8 +252,8 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
         state = _advance(plant, params, state, commands)
         return state, plant.observe(state)
 
-    params, latency = _without_latency(params)
-    params, lag = _without_lag(params) if plant.frame else (params, None)
+    params, latency = _without(params, SensorDelay.name)
+    params, lag = _without(params, OdometryLag.name) if plant.frame else (params, None)
     state = plant.place(params, start)
     if warm_up:
         state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
@@ -264,7 +264,7 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
         path = path.at[:, column].set(_unwrap(path[:, column]))
     gap = plant.dt * command.shape[1]
     if lag is not None and plant.frame:
-        path = path.at[:, SPEEDS].set(_framed(path[:, SPEEDS], lag, plant.frame, gap))
+        path = path.at[:, SPEEDS].set(_framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
     if latency is not None:
         path = path.at[:, ODOMETRY].set(_late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
@@ -274,26 +274,16 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
     return path.at[:, 2].add(jax.lax.stop_gradient(_turns(start[2] - first[2])))
 
 
-def _without_latency(params: Any) -> tuple[Any, tuple[jax.Array, jax.Array] | None]:
-    """The vehicle without a latency of its odometry, where that comes last, and those of pose and speeds [s] or None.
+def _without(params: Any, name: str) -> tuple[Any, Any]:
+    """The vehicle without the last of its effects of sensing, where that is the named one, and that effect or None.
 
-    What was recorded is read later instead: the same law, without a buffer that every step would have to carry.
+    What was recorded is read by its law instead, without a buffer that every step would have to carry.
     """
     effects = getattr(params, "effects", ())
     last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
-    if not last or getattr(last[0], "name", "") != SensorDelay.name:
+    if not last or getattr(last[0], "name", "") != name:
         return params, None
-    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), (
-        last[0].delay, last[0].delay + last[0].speed)
-
-
-def _without_lag(params: Any) -> tuple[Any, jax.Array | None]:
-    """The vehicle without the low-pass of its reported speeds, where that comes last, and its time constant [s]."""
-    effects = params.effects if hasattr(params, "effects") else ()
-    last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
-    if not last or getattr(last[0], "name", "") != OdometryLag.name:
-        return params, None
-    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0].time_constant
+    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0]
 
 
 def _framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float) -> jax.Array:
@@ -326,13 +316,12 @@ def _framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: floa
     return jax.lax.scan(step, jnp.repeat(speeds[:1], whole + 1, axis=0), means)[1]
 
 
-def _late(path: jax.Array, latency: tuple[jax.Array, jax.Array], dt: float) -> jax.Array:
-    """Odometry (R, 5) as reported so long after it was true [s], of one recorded every `dt` [s], yaw unwrapped."""
-    pose, speed = latency
-    place = jnp.clip(jnp.arange(path.shape[0]) - speed / dt, 0.0, None)
+def _late(path: jax.Array, latency: SensorDelay, dt: float) -> jax.Array:
+    """Odometry (R, 5) as reported with that latency, of one recorded every `dt` [s], yaw unwrapped."""
+    place = jnp.clip(jnp.arange(path.shape[0]) - (latency.delay + latency.speed) / dt, 0.0, None)
     before = jnp.minimum(place.astype(int), path.shape[0] - 2)
     speeds = path[before, 3:] + (place - before)[:, None] * (path[before + 1, 3:] - path[before, 3:])
-    return jnp.concatenate([PoseDelay(pose).outside((), path[:, :3], dt)[1], speeds], axis=1)
+    return jnp.concatenate([PoseDelay(latency.delay).outside((), path[:, :3], dt)[1], speeds], axis=1)
 
 
 class PathReplay:

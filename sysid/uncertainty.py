@@ -21,6 +21,7 @@ import numpy as np
 from sysid.gradient import HUBER, huber_weight, robust_cost
 from sysid.metrics import replicate_groups
 from sysid.objective import Told, without_prior
+from sysid.prior import UNKNOWN
 from sysid.sandwich import Variance, sandwich
 from sysid.slopes import average_slopes, likely
 from sysid.space import NUISANCE
@@ -34,7 +35,7 @@ CHANCE = 0.05
 """Probability below which what replicates share is taken for the model's error."""
 FLIPS = 999  # draws of the signs of trials
 PASSES = 2  # of averaging slopes: over errors as differences tell them, and as averaged slopes do
-PRIOR_SD = 0.29
+PRIOR_SD = UNKNOWN
 """Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
 UNIDENTIFIABLE = 0.5
 """Share of the prior's standard deviation above which a parameter counts as not told by the log."""
