@@ -23,7 +23,7 @@ from sysid.log import Log, load_log
 from sysid.objective import HUGE, Objective
 from sysid.searches import Judge, Trace, arrivals, trace, write
 from sysid.studies import BATCH
-from sysid.valleys import gradient_search
+from sysid.valleys import from_all, gradient_search
 
 STARTS = 32
 SAME = 0.01
@@ -182,13 +182,14 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int, who
     """Costs and seconds of `count` starts at once, each drawn, fitted to features, and then to what the default search
     ends on; if `whole` also of that search as a whole, which goes on from the best of them and looks elsewhere."""
     report, began = reporter(f"{count} starts"), time.perf_counter()
+    starts.compile_ahead(problem.objective, track)
     points = starts.draw(problem.objective, range(count), track, 0, progress=report)
     drawn = time.perf_counter()
     coarse = starts.fit(problem.objective, points, track, FEATURE_ITERATIONS, report)
     fitted = time.perf_counter()
     told = choose(problem.objective, coarse.u, track, FitConfig(), report)
     ends = np.concatenate([coarse.u[None], coarse.starts[1:]])
-    fine = gradient.fit(told, problem.space, starts=ends, iterations=iterations, robust=True, progress=report)
+    fine = from_all(told, problem.space, ends, iterations, robust=True, progress=report)
     seconds = time.perf_counter() - began
     done = {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
             "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn}

@@ -8,13 +8,16 @@ from the origin, with its derivatives, and then moved to the start of each trial
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sysid import pieces
 from sysid.arrays import namespace
 from sysid.cores import cores, on_all_cores, on_processor
 from sysid.log import Trial
@@ -37,6 +40,7 @@ class CourseReplay:
         """
         batch, self.measured = make_batch(trials, plant.dt)
         command, start = np.asarray(batch.command), np.asarray(batch.start, float)
+        self._anywhere, self._record = anywhere, plant.dt * command.shape[2]
         seen: dict[bytes, int] = {}
         keys = [command[i].tobytes() + start[i, 3 if anywhere else 0 :].tobytes() for i in range(len(trials))]
         self._course = np.array([seen.setdefault(key, len(seen)) for key in keys])  # (B,)
@@ -55,11 +59,29 @@ class CourseReplay:
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
         self._replay, self._compiled = Replay(plant, whole, set_values), set[int]()
+        self._traced, self.drives = self._replay, self.courses
+        self._batch, self._trials = whole, [trials[i] for i in first]
+
+    @cached_property
+    def in_pieces(self) -> CourseReplay:
+        """The same with drives in pieces side by side (`sysid.pieces`) where it is traced, if they are long, start at
+        rest and may be anywhere."""
+        records, step = self._batch.command.shape[1], self._record
+        count = pieces.count(records * step)
+        if count < 2 or self._batch.warm_up or not self._anywhere:
+            return self
+        times = pieces.begins(records, count) * step - pieces.OVERLAP
+        speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])
+        other = copy(self)
+        other._traced = self._replay.on(replace(self._batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
+        other.drives = count * self.courses
+        return other
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
         if not on_processor():
-            return self._spread(self._replay.simulate(values), motion=True)
+            size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
+            return self._spread(self._replay.simulate(values, size), motion=True)
         # Rows are of two numbers, each of which is compiled once: for a few tries, and for a Jacobian's differences.
         few = max(min(SETS, INSTANCES // self.courses), 1)
         many = max(min(-(-(2 * values.shape[1] + 1) // cores()), INSTANCES // self.courses), few)
@@ -78,7 +100,7 @@ class CourseReplay:
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""
-        return self._spread(self._replay.traced(values), motion=True)
+        return self._spread(self._traced.traced(values), motion=True)
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""

@@ -9,7 +9,7 @@ processor's vectors, tangents do not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +36,17 @@ class DifferenceReplay:
     def compiled(self) -> dict[Any, Any]:
         """What `sysid.normal_equations` compiled of it."""
         return {}
+
+    @property
+    def drives(self) -> int:
+        """Of one set, side by side."""
+        return self.replay.drives
+
+    @cached_property
+    def in_pieces(self) -> DifferenceReplay:
+        """The same with long drives in pieces side by side (`sysid.pieces`) where it is traced."""
+        pieces = self.replay.in_pieces
+        return self if pieces is self.replay else replace(self, replay=pieces)
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """As that of the replay."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from sysid import gradient
 from sysid.arrays import namespace
+from sysid.cores import on_processor
 from sysid.differences import STEP
 from sysid.log import Trial
 from sysid.loop.features import ENOUGH, Features, bin_width, make_features
@@ -67,6 +68,12 @@ class FeatureObjective:
                 return False
         return True
 
+    @cached_property
+    def quicker(self) -> FeatureObjective:
+        """For a search on its way: the same on a processor; an accelerator replays long drives in pieces."""
+        replay = self.replay if on_processor() else getattr(self.replay, "in_pieces", self.replay)
+        return self if replay is self.replay else replace(self, replay=replay)
+
     @property
     def counted(self) -> int:
         """Number of measured values."""
@@ -93,7 +100,9 @@ class FeatureObjective:
     def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay."""
         filters = self.whitener
-        return self.target, self.mask, filters.scale, filters.coefficients, filters.inverse, self.prior
+        lags = len(filters.coefficients)  # filters of any memory have one shape, so that they share what is compiled
+        coefficients = np.pad(filters.coefficients, ((0, max(LONG - lags, 0)), (0, 0), (0, 0)))
+        return self.target, self.mask, filters.scale, coefficients, filters.inverse, self.prior
 
     @property
     def kind(self) -> Any:

@@ -171,6 +171,7 @@ def fit_log(
                        method="cmaes" if config.method == "cmaes" else "tpe")
         points = np.concatenate([points[:1], scan.starts])[:count]
     elif config.method == "features":
+        starts.compile_ahead(objective, log.spec.track)
         points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
         points = coarse.u[None]
@@ -368,7 +369,8 @@ def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes, unless searches from elsewhere lead on."""
     scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    first = {"features": FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
+    drawn = starts.FIRST + starts.STEPS if config.starts > 1 else 0
+    first = {"features": drawn + FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
     elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
     return first + (TRIED + iterations + elsewhere if config.method not in GLOBAL else 0)
 

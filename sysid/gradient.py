@@ -283,13 +283,14 @@ def huber_weight(residual: Any) -> Any:
     return xp.minimum(1.0, HUBER / xp.maximum(xp.abs(residual), 1e-12))
 
 
-def robust_cost(residual: Any, robust: bool) -> Any:
-    """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K)."""
+def robust_cost(residual: Any, robust: Any) -> Any:
+    """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K). `robust` may be traced."""
     xp = namespace(residual)
-    if not robust:
+    if robust is False:
         return xp.square(residual).sum((-1, -2))
     size = xp.abs(residual)
-    return xp.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2).sum((-1, -2))
+    linear = (size > HUBER) & robust
+    return xp.where(linear, 2 * HUBER * size - HUBER**2, size**2).sum((-1, -2))
 
 
 def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ that only those sums come back.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol
 
 import jax
@@ -19,9 +21,11 @@ from sysid.gradient import huber_weight, robust_cost
 from sysid.rollout import Simulated
 from sysid.space import Space
 
-WASTE = 8  # times as many sets as are asked for are computed rather than that compiled
-LEAST = 32
-"""Sets that are computed at least: on an accelerator a few take as long, and each number is compiled once."""
+DRIVES = 32768
+"""Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
+0.33 s for these), and each number is compiled once."""
+SEARCHES = 32  # sets at least whose gradients and Hessians are made together: as many as a search has starts, at most
+_COMPILERS = ThreadPoolExecutor(7)
 
 
 class Traceable(Protocol):
@@ -50,7 +54,7 @@ class Traceable(Protocol):
 class Sums:
     """Compiled sums over the residuals of an objective."""
 
-    def __init__(self, objective: Traceable, least: int):
+    def __init__(self, objective: Traceable):
         def residual(u: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
             """White residuals (B, K) of one set (P,), and the replays (B,) that diverged."""
             one = objective.with_arrays(arrays)
@@ -58,10 +62,10 @@ class Sums:
                 simulated = one.replay.traced(one.space.to_values(u[None]))
                 return one.residuals(u[None], simulated)[0], one.bad(simulated)[0]
 
-        def cost(u: jax.Array, arrays: Any, robust: bool) -> jax.Array:
+        def cost(u: jax.Array, arrays: Any, robust: jax.Array) -> jax.Array:
             return robust_cost(residual(u, arrays)[0], robust)
 
-        def quadratic(u: jax.Array, arrays: Any, robust: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def quadratic(u: jax.Array, arrays: Any, robust: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             size = u.shape[0]
             up, down = (jnp.clip(u + sign * STEP * jnp.eye(size), 0.0, 1.0) for sign in (1, -1))
             white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], up, down]), arrays)
@@ -69,49 +73,73 @@ class Sums:
             slope = (white[1 : 1 + size] - white[1 + size :]) / width[:, None, None]  # (P, B, K)
             lost = bad[:1] | bad[1 : 1 + size] | bad[1 + size :]
             slope = jnp.where(lost[..., None] | ~jnp.isfinite(slope), 0.0, slope)
-            weight = huber_weight(white[0]) if robust else jnp.ones_like(white[0])
+            weight = jnp.where(robust, huber_weight(white[0]), 1.0)
             with jax.default_matmul_precision("highest"):
                 gradient = jnp.einsum("pbk,bk->p", slope, white[0] * weight)
                 hessian = jnp.einsum("pbk,qbk->pq", slope, slope * weight)
             return robust_cost(white[0], robust), gradient, hessian
 
-        self.least = least
-        self.sizes: dict[Any, set[int]] = {}
-        """Numbers of sets that each function was compiled for."""
-        self.cost, self.quadratic = (
-            jax.jit(jax.vmap(one, in_axes=(0, None, None)), static_argnums=2) for one in (cost, quadratic))
+        self._functions = {"cost": jax.jit(jax.vmap(cost, in_axes=(0, None, None))),
+                           "quadratic": jax.jit(jax.vmap(quadratic, in_axes=(0, None, None)))}
+        self.compiled: dict[Any, Future[Any]] = {}
 
-    def call(self, function: Any, u: np.ndarray, arrays: Any, robust: bool) -> Any:
-        """What a function gives for each of u (N, P)."""
-        sizes, count = self.sizes.setdefault((function, robust), set()), len(u)
-        enough = max(WASTE * count, self.least)
-        size = min((size for size in sizes if count <= size <= enough), default=max(count, self.least))
-        sizes.add(size)
-        padded = np.concatenate([u, np.repeat(u[-1:], size - count, axis=0)])
-        found = function(jnp.asarray(padded, jnp.result_type(float)), arrays, robust)
-        return jax.tree.map(lambda leaf: np.asarray(leaf[:count], float), found)
+    def compile(self, name: str, size: int, parameters: int, arrays: Any) -> Future[Any]:
+        """The function for so many sets, compiled in a thread of its own."""
+        leaves, structure = jax.tree.flatten(arrays)
+        key = name, size, structure, tuple(leaf.shape for leaf in leaves)
+        if key not in self.compiled:
+            u = jax.ShapeDtypeStruct((size, parameters), jnp.result_type(float))
+            self.compiled[key] = _COMPILERS.submit(
+                lambda: self._functions[name].lower(u, arrays, np.bool_(False)).compile())
+        return self.compiled[key]
 
 
 class NormalEquations:
     """Sums over the residuals of one objective."""
 
-    def __init__(self, objective: Traceable, least: int = LEAST):
-        """`least` is the number of sets that any call is filled up to."""
-        compiled, kind = objective.replay.compiled, (objective.kind, least)
-        if kind not in compiled:
-            compiled[kind] = Sums(objective, least)
-        self.sums: Sums = compiled[kind]
+    def __init__(self, objective: Traceable, at_once: int):
+        """`at_once` is the number of sets that are replayed together."""
+        compiled = objective.replay.compiled
+        if objective.kind not in compiled:
+            compiled[objective.kind] = Sums(objective)
+        self.sums: Sums = compiled[objective.kind]
         self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
+        parameters = objective.space.size
+        sizes = {"cost": at_once, "quadratic": max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))}
+        # A search needs both: they are compiled side by side.
+        self._compiled = {name: (size, self.sums.compile(name, size, parameters, self._arrays))
+                          for name, size in sizes.items()}
 
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray:
         """Sum (N,) of squares, or of the Huber loss, at unit coordinates (N, P)."""
-        return self.sums.call(self.sums.cost, u, self._arrays, robust)
+        return self._call("cost", u, robust)
 
     def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cost (N,), half its gradient (N, P) and half its Hessian (N, P, P) by Gauss and Newton, at u (N, P)."""
-        return self.sums.call(self.sums.quadratic, u, self._arrays, robust)
+        return self._call("quadratic", u, robust)
+
+    def _call(self, name: str, u: np.ndarray, robust: bool) -> Any:
+        """What a function gives for each of u (N, P), so many of them at a time; the last call is filled up."""
+        size, compiled = self._compiled[name]
+        function = compiled.result()
+        padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % size, axis=0)])
+        parts = [function(jnp.asarray(padded[i : i + size], jnp.result_type(float)), self._arrays, np.bool_(robust))
+                 for i in range(0, len(padded), size)]
+        return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf, float) for leaf in leaves])[: len(u)],
+                            *parts)
+
+
+def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
+    """Let an accelerator compile side by side what a search by these objectives will need, and what it fetches of a
+    replay with values (P,); a processor compiles in seconds what it comes to."""
+    if not on_processor() and hasattr(replay, "traced"):
+        _COMPILERS.submit(replay.simulate, values[None])
+        for objective in objectives:
+            _ = objective.equations
 
 
 def make_equations(objective: Traceable) -> NormalEquations | None:
     """Those of an objective whose replay an accelerator computes; None on a processor, where residuals are at hand."""
-    return None if on_processor() or not hasattr(objective.replay, "traced") else NormalEquations(objective)
+    if on_processor() or not hasattr(objective.replay, "traced"):
+        return None
+    return NormalEquations(objective, max(DRIVES // objective.replay.drives, 1))

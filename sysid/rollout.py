@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from sysid import pieces
 from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
@@ -52,6 +53,9 @@ class Plant:
     """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
     substeps: Callable[[Any, Any, jax.Array], Any] | None = None
     """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
+    record: Callable[[Any, Any, jax.Array], jax.Array] | None = None
+    """(params, state, commands (R, K, 2)) -> observed (R, 9) after each K physics steps, where an accelerator has a
+    quicker way."""
     frame: float | None = None
     """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
     once a frame."""
@@ -61,7 +65,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
     """The simulator's vehicle as a `Plant`; its parameters are `VehicleParams`."""
     from whill_mjx.kinematics import quaternion_from_angles, reference_pose
     from whill_mjx.model import build_model
-    from whill_mjx.vehicle import place, substep, substeps
+    from whill_mjx.vehicle import place, record, substep, substeps
 
     config = config or VehicleConfig()
     model = build_model(spec, config)
@@ -90,7 +94,8 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
     return Plant(lambda params, start: place(model, params, *start),
                  lambda params, state, command: substep(model, params, state, command), observe,
                  config.physics_dt, move,
-                 lambda params, state, commands: substeps(model, params, state, commands))
+                 lambda params, state, commands: substeps(model, params, state, commands),
+                 lambda params, state, commands: record(model, params, state, commands, observe))
 
 
 def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -115,6 +120,7 @@ class Batch:
     odometry_weight: jax.Array  # (B, L)
     warm_up: int = struct.field(pytree_node=False, default=0)
     """Physics steps at the start's speeds before the trial; 0 where all trials start at rest."""
+    speeds: jax.Array | None = None  # (B, W, 2) m/s, rad/s where W pieces of drives begin (`sysid.pieces`)
 
 
 @dataclass(frozen=True)
@@ -240,29 +246,44 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
     return results
 
 
-def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0) -> jax.Array:
+def path_of(
+    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None
+) -> jax.Array:
     """States (R + 1, 9) at the records, as `Plant.observe` tells them, of one drive.
 
     Args:
         command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].
         start: (5,) x, y, yaw, v, omega.
         warm_up: physics steps at the start's speeds before it.
+        speeds: (W, 2) where pieces begin, to replay it in these (`sysid.pieces`).
     """
-    def record(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
+    params, latency = _without(params, SensorDelay.name)
+    params, lag = _without(params, OdometryLag.name) if plant.frame else (params, None)
+
+    def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
         state = _advance(plant, params, state, commands)
         return state, plant.observe(state)
 
-    params, latency = _without(params, SensorDelay.name)
-    params, lag = _without(params, OdometryLag.name) if plant.frame else (params, None)
-    state = plant.place(params, start)
-    if warm_up:
-        state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
-    first = plant.observe(state)
-    _, later = jax.lax.scan(record, state, command)
-    path = jnp.concatenate([first[None], later])
+    def drive(start: jax.Array, command: jax.Array) -> jax.Array:
+        state = plant.place(params, start)
+        if warm_up:
+            state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
+        if plant.record is None or on_processor():
+            later = jax.lax.scan(after, state, command)[1]
+        else:
+            later = plant.record(params, state, command)
+        return jnp.concatenate([plant.observe(state)[None], later])
+
+    gap = plant.dt * command.shape[1]
+    if speeds is None:
+        path = drive(start, command)
+    else:
+        begin = ((POSE, start[:3]), (slice(3, 6), jnp.zeros_like(start[:3])))
+        path = pieces.record(drive, command, start, speeds, round(pieces.OVERLAP / gap), begin)
+        path = path.at[-1, 8].set(path[:, 8].max())
+    turns = jax.lax.stop_gradient(_turns(start[2] - path[0, 2]))
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
-    gap = plant.dt * command.shape[1]
     if lag is not None and plant.frame:
         path = path.at[:, SPEEDS].set(_framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
     if latency is not None:
@@ -271,7 +292,7 @@ def path_of(plant: Plant, params: Any, command: jax.Array, start: jax.Array, war
         if hasattr(effect, "outside"):
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
     # The measured yaw may count full turns from another origin than the simulated one.
-    return path.at[:, 2].add(jax.lax.stop_gradient(_turns(start[2] - first[2])))
+    return path.at[:, 2].add(turns)
 
 
 def _without(params: Any, name: str) -> tuple[Any, Any]:
@@ -362,7 +383,7 @@ class PathReplay:
 
 
 def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
-    path = path_of(plant, params, one.command, one.start, one.warm_up)
+    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]

@@ -13,20 +13,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid import gradient
-from sysid.cores import on_processor
+from sysid import gradient, normal_equations
 from sysid.feature_objective import make_features_objective
 from sysid.objective import Objective
 from sysid.result import FitResult, Progress
 
 SCAN = 256
 """Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
-KEPT = 3
-"""The best of them, from each of which is searched: a few steps do not tell yet which valley is the deepest."""
-STEPS = 20
-"""Iterations of those searches, at most."""
+KEPT, FIRST = 8, 3
+"""The best of them, and the iterations of a search from each: of ten random points three lead to the deepest valley,
+and their costs do not tell which; where a few iterations led does."""
+FOLLOWED, STEPS = 2, 20
+"""How many of those are searched further, and in how many iterations at most."""
 EDGE = 0.02  # of the range, at both ends, without random points
-CHUNK, ACCELERATED = 512, 4096  # points replayed together, on a processor and on an accelerator
+CHUNK = 512  # points whose residuals are kept at once
 AGREE = 0.02
 """Starts agree where their costs differ by no more than this share of the best one."""
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
@@ -45,7 +45,7 @@ def fit(
     Returns:
         The best point; `start_costs` are those of the first fit, ascending.
     """
-    coarse = make_features_objective(objective, track)
+    coarse = make_features_objective(objective, track).quicker
     found = gradient.fit(coarse, coarse.space, starts=points, iterations=iterations, tolerance=TOLERANCE,
                          progress=progress)
     fine = coarse.renewed(found.u)
@@ -74,21 +74,33 @@ def draw(
     scanned = [number for number in numbers if number > 0]
     if not scanned:
         return np.array([first for _ in numbers])
-    coarse = make_features_objective(objective, track)
+    coarse = make_features_objective(objective, track).quicker
     # Close to the walls as well: of many parameters the likely values are a small share of the range.
     tried = np.concatenate([np.random.default_rng((seed, number)).uniform(EDGE, 1 - EDGE, (scan, space.size))
                             for number in scanned])
-    chunk = CHUNK if on_processor() else ACCELERATED
+    chunk = CHUNK if coarse.equations is None else len(tried)
     costs = np.concatenate([coarse.weighted_cost(tried[i : i + chunk]) for i in range(0, len(tried), chunk)])
     costs, tried = costs.reshape(len(scanned), -1), tried.reshape(len(scanned), -1, space.size)
-    kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :KEPT, None], axis=1)  # (S, KEPT, P)
-    found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=STEPS, tolerance=TOLERANCE,
-                         progress=progress)
-    ends, costs = np.empty_like(found.starts), np.empty_like(found.start_costs)
-    ends[found.order], costs[found.order] = found.starts, found.start_costs
-    best = costs.reshape(len(scanned), -1).argmin(1)
-    ends = ends.reshape(kept.shape)[np.arange(len(scanned)), best]
+
+    def best_of(tried: np.ndarray, costs: np.ndarray, count: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where searches from the `count` cheapest of points (S, N, P) with costs (S, N) end, and what that costs."""
+        kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :count, None], axis=1)
+        found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=iterations,
+                             tolerance=TOLERANCE, progress=progress)
+        ends, costs = np.empty_like(found.starts), np.empty_like(found.start_costs)
+        ends[found.order], costs[found.order] = found.starts, found.start_costs
+        return ends.reshape(kept.shape), costs.reshape(kept.shape[:2])
+
+    ends, costs = best_of(tried, costs, KEPT, FIRST)
+    ends, costs = best_of(ends, costs, FOLLOWED, STEPS)
+    ends = ends[np.arange(len(scanned)), costs.argmin(1)]
     return np.array([first if number == 0 else ends[scanned.index(number)] for number in numbers])
+
+
+def compile_ahead(objective: Objective, track: float) -> None:
+    """Begin to compile what the default search needs on an accelerator: bins in pieces, whole ones, and poses."""
+    bins = make_features_objective(objective, track)
+    normal_equations.compile_ahead((bins.quicker, objective, bins), objective.replay, objective.space.initial)
 
 
 def agreeing(costs: np.ndarray) -> int:

@@ -27,6 +27,7 @@ DEAR, FAR = 10.0, 12
 """Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
 FIRST, KEPT, LOOK = 1, 2, 3
 """Iterations from all of these, how many are searched further, and iterations after which one must be better."""
+LAST = 3  # iterations on whole drives at most, after those in pieces of an accelerator
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
 
@@ -47,8 +48,7 @@ def gradient_search(
     """
 
     def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
-        return gradient.fit(objective, space, starts=starts, iterations=iterations, robust=config.robust,
-                            progress=progress)
+        return from_all(objective, space, starts, iterations, config.robust, progress)
 
     def renew(objective: Told, result: FitResult, starts: np.ndarray) -> tuple[Told, FitResult]:
         """With the noise that the result leaves, searched again from starts (S, P) where that changes it."""
@@ -88,13 +88,28 @@ def gradient_search(
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
 
 
+def from_all(
+    objective: Told, space: Space, starts: np.ndarray, iterations: int, robust: bool = False,
+    progress: Progress | None = None,
+) -> FitResult:
+    """LM from all starts (S, P), on what is quicker as long as that leads on."""
+    quicker, spent = getattr(objective, "quicker", objective), 0
+    if quicker is not objective:
+        way = gradient.fit(quicker, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+        starts, spent, iterations = np.empty_like(way.starts), way.evaluations, min(iterations, LAST)
+        starts[way.order] = way.starts
+    found = gradient.fit(objective, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+    return replace(found, evaluations=found.evaluations + spent)
+
+
 def _from_ends(
     search: Callable[[np.ndarray, int], FitResult], objective: Told, result: FitResult, iterations: int,
     robust: bool,
 ) -> FitResult:
-    """The result with where searches from those ends of ranges lead that cost little."""
+    """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here
+    lies on the same ground, and a search from it would come back."""
     costs, points = gradient.ends_of_ranges(objective, result.u, robust=robust)
-    near = [i for i in np.argsort(costs) if costs[i] < FLAT * result.cost][:KEPT]
+    near = (costs < FLAT * result.cost) & (np.abs(costs / result.cost - 1) > WORTH)
     return _from_elsewhere(search, result, points[near], iterations)
 
 

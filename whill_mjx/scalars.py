@@ -59,25 +59,29 @@ def apart(function: Callable) -> Callable:
 
 
 def scan_apart(
-    function: Callable[[Any, Any], Any], carry: Any, xs: Any = None, length: int | None = None, unroll: int = 1
-) -> Any:
-    """The last carry of `carry = function(carry, x)` over the leading axis of `xs`, as by `jax.lax.scan`.
+    function: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any = None, length: int | None = None,
+    unroll: int = 1,
+) -> tuple[Any, Any]:
+    """The last carry and all outputs of `carry, y = function(carry, x)` over the leading axis of `xs`, as by
+    `jax.lax.scan`.
 
     Between two steps the carry stays in single elements, so that no step puts an array together.
     """
     start, structure = jax.tree.flatten(carry)
     first = jax.tree.map(lambda leaf: leaf[0], xs)
-    traced = jax.make_jaxpr(function)(carry, first)
+    traced, (_, given) = jax.make_jaxpr(function, return_shape=True)(carry, first)
+    outputs, outside = jax.tree.flatten(given)
 
-    def body(pieces: list, x: Any) -> tuple[list, None]:
+    def body(pieces: list, x: Any) -> tuple[list, list]:
         given = [*_regroup(pieces, start), *(take_apart(leaf) for leaf in jax.tree.leaves(x))]
-        outputs = evaluate(traced, given)
-        return _flat([_as_arrays(parts, like) for parts, like in zip(outputs, start, strict=True)]), None
+        found = evaluate(traced, given)
+        after = [_as_arrays(parts, like) for parts, like in zip(found, start, strict=False)]
+        return _flat(after), [put_together(*pair) for pair in zip(found[len(start) :], outputs, strict=True)]
 
     pieces = _flat([_as_arrays(take_apart(leaf), leaf) for leaf in start])
-    pieces, _ = jax.lax.scan(body, pieces, xs, length=length, unroll=unroll)
+    pieces, ys = jax.lax.scan(body, pieces, xs, length=length, unroll=unroll)
     leaves = [put_together(parts, like) for parts, like in zip(_regroup(pieces, start), start, strict=True)]
-    return jax.tree.unflatten(structure, leaves)
+    return jax.tree.unflatten(structure, leaves), jax.tree.unflatten(outside, ys)
 
 
 def take_apart(array: Any) -> Parts:

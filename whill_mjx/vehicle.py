@@ -72,12 +72,34 @@ def _substep(model: VehicleModel, params: VehicleParams, state: VehicleState, co
 def substeps(model: VehicleModel, params: VehicleParams, state: VehicleState, commands: jax.Array) -> VehicleState:
     """Advance one instance by K physics steps, each with its own command of commands (K, 2)."""
 
-    def body(state: VehicleState, command: jax.Array) -> VehicleState:
-        return _substep(model, params, state, command)
+    def body(state: VehicleState, command: jax.Array) -> tuple[VehicleState, None]:
+        return _substep(model, params, state, command), None
 
-    if model.config.dynamics == "fused":
-        return scan_apart(body, state, commands)
-    return jax.lax.scan(lambda state, command: (body(state, command), None), state, commands)[0]
+    scan = scan_apart if model.config.dynamics == "fused" else jax.lax.scan
+    return scan(body, state, commands)[0]
+
+
+def record(
+    model: VehicleModel, params: VehicleParams, state: VehicleState, commands: jax.Array,
+    observe: Callable[[VehicleState], jax.Array],
+) -> jax.Array:
+    """What is observed (R, C) of one instance after each K of R K physics steps.
+
+    A fused vehicle stays in single numbers from record to record: an accelerator launches a quarter of the kernels,
+    and takes longer to compile them.
+
+    Args:
+        commands: (R, K, 2), one for each step.
+        observe: state -> (C,).
+    """
+
+    def body(state: VehicleState, commands: jax.Array) -> tuple[VehicleState, jax.Array]:
+        for command in commands:
+            state = _substep(model, params, state, command)
+        return state, observe(state)
+
+    scan = scan_apart if model.config.dynamics == "fused" else jax.lax.scan
+    return scan(body, state, commands)[1]
 
 
 def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:

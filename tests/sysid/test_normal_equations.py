@@ -12,6 +12,7 @@ from sysid import feature_objective, gradient, normal_equations, objective, star
 from sysid.courses import CourseReplay
 from sysid.differences import DifferenceReplay
 from sysid.feature_objective import make_features_objective
+from sysid.loop.noise import fit_whitener
 from sysid.normal_equations import NormalEquations, make_equations
 from sysid.objective import Objective, estimate_noise
 from sysid.prior import Prior
@@ -34,7 +35,7 @@ def on_accelerator(monkeypatch):
     monkeypatch.setattr(normal_equations, "on_processor", lambda: False)
     for module in (objective, feature_objective):
         monkeypatch.setattr(module, "make_equations", lambda one: (
-            NormalEquations(one, least=2) if hasattr(one.replay, "traced") else None))
+            NormalEquations(one, at_once=2) if hasattr(one.replay, "traced") else None))
 
 
 @pytest.mark.parametrize("robust", [False, True])
@@ -42,7 +43,7 @@ def on_accelerator(monkeypatch):
 def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robust):
     one = {"poses": poses, "features": make_features_objective(poses, 0.5),
            "with a prior": dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.01)))}[kind]
-    equations = NormalEquations(one, least=1)
+    equations = NormalEquations(one, at_once=1)
     value, slope, hessian = equations.quadratic(SETS, robust)
     np.testing.assert_allclose(value, equations.costs(SETS, robust), rtol=1e-4)
     residual, jacobian = one.jacobian(SETS)
@@ -81,7 +82,7 @@ def test_a_replay_that_diverges_is_dear_and_has_no_slope(poses):
     replay = poses.replay.replay
     broken = DifferenceReplay(Diverging(replay), UNICYCLE_SPACE)
     one = dataclasses.replace(poses, replay=broken)
-    value, slope, hessian = NormalEquations(one, least=1).quadratic(SETS[:1])
+    value, slope, hessian = NormalEquations(one, at_once=1).quadratic(SETS[:1])
     assert np.isfinite(value).all() and value[0] > 1e3 * gradient.robust_cost(poses.residuals(SETS[:1]), False)[0]
     assert not slope.any() and not hessian.any()
 
@@ -90,22 +91,26 @@ def test_a_processor_has_its_residuals_at_hand(poses):
     assert poses.equations is None and make_equations(poses) is None
 
 
-def test_calls_are_filled_up_to_what_was_compiled(poses):
-    equations = NormalEquations(dataclasses.replace(poses, replay=dataclasses.replace(poses.replay)), least=2)
+def test_calls_are_of_one_size(poses):
+    equations = NormalEquations(dataclasses.replace(poses, replay=dataclasses.replace(poses.replay)), at_once=2)
     three = equations.costs(SETS)
     np.testing.assert_allclose(equations.costs(SETS[1:2]), three[1:2], rtol=1e-5)
-    assert [size for sizes in equations.sums.sizes.values() for size in sizes] == [3]
+    np.testing.assert_allclose(NormalEquations(poses, at_once=3).costs(SETS), three, rtol=1e-5)
 
 
 def test_other_noise_is_weighed_without_compiling_again(poses):
+    poses = dataclasses.replace(poses, replay=dataclasses.replace(poses.replay))
     first = make_features_objective(poses, 0.5)
     louder = dataclasses.replace(first, whitener=first.whitener.scaled(2.0))
-    one, other = NormalEquations(first, least=3), NormalEquations(louder, least=3)
+    one, other = NormalEquations(first, at_once=3), NormalEquations(louder, at_once=3)
     np.testing.assert_allclose(one.costs(SETS), 4 * other.costs(SETS), rtol=1e-4)
-    assert one.sums is other.sums and one.sums.cost._cache_size() == 1
+    assert one.sums is other.sums and len(one.sums.compiled) == 2  # costs and quadratics
+    longer = dataclasses.replace(first, whitener=fit_whitener(first.target, first.mask))
+    NormalEquations(longer, at_once=3).costs(SETS)
+    assert len(one.sums.compiled) == 2
     wide = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.1)))
     narrow = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.001)))
-    assert (NormalEquations(narrow).costs(SETS) > NormalEquations(wide).costs(SETS)).all()
+    assert (NormalEquations(narrow, 3).costs(SETS) > NormalEquations(wide, 3).costs(SETS)).all()
 
 
 class Hidden:

@@ -143,13 +143,11 @@ def test_what_is_left_is_arithmetic_on_single_numbers():
 def test_a_scan_of_single_elements_equals_a_loop():
     def one(carry, x):
         big, small, count = carry
-        return big + x[0], jnp.stack([small[1] * 0.9, small[0] + x[1]]), count + 1
+        return (big + x[0], jnp.stack([small[1] * 0.9, small[0] + x[1]]), count + 1), small * x
 
     start = jnp.zeros((20, 20)), jnp.array([0.1, 0.2]), jnp.array(0)  # the first stays whole
     xs = jnp.arange(10.0).reshape(5, 2)
-    expected = start
-    for x in xs:
-        expected = one(expected, x)
+    expected = jax.lax.scan(one, start, xs)
     found = scan_apart(one, start, xs)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), found, expected)
-    assert found[2].dtype == start[2].dtype
+    assert found[0][2].dtype == start[2].dtype
