@@ -19,8 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from sysid.cores import on_processor
+
 BATCH = 16
-"""Candidates that are simulated together, and the population of CMA-ES."""
+"""Candidates that an accelerator simulates together, and the population of CMA-ES."""
+FEW = 4
+"""Candidates of TPE that a processor simulates together: as many as it replays at no loss, and the fewer are asked for
+at once, the more is known of those before."""
 LEASE = 600.0
 """Seconds after which a process on another machine that has not been heard of counts as dead."""
 POLL = 0.2  # s between looks while others finish
@@ -93,6 +98,7 @@ class SharedStudy:
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self._optuna, self._names, self._storage = optuna, names, storage
         self._worker = uuid.uuid4().hex[:12]
+        self.batch = FEW if method == "tpe" and on_processor() else BATCH
         self._study = optuna.create_study(study_name=study if storage is not None else None, storage=storage,
                                           direction="minimize", load_if_exists=storage is not None)
         wanted = {"parameters": ", ".join(names), "method": method, **(problem or {})}
@@ -120,7 +126,7 @@ class SharedStudy:
         """Ask, simulate and tell until the study has `evaluations` costs, whoever told them.
 
         Args:
-            costs: unit coordinates (BATCH, P) -> costs (BATCH,); always called with a whole batch.
+            costs: unit coordinates (N, P) -> costs (N,); always called with a whole batch.
         """
         best = np.inf
         while True:
@@ -129,19 +135,19 @@ class SharedStudy:
             trials = self._study.get_trials(deepcopy=False)
             done = sum(trial.state.name == "COMPLETE" for trial in trials)
             in_hand = sum(trial.state.name == "RUNNING" and "worker" in trial.user_attrs for trial in trials)
-            count = min(BATCH, evaluations - done - in_hand)
+            count = min(self.batch, evaluations - done - in_hand)
             if done >= evaluations and not self._unsettled(trials):
                 return
             if count <= 0:
                 time.sleep(POLL)  # others have them in hand
                 continue
-            if done == 0 and count == BATCH:
+            if done == 0 and count == self.batch:
                 count = 1  # a sampler that knows nothing yet draws at random; the initial values give it the space
             asked = []
             for _ in range(count):
                 asked.append(self._study.ask(self._distributions))
             u = np.array([[trial.params[name] for name in self._names] for trial in asked])
-            found = costs(np.concatenate([u, np.repeat(u[-1:], BATCH - count, axis=0)]))[:count]
+            found = costs(np.concatenate([u, np.repeat(u[-1:], self.batch - count, axis=0)]))[:count]
             for trial, value in zip(asked, found, strict=True):
                 # The logarithm keeps diverged candidates from flattening the rest. Another process may have given this
                 # one up and told the same candidate already.

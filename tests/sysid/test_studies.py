@@ -18,7 +18,7 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
 from sysid import studies, tpe
-from sysid.studies import BATCH, SharedStudy, open_storage
+from sysid.studies import BATCH, FEW, SharedStudy, open_storage
 
 NAMES = ("a", "b")
 GOAL = np.array([0.3, 0.8])
@@ -85,7 +85,7 @@ def check_nothing_is_lost(trials, evaluations):
 def test_a_killed_process_loses_no_trial_of_a_journal(tmp_path):
     storage = f"journal:{tmp_path / 'study.log'}"
     first, second = start_worker(storage, 96, 0.3), start_worker(storage, 96, 0.3)
-    wait_for(lambda: counted(storage, "COMPLETE") >= 20 and counted(storage, "RUNNING") >= BATCH)
+    wait_for(lambda: counted(storage, "COMPLETE") >= 20 and counted(storage, "RUNNING") >= FEW)
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
     left = [trial.number for trial in trials_of(storage) if trial.state.name == "RUNNING"]
@@ -96,7 +96,7 @@ def test_a_killed_process_loses_no_trial_of_a_journal(tmp_path):
     given_up = [trial for trial in trials if trial.state.name == "FAIL"]
     assert given_up and {trial.number for trial in given_up} <= set(left)
     assert len({trial.user_attrs["worker"] for trial in trials if "worker" in trial.user_attrs}) == 3
-    assert len(trials) < 96 + 3 * BATCH + len(given_up)
+    assert len(trials) < 96 + 3 * FEW + len(given_up)
 
 
 def test_a_study_that_lost_its_only_process_goes_on_where_it_was(tmp_path):
@@ -164,8 +164,8 @@ def test_cmaes_finds_the_planted_parameters(objective):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("method", ["tpe", "cmaes"])
-def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_first(method):
+@pytest.mark.parametrize(("method", "batch"), [("tpe", FEW), ("cmaes", BATCH)])
+def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_first(method, batch):
     sizes, first = [], []
 
     def costs(u):
@@ -176,7 +176,7 @@ def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_f
     study = SharedStudy(NAMES, np.array([0.5, 0.6]), method=method, seed=3)
     study.run(costs, 60)
     u, values, initial = study.table()
-    assert set(sizes) == {BATCH} and len(sizes) == 5 and len(u) == 60
+    assert set(sizes) == {batch} and len(sizes) == 1 + -(-59 // batch) and len(u) == 60
     np.testing.assert_allclose(first[0], [0.5, 0.6])
     np.testing.assert_allclose(u[initial], [0.5, 0.6])
     np.testing.assert_allclose(values, quadratic(u))
