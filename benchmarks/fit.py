@@ -211,7 +211,7 @@ def many_starts(settings: Benchmark) -> None:
             results = read_results(settings.work / f"{stem}_{platform}")
             if results:
                 figures = on_device(fit_searches.summarise_many(results, platform), results)
-                record("fit", CLAIM, figures)
+                record("fit", CLAIM, figures, replacing=fit_searches.many_stem(platform))
                 show(figures)
         return
     log = fit_searches.find_log(settings.search_log, settings.shared, settings.search_trials)

@@ -199,10 +199,15 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int, who
     return {**done, "whole": time.perf_counter() - began, "whole_cost": found.cost}
 
 
+def many_stem(platform: str) -> str:
+    """What names of figures of `many_starts` on a platform (cpu, gpu) begin with."""
+    return "gpu_seconds" if platform == "gpu" else "cpu_seconds_32_starts"
+
+
 def summarise_many(results: Sequence[Mapping[str, Any]], platform: str) -> dict[str, dict[str, Any]]:
     """Seconds of the timed searches, by how much more the first one of the process took (its compilation), and how many
     starts come within SAME of what the whole search finds."""
-    stem = "gpu_seconds" if platform == "gpu" else "cpu_seconds_32_starts"
+    stem = many_stem(platform)
     seconds = [float(one["seconds"]) for one in results]
     compiling = [float(one["first"]) - float(np.median(seconds)) for one in results]
     figures = {stem: figure(seconds, "s"), f"{stem}_compile": figure(compiling, "s")}

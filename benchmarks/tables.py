@@ -88,7 +88,6 @@ HEADLINES = (  # file, figure, factor, what it says
     ("fit", "cpu_seconds", 1.0, "s for one start of a fit of 18 drives of 22 s on two cores, compilation included"),
     ("fit", "cpu_seconds_whole", 1.0, "s for that fit as a whole, which also looks elsewhere"),
     ("fit", "gpu_seconds", 1.0, "s for 32 starts of such a fit at once, compiled before"),
-    ("fit", "gpu_seconds_whole", 1.0, "s for the whole fit from the best of them, those seconds included"),
     ("fit", "tpe500_gpu_seconds", 1.0, "s for TPE with the paper's 500 parameter sets on them"),
 )
 MARKS = ("<!-- figures -->", "<!-- /figures -->")
