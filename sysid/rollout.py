@@ -32,6 +32,7 @@ WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in 
 WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
 FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
 RECORD_DT = 0.01  # s between recorded states: speeds that pass a low-pass of 40 ms bend by 1 mm/s between them
+UNROLLED = 2  # steps between records at most that `Plant.record` takes: compiling it takes as long as it has steps
 POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
 SPEEDS = slice(6, 8)
 YAW_COLUMNS = (2, 5)
@@ -268,7 +269,7 @@ def path_of(
         state = plant.place(params, start)
         if warm_up:
             state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
-        if plant.record is None or on_processor():
+        if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
             later = jax.lax.scan(after, state, command)[1]
         else:
             later = plant.record(params, state, command)
