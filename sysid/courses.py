@@ -59,7 +59,7 @@ class CourseReplay:
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
         self._replay, self._compiled = Replay(plant, whole, set_values), set[int]()
-        self._traced, self.drives = self._replay, self.courses
+        self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
         self._batch, self._trials = whole, [trials[i] for i in first]
 
     @cached_property

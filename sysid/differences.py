@@ -42,6 +42,11 @@ class DifferenceReplay:
         """Of one set, side by side."""
         return self.replay.drives
 
+    @property
+    def states(self) -> int:
+        """That are recorded of one set."""
+        return self.replay.states
+
     @cached_property
     def in_pieces(self) -> DifferenceReplay:
         """The same with long drives in pieces side by side (`sysid.pieces`) where it is traced."""

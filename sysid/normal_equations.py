@@ -24,8 +24,10 @@ from sysid.space import Space
 DRIVES = 32768
 """Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
 0.33 s for these), and each number is compiled once."""
+STATES = 2**27
+"""States recorded by one call at most: 5 GB, several times as much with what is made of them."""
 SEARCHES = 32  # sets at least whose gradients and Hessians are made together: as many as a search has starts, at most
-_COMPILERS = ThreadPoolExecutor(7)
+_COMPILERS = ThreadPoolExecutor(7)  # as many functions as a search has
 
 
 class Traceable(Protocol):
@@ -105,10 +107,10 @@ class NormalEquations:
         self.sums: Sums = compiled[objective.kind]
         self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
         parameters = objective.space.size
-        sizes = {"cost": at_once, "quadratic": max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))}
+        self.sizes = {"cost": at_once, "quadratic": max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))}
         # A search needs both: they are compiled side by side.
-        self._compiled = {name: (size, self.sums.compile(name, size, parameters, self._arrays))
-                          for name, size in sizes.items()}
+        self._compiled = {name: self.sums.compile(name, size, parameters, self._arrays)
+                          for name, size in self.sizes.items()}
 
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray:
         """Sum (N,) of squares, or of the Huber loss, at unit coordinates (N, P)."""
@@ -120,8 +122,7 @@ class NormalEquations:
 
     def _call(self, name: str, u: np.ndarray, robust: bool) -> Any:
         """What a function gives for each of u (N, P), so many of them at a time; the last call is filled up."""
-        size, compiled = self._compiled[name]
-        function = compiled.result()
+        size, function = self.sizes[name], self._compiled[name].result()
         padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % size, axis=0)])
         parts = [function(jnp.asarray(padded[i : i + size], jnp.result_type(float)), self._arrays, np.bool_(robust))
                  for i in range(0, len(padded), size)]
@@ -142,4 +143,5 @@ def make_equations(objective: Traceable) -> NormalEquations | None:
     """Those of an objective whose replay an accelerator computes; None on a processor, where residuals are at hand."""
     if on_processor() or not hasattr(objective.replay, "traced"):
         return None
-    return NormalEquations(objective, max(DRIVES // objective.replay.drives, 1))
+    replay = objective.replay
+    return NormalEquations(objective, max(min(DRIVES // replay.drives, STATES // replay.states), 1))

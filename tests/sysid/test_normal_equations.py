@@ -98,6 +98,15 @@ def test_calls_are_of_one_size(poses):
     np.testing.assert_allclose(NormalEquations(poses, at_once=3).costs(SETS), three, rtol=1e-5)
 
 
+def test_long_drives_are_replayed_fewer_at_a_time(poses, monkeypatch):
+    monkeypatch.setattr(normal_equations, "on_processor", lambda: False)
+    courses = poses.replay.replay
+    for states, expected in ((10 * courses.states, 10), (1, 1), (10**9, normal_equations.DRIVES // courses.drives)):
+        monkeypatch.setattr(normal_equations, "STATES", states)
+        monkeypatch.setattr(normal_equations.Sums, "compile", lambda *_: None)
+        assert make_equations(poses).sizes["cost"] == expected
+
+
 def test_other_noise_is_weighed_without_compiling_again(poses):
     poses = dataclasses.replace(poses, replay=dataclasses.replace(poses.replay))
     first = make_features_objective(poses, 0.5)
