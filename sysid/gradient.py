@@ -194,7 +194,7 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
                 held.append(index)
                 side.append(2 * index + int(other > value))
     costs, followed = _followed(objective, linear, np.array(points), np.array(held), robust)
-    sides, level = np.array(side), np.abs(costs / here - 1.0) <= PLATEAU
+    sides, level = np.array(side), np.abs(costs - here) <= PLATEAU * here
     behind = np.isin(sides, sides[level])
     order = np.lexsort((costs, ~behind))
     order = order[~level[order]]

@@ -107,9 +107,10 @@ def _from_ends(
     robust: bool,
 ) -> FitResult:
     """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here
-    lies on the same ground, and a search from it would come back."""
+    lies on the same ground, and a search from it hardly leads on: such are tried where there are no others."""
     costs, points = gradient.ends_of_ranges(objective, result.u, robust=robust)
-    near = (costs < FLAT * result.cost) & (np.abs(costs / result.cost - 1) > WORTH)
+    near, level = costs < FLAT * result.cost, np.abs(costs - result.cost) <= WORTH * result.cost
+    near = near & ~level if (near & ~level).any() else near
     return _from_elsewhere(search, result, points[near], iterations)
 
 
