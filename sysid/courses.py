@@ -60,20 +60,21 @@ class CourseReplay:
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
         self._replay, self._compiled = Replay(plant, whole, set_values), set[int]()
         self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
-        self._batch, self._trials = whole, [trials[i] for i in first]
+        self._trials = [trials[i] for i in first]
 
     @cached_property
     def in_pieces(self) -> CourseReplay:
         """The same with drives in pieces side by side (`sysid.pieces`) where it is traced, if they are long, start at
         rest and may be anywhere."""
-        records, step = self._batch.command.shape[1], self._record
+        batch = self._replay.batch
+        records, step = batch.command.shape[1], self._record
         count = pieces.count(records * step)
-        if count < 2 or self._batch.warm_up or not self._anywhere:
+        if count < 2 or batch.warm_up or not self._anywhere:
             return self
         times = pieces.begins(records, count) * step - pieces.OVERLAP
         speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])
         other = copy(self)
-        other._traced = self._replay.on(replace(self._batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
+        other._traced = self._replay.on(replace(batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
         other.drives = count * self.courses
         return other
 

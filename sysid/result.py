@@ -28,3 +28,9 @@ class FitResult:
     """(S,) which of the given starts each of them comes from, in a gradient search."""
     history: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Best cost so far after each evaluation or iteration."""
+
+    @property
+    def as_given(self) -> tuple[np.ndarray, np.ndarray]:
+        """End points (S, P) and costs (S,) of a gradient search in the order of the given starts."""
+        place = np.argsort(self.order)
+        return self.starts[place], self.start_costs[place]

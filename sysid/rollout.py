@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sysid import pieces
+from sysid import pieces, sensing
 from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
-from whill_mjx.effects import OdometryLag, PoseDelay, SensorDelay
+from whill_mjx.effects import OdometryLag, SensorDelay
 from whill_mjx.specs import VehicleSpec
 
 WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
@@ -200,14 +200,14 @@ class Replay:
 
             return jax.vmap(along, out_axes=(None, -1))(tangents)
 
-        self._batch = batch
+        self.batch = batch
         self._simulate, self._jacobian = jax.jit(rows), jax.jit(jacobian)
         self._sizes: dict[Any, set[int]] = {self._simulate: set(), self._jacobian: set()}
 
     def on(self, batch: Batch) -> Replay:
         """The same replay of another batch; nothing is compiled again where its shapes are the same."""
         other = object.__new__(Replay)
-        other.__dict__ = {**self.__dict__, "_batch": batch}
+        other.__dict__ = {**self.__dict__, "batch": batch}
         return other
 
     def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
@@ -216,7 +216,7 @@ class Replay:
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""
-        return self._simulate(values, self._batch)
+        return self._simulate(values, self.batch)
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
@@ -228,7 +228,7 @@ class Replay:
         size = size or min((size for size in sizes if size >= count), default=count)
         sizes.add(size)
         padded = np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
-        output = function(jnp.asarray(padded, jnp.result_type(float)), self._batch)
+        output = function(jnp.asarray(padded, jnp.result_type(float)), self.batch)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], output)
 
 
@@ -286,9 +286,9 @@ def path_of(
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     if lag is not None and plant.frame:
-        path = path.at[:, SPEEDS].set(_framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
+        path = path.at[:, SPEEDS].set(sensing.framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
     if latency is not None:
-        path = path.at[:, ODOMETRY].set(_late(path[:, ODOMETRY], latency, gap))
+        path = path.at[:, ODOMETRY].set(sensing.late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "outside"):
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
@@ -306,44 +306,6 @@ def _without(params: Any, name: str) -> tuple[Any, Any]:
     if not last or getattr(last[0], "name", "") != name:
         return params, None
     return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0]
-
-
-def _framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float) -> jax.Array:
-    """Speeds (R, 2) as an odometry reports them that is computed once a period [s], of true ones every `dt` [s].
-
-    What counts of an encoder tell is the mean over the period; the low-pass goes on by one step in each. Given as if
-    there were a frame at every record: rows are taken at the times of their frames.
-    """
-    ways = jnp.concatenate([jnp.zeros((1, 2), speeds.dtype), jnp.cumsum((speeds[1:] + speeds[:-1]) / 2 * dt, axis=0)])
-    back = period / dt
-    whole = math.floor(back + 1e-6)
-    part = max(back - whole, 0.0)
-
-    def before(values: jax.Array) -> jax.Array:
-        """Values one period ago; the first ones last for ever before them."""
-        padded = jnp.concatenate([jnp.repeat(values[:1], whole + 1, axis=0), values])
-        return padded[1 : 1 + len(values)] * (1 - part) + padded[: len(values)] * part
-
-    # Before its first record the vehicle goes on as it begins: at rest, or at the start's speeds.
-    known = jnp.minimum(jnp.arange(len(ways)) / back, 1.0)[:, None]  # share of the period since then
-    means = (ways - before(ways)) / period + speeds[0] * (1 - known)
-    keep = jnp.exp(-period / jnp.maximum(time_constant, 1e-6))
-
-    def step(past: jax.Array, mean: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """One record: `past` (whole + 1, 2) are the filtered speeds of the records before it, newest first."""
-        old = past[whole - 1] * (1 - part) + past[whole] * part
-        new = mean + keep * (old - mean)
-        return jnp.concatenate([new[None], past[:-1]]), new
-
-    return jax.lax.scan(step, jnp.repeat(speeds[:1], whole + 1, axis=0), means)[1]
-
-
-def _late(path: jax.Array, latency: SensorDelay, dt: float) -> jax.Array:
-    """Odometry (R, 5) as reported with that latency, of one recorded every `dt` [s], yaw unwrapped."""
-    place = jnp.clip(jnp.arange(path.shape[0]) - (latency.delay + latency.speed) / dt, 0.0, None)
-    before = jnp.minimum(place.astype(int), path.shape[0] - 2)
-    speeds = path[before, 3:] + (place - before)[:, None] * (path[before + 1, 3:] - path[before, 3:])
-    return jnp.concatenate([PoseDelay(latency.delay).outside((), path[:, :3], dt)[1], speeds], axis=1)
 
 
 class PathReplay:

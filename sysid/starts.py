@@ -87,8 +87,7 @@ def draw(
         kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :count, None], axis=1)
         found = gradient.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=iterations,
                              tolerance=TOLERANCE, progress=progress)
-        ends, costs = np.empty_like(found.starts), np.empty_like(found.start_costs)
-        ends[found.order], costs[found.order] = found.starts, found.start_costs
+        ends, costs = found.as_given
         return ends.reshape(kept.shape), costs.reshape(kept.shape[:2])
 
     ends, costs = best_of(tried, costs, KEPT, FIRST)

@@ -96,8 +96,7 @@ def from_all(
     quicker, spent = getattr(objective, "quicker", objective), 0
     if quicker is not objective:
         way = gradient.fit(quicker, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
-        starts, spent, iterations = np.empty_like(way.starts), way.evaluations, min(iterations, LAST)
-        starts[way.order] = way.starts
+        starts, spent, iterations = way.as_given[0], way.evaluations, min(iterations, LAST)
     found = gradient.fit(objective, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
     return replace(found, evaluations=found.evaluations + spent)
 

@@ -95,7 +95,7 @@ def test_a_log_that_says_nothing_of_steady_motion_has_no_frames():
 @pytest.mark.parametrize("period", [0.02, 0.025])
 def test_speeds_of_frames_are_means_over_them_low_passed_once_a_frame(period):
     """Against the recursion itself, as an odometry runs it, at the frames of a drive that starts in motion."""
-    from sysid.rollout import _framed
+    from sysid.sensing import framed
 
     dt, time_constant = 0.01, 0.042
     t = np.arange(400) * dt
@@ -108,6 +108,6 @@ def test_speeds_of_frames_are_means_over_them_low_passed_once_a_frame(period):
     for mean in means:
         kept = keep * kept + (1 - keep) * mean
         expected.append(kept)
-    told = np.asarray(_framed(jnp.asarray(speeds), jnp.asarray(time_constant), period, dt))
+    told = np.asarray(framed(jnp.asarray(speeds), jnp.asarray(time_constant), period, dt))
     seen = np.column_stack([np.interp(frame, t, column) for column in told.T])
     np.testing.assert_allclose(seen, expected, atol=2e-3)
