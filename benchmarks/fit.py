@@ -236,10 +236,10 @@ def coverage(settings: Benchmark) -> None:
     if not settings.collect:
         share_compilations(settings.work / "compiled")
         run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(
-            label, settings.iterations, settings.work / "compiled"))
+            label, settings.iterations, folder, settings.work / "compiled"))
         return
     for kind, prefix in (("synthetic", ""), ("plant", "plant_")):
-        results = read_results(folder, f"{kind}_*")
+        results = [fit_coverage.judged_again(one, folder) for one in read_results(folder, f"{kind}_*")]
         if results:
             figures = on_device(fit_coverage.summarise(results, prefix), results)
             record("fit", CLAIM, figures, replacing=tuple(f"{prefix}{stem}" for stem in fit_coverage.PER_PARAMETER))

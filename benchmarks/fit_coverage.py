@@ -2,14 +2,16 @@
 
 Synthetic logs are driven by the model that is fitted, with values drawn around the preset's; logs of the contact plant
 by another physics, of which the values that both have in common are known. Each log has six replicates of a few short
-manoeuvres (10 s, 11 s); the search and the intervals are those of `sysid.fit` without options.
+manoeuvres (10 s, 11 s); the search and the intervals are those of `sysid.fit` without options. What each search ends
+with is kept, so that figures are collected with intervals by the present code: another rule needs no other search.
 """
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,12 @@ from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
 from sysid.fit import FitConfig, fit_log, fitted_plant, make_problem
+from sysid.independence import Evidence
 from sysid.log import Log, load_log
 from sysid.models import with_effects
 from sysid.space import NUISANCE, Space, make_space, searched
 from sysid.synthetic import write_dataset
+from sysid.uncertainty import Estimate, uncertainty_of
 from whill_mjx.parameters import get_values, set_values
 from whill_mjx.presets import preset_params
 from whill_mjx.specs import WHILL_CR, VehicleSpec
@@ -114,22 +118,56 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 
 
-def job(label: str, iterations: int, compiled: Path) -> dict[str, Any]:
+def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, Any]:
     """Fit one log, `synthetic_NNN` or `plant_NNN`, and note each known value with its estimate.
 
     Args:
+        folder: where what the log tells is kept, as evidence/LABEL.npz.
         compiled: folder of what the processes share.
     """
     kind, _, number = label.partition("_")
-    with tempfile.TemporaryDirectory() as folder:
-        log, truth = (plant_log if kind == "plant" else synthetic_log)(Path(folder), 50000 + int(number))
+    with tempfile.TemporaryDirectory() as scratch:
+        log, truth = (plant_log if kind == "plant" else synthetic_log)(Path(scratch), 50000 + int(number))
     problem = make_problem(log, FitConfig())
     compile_once(compiled, f"coverage_{kind}", lambda: compile_replay(problem.objective))
     fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))
-    rows = {one.name: {"truth": truth[one.name], "value": one.value, "low": one.low, "high": one.high,
-                       "identifiable": one.identifiable} for one in fit.uncertainty.estimates if one.name in truth}
+    save_evidence(folder / "evidence" / f"{label}.npz", fit.uncertainty.evidence, fit.space)
+    rows = {one.name: _row(one, truth[one.name]) for one in fit.uncertainty.estimates if one.name in truth}
     values = dict(zip(fit.space.names, fit.space.to_values(fit.u).tolist(), strict=True))
     return {"parameters": rows, "values": values, "cost": fit.cost, "seconds": fit.seconds}
+
+
+def _row(one: Estimate, truth: float) -> dict[str, Any]:
+    return {"truth": truth, "value": one.value, "low": one.low, "high": one.high, "identifiable": one.identifiable}
+
+
+def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
+    """Keep what a log tells, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
+    np.savez_compressed(temporary, names=np.array(space.names), low=space.low, high=space.high, initial=space.initial,
+                        log=space.log, **asdict(evidence))
+    os.replace(temporary, path)
+
+
+def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A job's result with the intervals that the present code gives to what its log tells.
+
+    Raises:
+        ValueError: that was not kept.
+    """
+    path = folder / "evidence" / f"{result['label']}.npz"
+    if not path.exists():
+        raise ValueError(f"{path}: missing, so that the intervals of {result['label']} cannot be made anew. Remove its "
+                         f"result from {folder} and run the job again.")
+    with np.load(path) as kept:
+        arrays: dict[str, Any] = dict(kept)
+    space = Space(tuple(map(str, arrays.pop("names"))),
+                  *(arrays.pop(name) for name in ("low", "high", "initial", "log")))
+    numbers: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in arrays.items()}
+    known = {name: row["truth"] for name, row in result["parameters"].items()}
+    estimates = uncertainty_of(Evidence(**numbers), space).estimates
+    return {**result, "parameters": {one.name: _row(one, known[one.name]) for one in estimates if one.name in known}}
 
 
 def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, dict[str, Any]]:

@@ -18,20 +18,28 @@ LEAST_LEFT = 1e-3
 
 
 @dataclass(frozen=True)
-class Variance:
-    """Covariance of P estimates."""
+class Sandwich:
+    """How G independent blocks move P estimates."""
 
-    covariance: np.ndarray  # (P, P)
-    freedom: np.ndarray  # (P,) degrees of freedom of its diagonal
-    told: np.ndarray  # (P,) expected diagonal for independent errors, over what it is then
+    moves: np.ndarray  # (G, P, P): of each block's J^T r, corrected for what the estimates follow
+    freedom: np.ndarray  # (P,) degrees of freedom of the variances
+    told: np.ndarray  # (P,) expected variance for independent errors, over what it is then
+
+    def covariance(self, scores: np.ndarray) -> np.ndarray:
+        """(P, P) of the estimates, from J_g^T r_g (G, P) of each block at the minimum."""
+        moved = np.einsum("gpq,gq->gp", self.moves, scores)
+        return moved.T @ moved
+
+    def variances(self, scores: np.ndarray) -> np.ndarray:
+        """(N, P) diagonals of covariances, from scores (N, G, P)."""
+        return np.square(np.einsum("gpq,ngq->ngp", self.moves, scores, optimize=True)).sum(1)
 
 
-def sandwich(scores: np.ndarray, blocks: np.ndarray, inverse: np.ndarray) -> Variance:
-    """Variance of a minimum of squares.
+def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
+    """The variances of a minimum of squares.
 
     Args:
-        scores: (G, P) J_g^T r_g of each block at the minimum.
-        blocks: (G, P, P) J_g^T J_g.
+        blocks: (G, P, P) J_g^T J_g of each block.
         inverse: (P, P) of their sum, or of a larger matrix.
     """
     value, vector = np.linalg.eigh(inverse)
@@ -40,7 +48,6 @@ def sandwich(scores: np.ndarray, blocks: np.ndarray, inverse: np.ndarray) -> Var
     left = 1.0 - np.clip(share, 0.0, 1.0)
     gain = np.where(left > LEAST_LEFT, np.maximum(left, LEAST_LEFT) ** -0.5, 0.0)
     local = axes.swapaxes(1, 2) @ half  # (G, P, P)
-    moved = np.einsum("gkp,gk,gkq,gq->gp", local, gain, local, scores, optimize=True)  # how each block moves them
     # Of independent errors of variance 1, blocks g and h move p with the covariance lengths_gp (g = h) - z_gp^T z_hp.
     lengths = np.einsum("gkp,gk->gp", local**2, share * gain**2)
     z = axes @ ((share * gain)[..., None] * local)  # (G, P, P)
@@ -49,4 +56,5 @@ def sandwich(scores: np.ndarray, blocks: np.ndarray, inverse: np.ndarray) -> Var
         products = np.diag(lengths[:, p]) - z[:, :, p] @ z[:, :, p].T
         expected[p] = np.trace(products)
         freedom[p] = expected[p] ** 2 / max(float(np.square(products).sum()), 1e-300)
-    return Variance(moved.T @ moved, freedom, expected / np.maximum(np.diag(inverse), 1e-300))
+    return Sandwich(local.swapaxes(1, 2) @ (gain[..., None] * local), freedom,
+                    expected / np.maximum(np.diag(inverse), 1e-300))

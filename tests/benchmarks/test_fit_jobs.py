@@ -19,7 +19,8 @@ from benchmarks.fit_jobs import (
     staged,
 )
 from benchmarks.plant.chair import Chair
-from sysid.space import make_space, searched
+from sysid.independence import Evidence
+from sysid.space import Space, make_space, searched
 from whill_mjx.specs import WHILL_CR
 
 
@@ -65,6 +66,24 @@ def test_coverage_counts_a_parameter_only_where_a_log_tells_it():
     assert "coverage_90_c" not in found and found["identifiable_c"] == 0.0
     assert (found["coverage_90_min"], found["coverage_90_max"]) == (0.0, 0.5)
     assert found["half_width_90_a"] == pytest.approx(0.175) and found["seconds_coverage_log"] == 2.0
+
+
+@pytest.mark.quick
+def test_intervals_of_a_kept_search_are_made_anew(tmp_path):
+    random = np.random.default_rng(0)
+    space = Space(("a", "b"), np.zeros(2), np.array([1.0, 10.0]), np.array([0.5, 2.0]), np.zeros(2, bool))
+    blocks = np.tile(1e3 * np.eye(2), (12, 8, 1, 1))
+    scores = 1e3**0.5 * random.standard_normal((12, 8, 2))
+    evidence = Evidence(np.array([0.4, 0.3]), scores - scores.mean((0, 1)), blocks, np.arange(12) // 2, 1.0, 1.0,
+                        np.eye(2), 1.0)
+    found = {"label": "synthetic_000", "parameters": {"b": row(3.1, 0.0, 9.0)}, "seconds": 1.0}
+    with pytest.raises(ValueError, match="synthetic_000.*run the job again"):
+        fit_coverage.judged_again(found, tmp_path)
+    fit_coverage.save_evidence(tmp_path / "evidence" / "synthetic_000.npz", evidence, space)
+    (name, again), = fit_coverage.judged_again(found, tmp_path)["parameters"].items()
+    sd = 10 / (12 * 8 * 1e3) ** 0.5
+    assert name == "b" and again["truth"] == 3.1 and again["value"] == pytest.approx(3.0) and again["identifiable"]
+    assert again["high"] - again["low"] == pytest.approx(2 * 1.645 * sd, rel=0.3)
 
 
 @pytest.mark.quick

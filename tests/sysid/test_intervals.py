@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 from conftest import unicycle_objective
 
-from sysid import gradient, uncertainty
+from sysid import gradient, independence, uncertainty
 from sysid.log import Command, Start, Trial
 from sysid.sandwich import sandwich
 from sysid.space import Space
 
 DRIVES, SAMPLES, PARAMETERS = 12, 80, 3
+
+
+@pytest.fixture(autouse=True)
+def few_flips(monkeypatch):
+    """Enough for shares over hundreds of logs."""
+    monkeypatch.setattr(independence, "FLIPS", 199)
 
 
 class Linear:
@@ -72,14 +78,14 @@ def covered(objective: Linear) -> tuple[list[bool], np.ndarray]:
 
 @pytest.mark.quick
 @pytest.mark.parametrize("rho", [0.0, 0.9])
-def test_intervals_of_correlated_errors_cover_nine_in_ten_and_a_little_more(rho):
-    """The wider of two estimates is taken: of drives that happen to differ little, and of what varies within them."""
+def test_intervals_of_correlated_errors_cover_nine_in_ten(rho):
+    """The widest of several estimates is taken, and would hold in 96 were it not corrected for that."""
     random = np.random.default_rng(1)
     inside = []
     for _ in range(400):
         inside.append(covered(Linear(designs(random), correlated(random, rho)))[0])
     share = np.mean(inside, axis=0)
-    assert (share > 0.88).all() and (share < 0.965).all()
+    assert (share > 0.87).all() and (share < 0.955).all() and share.mean() < 0.93
 
 
 @pytest.mark.quick
@@ -89,13 +95,13 @@ def test_the_variance_of_few_blocks_is_unbiased_where_errors_are_independent():
     design = designs(random)[:5]
     blocks = np.einsum("bkp,bkq->bpq", design, design)
     inverse = np.linalg.inv(blocks.sum(0))
+    one = sandwich(blocks, inverse)
     found, plain = [], []
     for _ in range(2000):
         errors = random.standard_normal(design.shape[:2])
         residual = errors - design @ (inverse @ np.einsum("bkp,bk->p", design, errors))
         scores = np.einsum("bkp,bk->bp", design, residual)
-        one = sandwich(scores, blocks, inverse)
-        found.append(np.diag(one.covariance))
+        found.append(np.diag(one.covariance(scores)))
         plain.append(np.square(scores @ inverse).sum(0))
     told = np.diag(inverse)
     np.testing.assert_allclose(np.mean(found, 0), told * one.told, rtol=0.1)
@@ -120,8 +126,8 @@ def test_what_replicates_share_widens_intervals_until_they_hold():
         objective = Linear(design, correlated(random, 0.5) + misfit(random))
         held, u = covered(objective)
         inside.append(held)
-        shared = uncertainty.shared_error(objective.residuals(u[None])[0], np.arange(DRIVES) // 2)
-        narrow.append(shared > uncertainty.CHANCE)
+        shared = independence.shared_error(objective.residuals(u[None])[0], np.arange(DRIVES) // 2)
+        narrow.append(shared > independence.CHANCE)
     assert np.mean(narrow) < 0.05
     assert (np.mean(inside, axis=0)[:2] > 0.83).all()
 
@@ -135,9 +141,9 @@ def test_replicates_that_share_nothing_are_rarely_taken_to(rho):
         design, errors = designs(random), correlated(random, rho)
         inverse = np.linalg.inv(np.einsum("bkp,bkq->pq", design, design))
         residual = errors - design @ (inverse @ np.einsum("bkp,bk->p", design, errors))
-        found.append(uncertainty.shared_error(residual, np.arange(DRIVES) // 2))
-    assert np.mean(np.array(found) < uncertainty.CHANCE) < 0.08
-    assert uncertainty.shared_error(residual, np.arange(DRIVES)) == 1.0
+        found.append(independence.shared_error(residual, np.arange(DRIVES) // 2))
+    assert np.mean(np.array(found) < independence.CHANCE) < 0.08
+    assert independence.shared_error(residual, np.arange(DRIVES)) == 1.0
 
 
 @pytest.mark.quick
