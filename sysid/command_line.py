@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import platform
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from sysid.result import Progress
@@ -14,6 +18,7 @@ def run(options: type, main: Callable[[Any], Any], description: str | None) -> N
     import tyro
 
     chosen: Any = tyro.cli(options, description=description, config=(tyro.conf.PositionalRequiredArgs,))
+    keep_compiled()
     try:
         main(chosen)
     except (ValueError, FileNotFoundError) as error:
@@ -31,3 +36,34 @@ def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Pro
         bar.update(min(count, max(bar.total - bar.n, 0)))
 
     return advance, bar.close
+
+
+def keep_compiled() -> None:
+    """Keep what XLA compiles for later runs, in the user's cache folder, unless JAX was told another folder
+    (JAX_COMPILATION_CACHE_DIR) or none (JAX_ENABLE_COMPILATION_CACHE=false), or where that cannot be written.
+
+    Each kind of processor has a folder of its own: a home may be shared by several.
+    """
+    import jax
+
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(home) / "whill_mjx" / f"compiled-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _processor() -> str:
+    """What stands for the instructions that this machine's processor has."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = platform.processor()
+    about = [line for line in text.splitlines() if line.startswith(("flags", "Features", "model name"))]
+    return hashlib.sha256(f"{platform.machine()} {about[:2] or text}".encode()).hexdigest()[:12]

@@ -133,6 +133,28 @@ def test_what_replicates_share_widens_intervals_until_they_hold():
 
 
 @pytest.mark.quick
+def test_errors_that_replicates_share_at_places_of_their_drives_are_counted_once():
+    """Two drives of a manoeuvre do not average out where a wheel breaks away a little early in both."""
+    random = np.random.default_rng(7)
+    design = np.repeat(designs(random)[::2], 2, axis=0)
+    inside, reach = [], []
+    for shared in (1.5, 0.0):
+        held, width = [], []
+        for _ in range(120):
+            places = random.standard_normal((DRIVES // 2, uncertainty.PIECES))
+            errors = shared * np.repeat(np.repeat(places, SAMPLES // uncertainty.PIECES, axis=1), 2, axis=0)
+            objective = Linear(design, random.standard_normal((DRIVES, SAMPLES)) + errors)
+            u = gradient.fit(objective, objective.space, iterations=4).u
+            known = uncertainty.estimate(objective, u)
+            held.append([one.low <= 0.5 <= one.high for one in known.estimates])
+            width.append(known.quantile * known.deviation)
+        inside.append(np.mean(held, axis=0))
+        reach.append(np.median(width, axis=0))
+    assert (inside[0][:2] > 0.85).all() and (inside[0][:2] < 0.955).all() and (inside[1] > 0.85).all()
+    assert (reach[0] > 2 * reach[1]).all()
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_replicates_that_share_nothing_are_rarely_taken_to(rho):
     random = np.random.default_rng(5)
