@@ -300,7 +300,7 @@ def main(settings: Peer) -> None:
         "peer_trials": figure([float(len(log.trials))], "count"),
     }
     figures = {name + ("_preset" if settings.preset else ""): one for name, one in figures.items()}
-    record("fit", CLAIM, figures)
+    record("fit", CLAIM, figures, replacing=None if settings.preset else "peer_")  # those of `--preset` come after
     for name, one in figures.items():
         print(f"{name:44} {one['value']:10.4f} {one['unit']}")
     print(values, their_values, sep="\n")

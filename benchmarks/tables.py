@@ -89,6 +89,10 @@ HEADLINES = (  # file, figure, factor, what it says
     ("fit", "cpu_seconds_whole", 1.0, "s for that fit as a whole, which also looks elsewhere"),
     ("fit", "gpu_seconds", 1.0, "s for 32 starts of such a fit at once, compiled before"),
     ("fit", "tpe500_gpu_seconds", 1.0, "s for TPE with the paper's 500 parameter sets on them"),
+    ("fit", "peer_mujoco_sysid_ratio", 1.0,
+     "times as long takes `mujoco.sysid` to the same error, five parameters, compilation apart"),
+    ("fit", "coverage_90_min", 100.0, "% of 90 % intervals hold at least, of each parameter, 200 synthetic logs"),
+    ("fit", "plant_coverage_90_min", 100.0, "% of them at least, logs of the contact plant that tell the parameter"),
 )
 MARKS = ("<!-- figures -->", "<!-- /figures -->")
 

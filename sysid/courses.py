@@ -7,6 +7,7 @@ from the origin, with its derivatives, and then moved to the start of each trial
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -23,9 +24,10 @@ from sysid.cores import cores, on_all_cores, on_processor
 from sysid.log import Trial
 from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch
 
-INSTANCES = 512  # drives replayed together on a processor, at most: more are no faster, one by one, than these
-SETS = 4  # parameter sets replayed together there where a search tries a few
-FULL = 0.5  # share of the rows for a Jacobian's differences from which they are used
+VECTOR, FEW, MANY = 8, 32, 128
+"""Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
+many for a few parameter sets, and for many: 1.7 ms a drive of 22 s with 32, 1.3 ms with 112, and no less with more."""
+SETS = 4  # parameter sets together at least where courses alone fill vectors: as many as a search tries at once
 
 
 class CourseReplay:
@@ -83,20 +85,17 @@ class CourseReplay:
         if not on_processor():
             size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
             return self._spread(self._replay.simulate(values, size), motion=True)
-        # Rows are of two numbers, each of which is compiled once: for a few tries, and for a Jacobian's differences.
-        few = max(min(SETS, INSTANCES // self.courses), 1)
-        many = max(min(-(-(2 * values.shape[1] + 1) // cores()), INSTANCES // self.courses), few)
-        return self._on_cores(values, many if len(values) >= FULL * many else few)
-
-    def _on_cores(self, values: np.ndarray, rows: int) -> Simulated:
-        """Replay with each of values (N, P), so many `rows` at a time on each core."""
+        few, many = sets_together(self.courses, 2 * values.shape[1] + 1, cores())
+        rows = many if len(values) >= many * cores() else few
+        missing = {few, rows} - self._compiled  # a search that begins with a Jacobian needs both: side by side
+        on_all_cores(lambda rows: self._replay.simulate(values[:1], rows), sorted(missing))
+        self._compiled |= missing
         padded = np.concatenate([values, np.repeat(values[-1:], -len(values) % rows, axis=0)])
 
         def part(first: int) -> Simulated:
             return self._spread(self._replay.simulate(padded[first : first + rows], rows), motion=True)
 
-        parts = on_all_cores(part, range(0, len(padded), rows), rows in self._compiled)
-        self._compiled.add(rows)
+        parts = on_all_cores(part, range(0, len(padded), rows))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(values)], *parts)
 
     def traced(self, values: jax.Array) -> Simulated:
@@ -135,6 +134,19 @@ class CourseReplay:
         weight = weight.reshape(*weight.shape, *(1,) * (values.ndim - 3))
         before, after = values[:, course, index], values[:, course, index + 1]
         return before + weight * (after - before)
+
+
+def sets_together(courses: int, jacobian: int, cores: int) -> tuple[int, int]:
+    """Parameter sets that a core replays at once, where there are few and where there are as many as for a Jacobian's
+    differences: of two numbers, each of which is compiled once."""
+    fitting = 1 if courses >= FEW else VECTOR // math.gcd(VECTOR, courses)
+
+    def whole(sets: int) -> int:
+        return fitting * -(-sets // fitting)
+
+    few = whole(SETS if courses >= FEW else -(-FEW // courses))
+    rounds = -(-jacobian // (cores * max(MANY // courses, few)))
+    return few, max(few, whole(-(-jacobian // (cores * rounds))))
 
 
 def make_courses(plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],

@@ -103,9 +103,9 @@ def fit(
         """(G, D, P) points that are tried next."""
         nonlocal evaluations
         evaluations += len(starts) * len(dampings)
-        return np.stack([
-            np.stack([damped_step(u[n], gradient[i], hessian[i], damping[n] * factor, free) for factor in dampings])
-            for i, n in enumerate(starts)])
+        at, slopes, curvatures = (np.repeat(one, len(dampings), axis=0) for one in (u[starts], gradient, hessian))
+        points = damped_steps(at, slopes, curvatures, np.outer(damping[starts], dampings).ravel(), free)
+        return points.reshape(len(starts), len(dampings), -1)
 
     def step(at: _Points) -> _Points:
         """Move these starts; those of them that can try again without a new Jacobian."""
@@ -221,9 +221,8 @@ def _followed(
     index = np.arange(points.shape[1])
     residual = objective.residuals(points)
     weight = huber_weight(residual) if robust else np.ones_like(residual)
-    moved = np.stack([
-        damped_step(point, np.einsum("bkp,bk->p", jacobian, one), hessian, 1e-3, index != fixed)
-        for point, one, fixed in zip(points, residual * weight, held, strict=True)])  # fmt: skip
+    pulls = np.einsum("bkp,nbk->np", jacobian, residual * weight, optimize=True)
+    moved = damped_steps(points, pulls, hessian, 1e-3, index != held[:, None])
     costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))]) / objective.counted
     return costs.min(0), np.where((costs[1] < costs[0])[:, None], moved, points)
 
@@ -308,26 +307,33 @@ def normal_sums(residual: np.ndarray, jacobian: np.ndarray, robust: bool) -> tup
     return gradient, np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
 
 
-def damped_step(
-    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float, free: np.ndarray
+def damped_steps(
+    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any, free: np.ndarray
 ) -> np.ndarray:
-    """The damped Gauss-Newton point (P,) of u (P,) within the box; what is not `free` (P,) stays."""
+    """The damped Gauss-Newton points (N, P) of u (N, P) within the box; what is not `free` (P,) or (N, P) stays.
+
+    Args:
+        gradient, hessian: by half, (N, P) and (N, P, P); without N where they are the same for all.
+        damping: (N,), or one for all.
+    """
+    count, size = u.shape
+    gradient, free = (np.broadcast_to(one, u.shape) for one in (gradient, free))
+    hessian, damping = np.broadcast_to(hessian, (count, size, size)), np.broadcast_to(damping, count)
     active = free & ~((u <= 0.0) & (gradient > 0)) & ~((u >= 1.0) & (gradient < 0))
-    new = u.copy()
+    curvature = np.einsum("npp->np", hessian)
+    scale = (curvature + 1e-6 * np.maximum(curvature.max(-1, keepdims=True), 1e-12)) * damping[:, None]
+    new, left = u.copy(), np.arange(count)
     for _ in range(3):  # cutting at a wall may let another parameter reach its own
-        index = np.flatnonzero(active)
-        if len(index) == 0:
-            return new
-        block = hessian[np.ix_(index, index)]
-        scale = np.diag(block) + 1e-6 * max(float(np.diag(hessian).max()), 1e-12)
-        step = -np.linalg.solve(block + damping * np.diag(scale), gradient[index])
-        step = np.clip(step, -MAX_STEP, MAX_STEP)
-        new = u.copy()
-        new[index] = u[index] + step
-        outside = (new < 0.0) | (new > 1.0)
-        new = np.clip(new, 0.0, 1.0)
-        if not outside.any():
-            break
+        moving = active[left]
+        matrix = hessian[left] * (moving[:, :, None] & moving[:, None])
+        matrix[:, np.arange(size), np.arange(size)] += np.where(moving, scale[left], 1.0)
+        step = -np.linalg.solve(matrix, np.where(moving, gradient[left], 0.0)[..., None])[..., 0]
+        moved = u[left] + np.clip(step, -MAX_STEP, MAX_STEP)
+        outside = (moved < 0.0) | (moved > 1.0)
+        new[left] = np.clip(moved, 0.0, 1.0)
         # Hold what hit its wall at once; what merely reached it keeps the cut step.
-        active &= ~(outside & ((u <= 1e-6) | (u >= 1 - 1e-6)))
+        active[left] &= ~(outside & ((u[left] <= 1e-6) | (u[left] >= 1 - 1e-6)))
+        left = left[outside.any(-1)]
+        if not len(left):
+            break
     return new

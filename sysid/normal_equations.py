@@ -26,8 +26,10 @@ DRIVES = 32768
 0.33 s for these), and each number is compiled once."""
 STATES = 2**27
 """States recorded by one call at most: 5 GB, several times as much with what is made of them."""
-SEARCHES = 32  # sets at least whose gradients and Hessians are made together: as many as a search has starts, at most
-_COMPILERS = ThreadPoolExecutor(7)  # as many functions as a search has
+SEARCHES, FEW = 32, 8
+"""Sets whose gradients and Hessians are made together: as many at least as a search has starts, and so few where no
+more of them go on, or where it has a single one."""
+_COMPILERS = ThreadPoolExecutor(10)  # as many functions as a search has
 
 
 class Traceable(Protocol):
@@ -107,10 +109,11 @@ class NormalEquations:
         self.sums: Sums = compiled[objective.kind]
         self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
         parameters = objective.space.size
-        self.sizes = {"cost": at_once, "quadratic": max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))}
-        # A search needs both: they are compiled side by side.
-        self._compiled = {name: self.sums.compile(name, size, parameters, self._arrays)
-                          for name, size in self.sizes.items()}
+        many = max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))
+        self.sizes = {"cost": (at_once,), "quadratic": (min(FEW, many), many)}
+        # A search needs all of them: they are compiled side by side.
+        self._compiled = {(name, size): self.sums.compile(name, size, parameters, self._arrays)
+                          for name, sizes in self.sizes.items() for size in sizes}
 
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray:
         """Sum (N,) of squares, or of the Huber loss, at unit coordinates (N, P)."""
@@ -122,7 +125,9 @@ class NormalEquations:
 
     def _call(self, name: str, u: np.ndarray, robust: bool) -> Any:
         """What a function gives for each of u (N, P), so many of them at a time; the last call is filled up."""
-        size, function = self.sizes[name], self._compiled[name].result()
+        sizes = self.sizes[name]
+        size = next((size for size in sizes if size >= len(u)), sizes[-1])
+        function = self._compiled[name, size].result()
         padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % size, axis=0)])
         parts = [function(jnp.asarray(padded[i : i + size], jnp.result_type(float)), self._arrays, np.bool_(robust))
                  for i in range(0, len(padded), size)]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,13 +26,17 @@ from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
-from whill_mjx.effects import OdometryLag, SensorDelay
+from whill_mjx.effects import CommandDelay, OdometryLag, SensorDelay
+from whill_mjx.processor import as_one_function
 from whill_mjx.specs import VehicleSpec
 
 WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
 WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
 FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
 RECORD_DT = 0.01  # s between recorded states: speeds that pass a low-pass of 40 ms bend by 1 mm/s between them
+IN_ONE = 256
+"""Drives at most that one function computes: with 128 it takes 0.7 ms for each of 22 s where many functions take 1.1,
+with 512 they take 1.5 and 0.8, for those divide loops among the cores; within one XLA fails to (seen with 1024)."""
 UNROLLED = 2  # steps between records at most that `Plant.record` takes: compiling it takes as long as it has steps
 POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
 SPEEDS = slice(6, 8)
@@ -60,6 +65,8 @@ class Plant:
     frame: float | None = None
     """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
     once a frame."""
+    arithmetic: bool = False
+    """Whether its steps are arithmetic on single numbers, without products of matrices or solvers."""
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
@@ -96,7 +103,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
                  lambda params, state, command: substep(model, params, state, command), observe,
                  config.physics_dt, move,
                  lambda params, state, commands: substeps(model, params, state, commands),
-                 lambda params, state, commands: record(model, params, state, commands, observe))
+                 lambda params, state, commands: record(model, params, state, commands, observe), arithmetic=True)
 
 
 def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -180,14 +187,15 @@ class Replay:
     def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
         """`set_values` turns values (P,) into the vehicle's parameters."""
 
-        def rows(values: jax.Array, batch: Batch) -> Simulated:
+        def rows(values: jax.Array, batch: Batch, directions: int = 1) -> Simulated:
             """Each set on each trial, in one row of instances: loops over a single axis fill a processor's vectors."""
             sets, trials = len(values), len(batch.start)
+            few = sets * trials * directions <= IN_ONE and batch.speeds is None
 
             def tiled(leaf: jax.Array) -> jax.Array:
                 return jnp.tile(leaf, (sets, *(1,) * (leaf.ndim - 1)))
 
-            one = jax.vmap(lambda value, trial: _simulate_one(plant, set_values(value), trial))
+            one = jax.vmap(lambda value, trial: _simulate_one(plant, set_values(value), trial, few))
             found = one(jnp.repeat(values, trials, axis=0), jax.tree.map(tiled, batch))
             return jax.tree.map(lambda leaf: leaf.reshape(sets, trials, *leaf.shape[1:]), found)
 
@@ -196,7 +204,8 @@ class Replay:
             tangents = jnp.eye(values.shape[1], dtype=values.dtype)
 
             def along(tangent: jax.Array) -> tuple[Simulated, Simulated]:
-                return jax.jvp(lambda v: rows(v, batch), (values,), (jnp.broadcast_to(tangent, values.shape),))
+                return jax.jvp(lambda v: rows(v, batch, len(tangents)), (values,),
+                               (jnp.broadcast_to(tangent, values.shape),))
 
             return jax.vmap(along, out_axes=(None, -1))(tangents)
 
@@ -248,7 +257,8 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
 
 
 def path_of(
-    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None
+    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None,
+    few: bool = False,
 ) -> jax.Array:
     """States (R + 1, 9) at the records, as `Plant.observe` tells them, of one drive.
 
@@ -257,9 +267,14 @@ def path_of(
         start: (5,) x, y, yaw, v, omega.
         warm_up: physics steps at the start's speeds before it.
         speeds: (W, 2) where pieces begin, to replay it in these (`sysid.pieces`).
+        few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
     """
     params, latency = _without(params, SensorDelay.name)
     params, lag = _without(params, OdometryLag.name) if plant.frame else (params, None)
+    if not warm_up:  # which finds its commands on the way
+        params, command = _delayed(params, command, plant.dt)
+
+    in_one = as_one_function if few and plant.arithmetic else lambda function: function
 
     def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
         state = _advance(plant, params, state, commands)
@@ -270,7 +285,7 @@ def path_of(
         if warm_up:
             state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
         if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
-            later = jax.lax.scan(after, state, command)[1]
+            later = in_one(partial(jax.lax.scan, after))(state, command)[1]
         else:
             later = plant.record(params, state, command)
         return jnp.concatenate([plant.observe(state)[None], later])
@@ -308,6 +323,17 @@ def _without(params: Any, name: str) -> tuple[Any, Any]:
     return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0]
 
 
+def _delayed(params: Any, command: jax.Array, dt: float) -> tuple[Any, jax.Array]:
+    """The vehicle without the first of its effects on commands, where that is a delay, and commands (R, K, 2) that are
+    delayed by its law: every step would carry the changes under way, on an accelerator as a kernel for each number."""
+    effects = getattr(params, "effects", ())
+    first = next((effect for effect in effects if hasattr(effect, "command")), None)
+    if not isinstance(first, CommandDelay):
+        return params, command
+    kept = replace(params, effects=tuple(effect for effect in effects if effect is not first))
+    return kept, first.ahead(command.reshape(-1, 2), dt).reshape(command.shape)
+
+
 class PathReplay:
     """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
 
@@ -316,7 +342,7 @@ class PathReplay:
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> jax.Array:
-            return path_of(plant, set_values(values), command, start, warm_up)
+            return path_of(plant, set_values(values), command, start, warm_up, few=rows <= IN_ONE)
 
         self.rows, self._compiled = rows, False
         self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), static_argnums=3)
@@ -345,8 +371,8 @@ class PathReplay:
         return np.concatenate(parts)[:count]
 
 
-def _simulate_one(plant: Plant, params: Any, one: Batch) -> Simulated:
-    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds)
+def _simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
+    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]

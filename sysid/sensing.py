@@ -31,13 +31,17 @@ def framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float
     means = (ways - before(ways)) / period + speeds[0] * (1 - known)
     keep = jnp.exp(-period / jnp.maximum(time_constant, 1e-6))
 
-    def step(past: jax.Array, mean: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """One record: `past` (whole + 1, 2) are the filtered speeds of the records before it, newest first."""
-        old = past[whole - 1] * (1 - part) + past[whole] * part
-        new = mean + keep * (old - mean)
-        return jnp.concatenate([new[None], past[:-1]]), new
+    size = max(whole, 1)  # records at once: none of them is filtered with another
 
-    return jax.lax.scan(step, jnp.repeat(speeds[:1], whole + 1, axis=0), means)[1]
+    def step(past: jax.Array, means: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Filtered speeds of the next records, from their means (size, 2) and those of the size + 1 before, `past`."""
+        old = past[1:] * (1 - part) + past[:-1] * part
+        new = means + keep * (old - means)
+        return jnp.concatenate([past[-1:], new]), new
+
+    padded = jnp.concatenate([means, jnp.zeros((-len(means) % size, 2), means.dtype)]).reshape(-1, size, 2)
+    filtered = jax.lax.scan(step, jnp.repeat(speeds[:1], size + 1, axis=0), padded)[1]
+    return filtered.reshape(-1, 2)[: len(means)]
 
 
 def late(path: jax.Array, latency: SensorDelay, dt: float) -> jax.Array:

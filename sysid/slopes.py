@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.gradient import Residuals, damped_step, normal_sums, robust_cost
+from sysid.gradient import Residuals, damped_steps, normal_sums, robust_cost
 from sysid.result import FitResult, Progress
 
 ROTATIONS = 3
@@ -96,7 +96,7 @@ def descend(
         covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
         residual, slopes = average_slopes(objective, u, covariance, seed + number)
         (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], robust)
-        points = np.stack([damped_step(u, gradient, hessian, damping, free) for damping in DAMPINGS])
+        points = damped_steps(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS), free)
         costs = robust_cost(objective.residuals(points), robust) / objective.counted
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)
         if costs.min() < cost:

@@ -3,11 +3,16 @@
 A physics step has some four thousand operations and sixty results. XLA's fusion for processors gives each result a loop
 of its own, in which everything that leads to it is computed again: 24,000 operations a step. Its fusion of several
 results into one loop is off by default, and no option of a single `jax.jit` turns it on; with it a step has 2,500.
+
+What is left are two hundred loops a step, each a task that a scheduler starts: for a few vehicles that takes longer
+than their arithmetic. `as_one_function` has a part of a program compiled as a single function.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from typing import Any
 
 OPTION = "xla_cpu_use_multi_output_fusion"
 FLAG = "--xla_backend_extra_options"
@@ -22,3 +27,23 @@ def share_results() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {FLAG}={OPTION}".strip()
+
+
+def as_one_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of arrays, compiled on a processor as a single function: its loops run without a task for each.
+
+    Only for arithmetic on single numbers: products of matrices and solvers lose their tuned kernels. Only for some
+    hundred instances: larger loops are divided among the cores, which XLA fails to compile within such a function.
+    Versions that do not know the attributes ignore them; an accelerator is not asked, it would keep the call apart.
+    """
+    import jax
+    from jax.experimental.xla_metadata import set_xla_metadata
+
+    if jax.default_backend() != "cpu":
+        return function
+
+    def marked(*args: Any) -> Any:
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            return jax.jit(function)(*jax.lax.optimization_barrier(args))  # XLA aborts on operands that are constants
+
+    return marked

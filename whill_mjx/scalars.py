@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -37,7 +37,9 @@ KNOWN: dict[str, Callable] = {
     "mul": np.multiply, "ne": np.not_equal, "neg": np.negative, "or": np.logical_or, "sign": np.sign, "sin": np.sin,
     "sqrt": np.sqrt, "square": np.square, "sub": np.subtract, "tanh": np.tanh,
 }  # fmt: skip
-"""Folded where all operands are constants of floating point or truth values."""
+"""Folded where all operands are constants."""
+OF_INTEGERS = {"abs", "add", "eq", "ge", "gt", "le", "lt", "max", "min", "mul", "ne", "neg", "sub"}
+"""Those of them that are the same for integers."""
 REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
               "reduce_or": "or"}  # fmt: skip
 BINARY = {name: getattr(jax.lax, f"{name}_p") for name in set(REDUCTIONS.values()) | {"neg"}}
@@ -142,6 +144,10 @@ def _evaluate_one(equation: Any, operands: list[Parts]) -> list[Parts]:
             return [_elementwise(equation, operands, shape)]
         if name in MOVES:
             return [MOVES[name](operands, params).reshape(shape)]
+        if name == "unstack":
+            return _lines(operands[0], params["axis"])
+        if name == "iota":
+            return [take_apart(np.indices(shape, params["dtype"])[params["dimension"]])]
         if name in REDUCTIONS:
             return [_reduce(REDUCTIONS[name], operands[0], params["axes"])]
         if name == "dot_general" and not any(params["dimension_numbers"][1]):
@@ -152,6 +158,7 @@ def _evaluate_one(equation: Any, operands: list[Parts]) -> list[Parts]:
 MOVES: dict[str, Callable[[list[Elements], dict], Elements]] = {
     "broadcast_in_dim": lambda x, p: _broadcast(x[0], p["shape"], p["broadcast_dimensions"]),
     "concatenate": lambda x, p: np.concatenate(x, p["dimension"]),
+    "pad": lambda x, p: _pad(x[0], x[1], p["padding_config"]),
     "reshape": lambda x, p: x[0],
     "squeeze": lambda x, p: x[0],
     "rev": lambda x, p: np.flip(x[0], p["dimensions"]),
@@ -176,11 +183,14 @@ def _combine(primitive: Any, params: dict, given: list, dtype: Any) -> Any:
     """One elementwise operation on scalars; constants are folded."""
     name = primitive.name
     known = [isinstance(value, np.generic) for value in given]
+    if name == "integer_pow" and known[0]:
+        return np.asarray(given[0] ** params["y"], dtype)[()]
     if name == "convert_element_type" and known[0]:
         return np.asarray(given[0], dtype)[()]
     if name == "select_n" and known[0]:
         return given[1 + int(given[0])]
-    if all(known) and name in KNOWN and all(value.dtype.kind in "fb" for value in given):
+    kinds = "fbiu" if name in OF_INTEGERS else "fb"
+    if all(known) and name in KNOWN and all(value.dtype.kind in kinds for value in given):
         with np.errstate(all="ignore"):
             return np.asarray(KNOWN[name](*given), dtype)[()]
     if len(given) == 2 and any(known) and dtype.kind == "f":
@@ -248,6 +258,23 @@ def _broadcast(operand: Elements, shape: tuple[int, ...], dimensions: tuple[int,
     for axis, dimension in enumerate(dimensions):
         spread[dimension] = operand.shape[axis]
     return np.broadcast_to(operand.reshape(spread), shape)
+
+
+def _lines(operand: Elements, axis: int) -> list[Elements]:
+    moved = np.moveaxis(operand, axis, 0)
+    return [moved[i, ...] for i in range(len(moved))]
+
+
+def _pad(operand: Elements, value: Elements, sizes: Sequence[tuple[int, int, int]]) -> Elements:
+    """With a `value` () before, behind and between elements; negative sizes cut."""
+    for axis, (before, behind, between) in enumerate(sizes):
+        filled = np.broadcast_to(value, operand.shape[:axis] + operand.shape[axis + 1 :])
+        lines = [filled] * max(before, 0)
+        for line in _lines(operand, axis):
+            lines += [line, *[filled] * between]
+        lines = lines[max(-before, 0) : len(lines) - between + min(behind, 0)] + [filled] * max(behind, 0)
+        operand = np.stack(lines, axis)
+    return operand
 
 
 def _slices(params: dict) -> tuple[slice, ...]:

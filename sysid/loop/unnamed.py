@@ -167,21 +167,20 @@ def find_unnamed(result: Result) -> Unnamed | None:
         if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
             names = list(result.reference.space.names)
             return replace(found, vehicle=set_values(found.vehicle, names, get_values(result.before, names)))
-        plant = with_start_angles(result.plant, found.vehicle, trials, found.angles)
+        plant = with_start_angles(result.plant, trials, found.angles)
         result = replace(result, prepared=replace(result.prepared, plant=plant))
     return replace(found, vehicle=refit_poses(result, found.vehicle))
 
 
-def with_start_angles(plant: Plant, vehicle: VehicleParams, trials: Sequence[Trial], angles: np.ndarray) -> Plant:
+def with_start_angles(plant: Plant, trials: Sequence[Trial], angles: np.ndarray) -> Plant:
     """A plant that places the wheels at each trial's own angle (B,), which it knows by where the trial starts."""
     starts = jnp.array([[one.start.x, one.start.y, one.start.yaw] for one in trials])
     turned = jnp.asarray(angles, starts.dtype)
-    index = [effect.name for effect in vehicle.effects].index("unnamed")
 
     def place(params: Any, start: jnp.ndarray) -> Any:
         state = plant.place(params, start)
         mine = turned[jnp.square(starts - start[:3]).sum(-1).argmin()]
-        memory = list(state.memory)
+        memory, index = list(state.memory), [effect.name for effect in params.effects].index("unnamed")
         memory[index] = replace(memory[index], angle=mine + jnp.zeros(2))
         return replace(state, memory=tuple(memory))
 

@@ -330,7 +330,7 @@ def test_replicates_start_at_their_own_angle_of_a_wheel_that_is_out_of_balance(d
     pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
     speeds = []
     for angles in ([0.0, 0.0], [0.0, np.pi]):
-        plant = with_start_angles(sloping.plant, pushed, trials, np.array(angles))
+        plant = with_start_angles(sloping.plant, trials, np.array(angles))
         turned = replace(sloping, prepared=replace(sloping.prepared, plant=plant))
         speeds.append([one.odometry.v for one in replay(turned, pushed, trials)])
     (first, second), (same, other) = speeds

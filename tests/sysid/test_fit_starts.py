@@ -9,7 +9,7 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid import gradient, starts
-from sysid.courses import CourseReplay, make_courses
+from sysid.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, sets_together
 from sysid.feature_objective import FeatureObjective, make_features_objective
 from sysid.fit import with_effects
 from sysid.objective import Objective, estimate_noise
@@ -122,3 +122,22 @@ def test_effects_are_added_where_they_do_nothing():
     assert values["lateral_damping.c_front"] == 0.0 and np.isfinite(values["jerk_limit.linear"])
     with pytest.raises(ValueError, match="no effect 'anti_gravity'"):
         with_effects(params, ("anti_gravity",))
+
+
+@pytest.mark.parametrize("cores", [1, 2, 16])
+@pytest.mark.parametrize("courses", [1, 2, 3, 5, 8, 9, 18, 31])
+def test_drives_that_a_core_replays_together_fill_its_vectors(courses, cores):
+    few, many = sets_together(courses, 53, cores)
+    assert few * courses % VECTOR == 0 and many * courses % VECTOR == 0
+    assert FEW <= few * courses <= many * courses <= MANY + VECTOR * courses
+
+
+def test_differences_of_a_jacobian_are_shared_out_evenly():
+    few, many = sets_together(8, 53, cores=2)
+    parts = -(-53 // many)
+    assert parts % 2 == 0 and parts * many - 53 < 4  # neither core waits, little is replayed in vain
+    assert many > few
+
+
+def test_of_many_courses_few_sets_are_replayed_together():
+    assert sets_together(600, 53, cores=2) == (4, 4)

@@ -57,6 +57,61 @@ def test_a_vehicle_that_starts_in_motion_is_under_way_at_the_start_pose():
     np.testing.assert_allclose(np.diff(pose[:, 2]) / 0.05, (pose[-1, 2] - pose[0, 2]) / t[-1], rtol=0.15)
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
+    """As the vehicle itself drives, also where another effect changes the commands before they are delayed."""
+    import jax
+    import jax.numpy as jnp
+
+    from sysid.rollout import path_of, vehicle_plant
+    from whill_mjx.config import VehicleConfig
+    from whill_mjx.effects import make_effect
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.005))
+    params = preset_params(WHILL_CR, "physical")
+    changed = (*params.effects[1:-1], make_effect("command_delay", delay=0.033))  # no low-pass after it
+    scale = make_effect("command_scale", linear=0.5)
+    params = params.replace(effects=changed if first else (scale, *changed))
+    command = jnp.asarray(np.repeat(np.random.default_rng(0).normal(0, 0.5, (20, 1, 2)), 4, axis=0), jnp.float32)
+    start = jnp.zeros(5)
+
+    def driven(command):
+        def after(state, commands):
+            state = plant.substeps(params, state, commands)
+            return state, plant.observe(state)
+        return jax.lax.scan(after, plant.place(params, start), command)[1]
+
+    found = jax.jit(lambda command: path_of(plant, params, command, start, few=True))(command)
+    assert np.abs(found).max() > 0.05
+    np.testing.assert_allclose(found[1:], jax.jit(driven)(command), atol=1e-5)
+
+
+def test_many_drives_side_by_side_are_those_of_a_few_and_so_are_their_derivatives():
+    """Few are computed by one function, which XLA cannot compile for many."""
+    from sysid.rollout import IN_ONE, vehicle_plant
+    from whill_mjx.config import VehicleConfig
+    from whill_mjx.parameters import get_values, set_values
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR
+
+    t = np.arange(0.0, 0.2, 0.05)
+    trial = Trial("a_1", "a", Command(np.array([0.0]), np.array([0.5]), np.array([0.4])), None,
+                  PoseStream(t, 0 * t, 0 * t, 0 * t), Start(0.0, 0.0, 0.0))
+    params, names = preset_params(WHILL_CR, "physical"), ("body.mass", "torque_drive.kp")
+    plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.005))
+    batch, _ = make_batch((trial,), plant.dt)
+    few, many = (Replay(plant, batch, lambda values: set_values(params, names, values)) for _ in range(2))
+    values = np.array(get_values(params, names)) * np.linspace(0.9, 1.1, 8 * IN_ONE)[:, None]
+    chosen = [0, 2 * IN_ONE, 8 * IN_ONE - 1]
+    expected = few.simulate(values[chosen]).pose
+    assert np.ptp(expected[:, 0, -1, 0]) > 1e-3
+    np.testing.assert_allclose(many.simulate(values).pose[chosen], expected, atol=1e-6)
+    slopes = [one.jacobian(rows)[1].pose for one, rows in ((few, values[chosen]), (many, values))]
+    np.testing.assert_allclose(slopes[1][chosen], slopes[0], atol=1e-5)
+
+
 def test_a_drive_that_starts_in_motion_is_settled_by_the_quick_way_of_many_steps():
     """One step after the other, each put together from single elements, takes sixty times as long."""
     plain = unicycle_plant()

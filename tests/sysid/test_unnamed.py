@@ -133,7 +133,7 @@ def test_nothing_is_kept_of_noise(bench):
 
 def test_a_plant_places_the_wheels_as_each_trial_found_them(bench):
     trials, angles = bench.result.log.training, np.linspace(0.5, 4.5, len(DRIVES))
-    plant = with_start_angles(bench.result.plant, bench.params, trials, angles)
+    plant = with_start_angles(bench.result.plant, trials, angles)
     for trial, angle in zip(trials, angles, strict=True):
         start = jnp.array([trial.start.x, trial.start.y, trial.start.yaw, 0.0, 0.0])
         state = plant.place(bench.params, start)

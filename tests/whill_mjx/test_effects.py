@@ -145,6 +145,26 @@ def test_a_delay_keeps_the_order_of_commands_that_are_under_way():
     np.testing.assert_allclose(heard[61:], sent[1:-60], atol=1e-5)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.0125, 0.037])
+def test_commands_that_are_known_are_delayed_ahead_as_step_by_step(delay):
+    """Several changes under way at once, a long hold, and the derivative by the delay."""
+    sent = np.repeat(np.random.default_rng(1).normal(size=(40, 2)), [1, 2, 1, 5] * 10, axis=0).astype(np.float32)
+    motion = dataclasses.replace(motion_at(), dt=0.005)
+
+    def one_by_one(delay):
+        effect = make_effect("command_delay", delay=delay)
+        return jax.lax.scan(lambda memory, command: effect.command(memory, command, motion), effect.init(), sent)[1]
+
+    def ahead(delay):
+        return make_effect("command_delay", delay=delay).ahead(jnp.asarray(sent), 0.005)
+
+    np.testing.assert_allclose(ahead(delay), one_by_one(delay), atol=2e-4)
+    if delay % 0.005 > 1e-3:
+        slopes = [jax.jacfwd(function)(jnp.asarray(delay)) for function in (ahead, one_by_one)]
+        assert np.abs(slopes[0]).max() > 1.0
+        np.testing.assert_allclose(*slopes, rtol=1e-3)
+
+
 def test_odometry_lag_filters_speeds_and_leaves_the_pose():
     lag = OdometryLag(time_constant=jnp.array(0.05))
     reading = Odometry(*(jnp.array(value) for value in (1.0, 2.0, 3.0, 0.5, 0.4)))

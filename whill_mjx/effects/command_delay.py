@@ -47,3 +47,15 @@ class CommandDelay(Effect):
             blend = delayed + arrived[slot] * (value[slot] - delayed)
             delayed = jnp.where(arrived[slot] >= 1.0, value[slot], blend)  # exact, not only to rounding
         return CommandMemory(value, age + motion.dt), delayed
+
+    def ahead(self, commands: jax.Array, dt: float) -> jax.Array:
+        """What acts in each of S physics steps of `dt` [s], of the commands (S, 2) sent in them and none before.
+
+        As `command` tells it step by step, however many changes are under way, for commands that are all known.
+        """
+        steps = self.delay / dt
+        whole = jnp.floor(steps)
+        sent = jnp.concatenate([jnp.zeros((1, 2), commands.dtype), commands])
+        at = jnp.arange(1, len(sent)) - whole.astype(int)
+        newer, older = (sent[jnp.clip(index, 0, None)] for index in (at, at - 1))
+        return newer + (steps - whole) * (older - newer)
