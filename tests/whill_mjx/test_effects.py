@@ -70,6 +70,23 @@ def test_lateral_damping_pushes_against_sideways_motion():
     np.testing.assert_allclose(wrench.fy, -2.0 * 52 * 0.3, rtol=0.02)
 
 
+def test_lateral_damping_grows_with_the_load_of_tyres_but_not_of_rollers():
+    """Rollers drag by the mass that their axle carries at rest, until they leave the floor."""
+    damping, motion = LateralDamping(c_rear=jnp.array(2.0), c_front=jnp.array(2.0)), motion_at(sideways=0.6)
+    rear, front = motion.contact_points[0][0], motion.contact_points[0][2]
+    at_front = motion.total_mass * (motion.com[0] - rear) / (front - rear)  # [kg]
+
+    def push(sliding, load):
+        moved = dataclasses.replace(motion, normal_force=load * motion.normal_force,
+                                    contact_vy=0.6 * jnp.array(sliding))
+        return damping.force((), moved)[1].fy
+
+    rollers, tyres = ([push(sliding, load) for load in (1.0, 0.6, 0.0)] for sliding in ([0, 0, 1, 1], [1, 1, 0, 0]))
+    np.testing.assert_allclose(rollers, -2.0 * 0.6 * at_front * np.array([1.0, 1.0, 0.0]), rtol=0.06)
+    np.testing.assert_allclose(tyres, np.array([1.0, 0.6, 0.0]) * tyres[0], rtol=1e-5)
+    assert tyres[0] < 0
+
+
 @pytest.mark.parametrize("omega", [-1.0, 1.0])
 def test_yaw_scrub_opposes_turning(omega):
     _, wrench = YawScrub(torque=jnp.array(4.0)).force((), motion_at(omega=omega))

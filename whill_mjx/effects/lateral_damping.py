@@ -10,11 +10,18 @@ from whill_mjx.effects.base import Effect, contact_wrench
 from whill_mjx.types import Motion, Wrench, parameter
 
 GRAVITY = 9.81  # [m/s^2], turns the load of a contact into the mass it carries
+TOUCHING = 3.0  # a passive wheel loses its damping smoothly below a third of the load that it has at rest
 
 
 @struct.dataclass
 class LateralDamping(Effect):
-    """F_y = -c (N / g) v_y at each contact, c of its axle. Source: reference paper, Table II."""
+    """F_y = -c m v_y at each contact, c of its axle, m the mass it carries: driven wheels now, passive ones at rest.
+
+    A tyre holds by its load. The rollers of a passive wheel turn in bearings, whose viscous drag does not know it: with
+    the present load, a front axle that lifts as the vehicle pulls away would let it turn more easily, and fits of
+    vehicles that do not brought the centre of mass down to the floor, where no load shifts. Source of the law and of
+    c: reference paper, Table II.
+    """
 
     name = "lateral_damping"
     typical = {"c_rear": (1.0, 35.0), "c_front": (0.1, 0.5)}
@@ -25,5 +32,15 @@ class LateralDamping(Effect):
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench of the lateral forces at the four contacts."""
         damping = jnp.stack([self.c_rear, self.c_rear, self.c_front, self.c_front])
-        lateral = -damping * motion.normal_force / GRAVITY * motion.contact_vy
+        driven, carried = motion.world.geometry.driven, motion.normal_force / GRAVITY
+        rest = resting_mass(motion)
+        passive = rest * jnp.tanh(TOUCHING * carried / rest)
+        lateral = -damping * (driven * carried + (1 - driven) * passive) * motion.contact_vy
         return memory, contact_wrench(motion, jnp.zeros(4), lateral)
+
+
+def resting_mass(motion: Motion) -> jax.Array:
+    """Mass (4,) [kg] that the contacts carry at rest on level ground, the same on both sides."""
+    x = motion.world.geometry.contact_x
+    front = jnp.clip((motion.com[0] - x[0]) / (x[2] - x[0]), 0.01, 0.99)
+    return motion.total_mass / 2 * jnp.stack([1 - front, 1 - front, front, front])
