@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,11 +22,12 @@ import numpy as np
 from flax import struct
 
 from sysid import pieces, sensing
+from sysid.by_law import delayed, without
 from sysid.cores import on_all_cores, on_processor
 from sysid.log import OdometryStream, PoseStream, Trial
 from sysid.metrics import Prediction, command_in_force
 from whill_mjx.config import VehicleConfig
-from whill_mjx.effects import CommandDelay, OdometryLag, SensorDelay
+from whill_mjx.effects import OdometryLag, SensorDelay
 from whill_mjx.processor import as_one_function
 from whill_mjx.specs import VehicleSpec
 
@@ -269,10 +270,10 @@ def path_of(
         speeds: (W, 2) where pieces begin, to replay it in these (`sysid.pieces`).
         few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
     """
-    params, latency = _without(params, SensorDelay.name)
-    params, lag = _without(params, OdometryLag.name) if plant.frame else (params, None)
+    params, latency = without(params, SensorDelay.name)
+    params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
     if not warm_up:  # which finds its commands on the way
-        params, command = _delayed(params, command, plant.dt)
+        params, command = delayed(params, command, plant.dt)
 
     in_one = as_one_function if few and plant.arithmetic else lambda function: function
 
@@ -309,29 +310,6 @@ def path_of(
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
     # The measured yaw may count full turns from another origin than the simulated one.
     return path.at[:, 2].add(turns)
-
-
-def _without(params: Any, name: str) -> tuple[Any, Any]:
-    """The vehicle without the last of its effects of sensing, where that is the named one, and that effect or None.
-
-    What was recorded is read by its law instead, without a buffer that every step would have to carry.
-    """
-    effects = getattr(params, "effects", ())
-    last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
-    if not last or getattr(last[0], "name", "") != name:
-        return params, None
-    return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0]
-
-
-def _delayed(params: Any, command: jax.Array, dt: float) -> tuple[Any, jax.Array]:
-    """The vehicle without the first of its effects on commands, where that is a delay, and commands (R, K, 2) that are
-    delayed by its law: every step would carry the changes under way, on an accelerator as a kernel for each number."""
-    effects = getattr(params, "effects", ())
-    first = next((effect for effect in effects if hasattr(effect, "command")), None)
-    if not isinstance(first, CommandDelay):
-        return params, command
-    kept = replace(params, effects=tuple(effect for effect in effects if effect is not first))
-    return kept, first.ahead(command.reshape(-1, 2), dt).reshape(command.shape)
 
 
 class PathReplay:
