@@ -64,6 +64,8 @@ class Benchmark:
     """Synthetic logs of the coverage."""
     plant_logs: int = 50
     """Logs of the contact plant of the coverage."""
+    other_logs: int = 0
+    """Logs of each of the contact plant's other vehicles, a scooter and a robot, of the coverage."""
     search_log: str = "plant"
     """Log of starts, tpe and searches: plant (the shared plain chair), planted, or a folder."""
     search_trials: int = 18
@@ -231,14 +233,15 @@ def many_starts(settings: Benchmark) -> None:
 def coverage(settings: Benchmark) -> None:
     """Coverage of the 90 % intervals on logs with known values."""
     folder = settings.work / "coverage"
-    labels = [f"{kind}_{n:03d}" for kind, count in (("synthetic", settings.logs), ("plant", settings.plant_logs))
-              for n in range(count)]
+    counts = {"synthetic": settings.logs, "plant": settings.plant_logs}
+    labels = [f"{kind}_{n:03d}" for kind in fit_coverage.KINDS for n in range(counts.get(kind, settings.other_logs))]
     if not settings.collect:
         share_compilations(settings.work / "compiled")
         run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(
             label, settings.iterations, folder, settings.work / "compiled"))
         return
-    for kind, prefix in (("synthetic", ""), ("plant", "plant_")):
+    for kind in fit_coverage.KINDS:
+        prefix = "" if kind == "synthetic" else f"{kind}_"
         results = [fit_coverage.judged_again(one, folder) for one in read_results(folder, f"{kind}_*")]
         if results:
             figures = on_device(fit_coverage.summarise(results, prefix), results)

@@ -12,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,17 +75,17 @@ def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
                                     strict=True))
 
 
-def plant_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
-    """A log of a day of the contact plant, and the values of the physical model that are known."""
-    from benchmarks.plant.chair import COULOMB, Chair
+def plant_log(folder: Path, seed: int, vehicle: str = "chair") -> tuple[Log, dict[str, float]]:
+    """A log of a day of one of the contact plant's vehicles, and the values of the physical model that are known."""
+    from benchmarks.plant.chair import COULOMB, VEHICLES
     from benchmarks.plant.commands import nine
     from benchmarks.plant.make import make_log
 
     tables = {name: table[table[:, 0] < PLANT_LENGTH] for name, table in nine(seed).items() if name in PLANT_MANOEUVRES}
-    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB)
+    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB, vehicle=vehicle)
     log = load_log(folder / "log")
     log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
-    return log, plant_values(Chair().on_day(np.random.default_rng([seed, 1])), log.spec)
+    return log, plant_values(VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])), log.spec)
 
 
 def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
@@ -118,8 +119,13 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 
 
+KINDS = {"synthetic": synthetic_log, "plant": plant_log, "scooter": partial(plant_log, vehicle="scooter"),
+         "robot": partial(plant_log, vehicle="robot")}
+"""Logs by the kind in their label. Figures of all but the synthetic ones begin with it."""
+
+
 def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, Any]:
-    """Fit one log, `synthetic_NNN` or `plant_NNN`, and note each known value with its estimate.
+    """Fit one log, KIND_NNN with a kind of `KINDS`, and note each known value with its estimate.
 
     Args:
         folder: where what the log tells is kept, as evidence/LABEL.npz.
@@ -127,7 +133,7 @@ def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, 
     """
     kind, _, number = label.partition("_")
     with tempfile.TemporaryDirectory() as scratch:
-        log, truth = (plant_log if kind == "plant" else synthetic_log)(Path(scratch), 50000 + int(number))
+        log, truth = KINDS[kind](Path(scratch), 50000 + int(number))
     problem = make_problem(log, FitConfig())
     compile_once(compiled, f"coverage_{kind}", lambda: compile_replay(problem.objective))
     fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))

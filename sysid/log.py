@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.specs import SPECS, WHILL_CR, VehicleSpec
+from whill_mjx.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
 SCHEMA = 1
 STANDSTILL = 1.0
@@ -267,25 +267,26 @@ def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
 def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, list[str]]:
     """Vehicle spec from the fields of dataset.toml, and notes on what had to be assumed."""
     name = fields["vehicle"]
-    base = SPECS.get(name, WHILL_CR)
-    changes: dict[str, Any] = {"name": name}
-    for key in ("drive", "driven_axle"):
-        if key in fields:
-            changes[key] = fields[key]
-    notes = []
-    for key in ("wheel_radius", "track", "wheelbase", "mass"):
+    sizes: dict[str, float] = {}
+    for key, limit in (("wheel_radius", 2.0), ("track", 5.0), ("wheelbase", 10.0), ("mass", 1e4)):
         if key not in fields:
             if key in ("wheel_radius", "track") and name not in SPECS:
                 raise ValueError(f"{path}: no {key}. Add {key} = VALUE in metres, measured on the vehicle.")
-            notes.append(f"{key} is not in dataset.toml: {getattr(base, key):g} of {base.name} is assumed")
             continue
         value = fields[key]
         if not isinstance(value, int | float) or not value > 0:
             raise ValueError(f"{path}: {key} is {value!r}; it must be a positive number (m, kg).")
-        changes[key] = float(value)
-    for key, limit in (("wheel_radius", 2.0), ("track", 5.0), ("wheelbase", 10.0), ("mass", 1e4)):
-        if changes.get(key, 0.0) > limit:
-            raise ValueError(f"{path}: {key} is {changes[key]:g}; at most {limit:g} is plausible. Use m and kg.")
+        if value > limit:
+            raise ValueError(f"{path}: {key} is {value:g}; at most {limit:g} is plausible. Use m and kg.")
+        sizes[key] = float(value)
+    changes: dict[str, Any] = {key: fields[key] for key in ("drive", "driven_axle") if key in fields}
+    if name in SPECS:
+        base, source = replace(SPECS[name], **sizes), f"that of {name}"
+    else:
+        like = HUSKY if fields.get("drive") == "skid" else WHILL_CR
+        base, source = in_proportion(like, name, **sizes), f"in proportion to {like.name}"
+    notes = [f"{key} is not in dataset.toml: {getattr(base, key):.3g} is assumed, {source}"
+             for key in ("wheel_radius", "track", "wheelbase", "mass") if key not in sizes]
     if "command_limits" in fields:
         limits = fields["command_limits"]
         if not (isinstance(limits, list) and len(limits) == 2 and all(value > 0 for value in limits)):

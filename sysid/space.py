@@ -94,14 +94,15 @@ LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-fo
 
 def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
     """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track, and
-    a centre of mass between the axles."""
+    a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
     scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
               for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
     middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
     return {**scaled, "torque_drive.kff": (0.0, LOSS * load), "wheel_damping.damping": (0.0, LOSS * load),
             "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
-            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width)}
+            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width),
+            "body.com_z": (-spec.wheel_radius, 1.5 * spec.track - spec.wheel_radius)}
 
 
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:

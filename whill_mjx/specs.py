@@ -7,7 +7,7 @@ at x = -0.265 m would lie behind that axle and tip the chair.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,35 @@ CREATE = VehicleSpec(
     body_length=0.34, body_width=0.34, body_height=0.10, v_min=-0.5, v_max=0.5, omega_max=4.0,
 )
 SPECS = {spec.name: spec for spec in (WHILL_CR, HUSKY, WARTHOG, CREATE)}
+
+
+def in_proportion(
+    base: VehicleSpec, name: str, wheel_radius: float, track: float, wheelbase: float | None = None,
+    mass: float | None = None,
+) -> VehicleSpec:
+    """The spec of a vehicle of which little but its size is known: all else is in proportion to `base` (an estimate).
+
+    Lengths along the vehicle go with the wheelbase, those across it and its height with the track, and the inertia of
+    its wheels with mass times the square of their radius.
+
+    Args:
+        name: what it is called.
+        wheel_radius, track: of the vehicle [m].
+        wheelbase: of the vehicle [m]; by default it goes with the track.
+        mass: of the vehicle [kg]; by default it goes with the cube of the track.
+    """
+    across = track / base.track
+    wheelbase = base.wheelbase * across if wheelbase is None else wheelbase
+    mass = base.mass * across**3 if mass is None else mass
+    along = wheelbase / base.wheelbase
+    spin = mass * wheel_radius**2 / (base.mass * base.wheel_radius**2)
+    camera = replace(base.camera, x=base.camera.x * along, z=base.camera.z * across)
+    return replace(
+        base, name=name, wheel_radius=wheel_radius, track=track, wheelbase=wheelbase, mass=mass, camera=camera,
+        rear_axle_x=None if base.rear_axle_x is None else base.rear_axle_x * along,
+        wheel_inertia=base.wheel_inertia * spin, body_length=base.body_length * along,
+        body_width=base.body_width * across, body_height=base.body_height * across,
+    )
 
 
 def find_spec(name: str) -> VehicleSpec:

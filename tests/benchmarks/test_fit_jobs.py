@@ -18,10 +18,12 @@ from benchmarks.fit_jobs import (
     run_jobs,
     staged,
 )
-from benchmarks.plant.chair import Chair
+from benchmarks.plant.chair import VEHICLES, Chair
 from sysid.independence import Evidence
+from sysid.models import measured_effects, with_effects
 from sysid.space import Space, make_space, searched
-from whill_mjx.specs import WHILL_CR
+from whill_mjx.presets import preset_params
+from whill_mjx.specs import WHILL_CR, in_proportion
 
 
 @pytest.mark.quick
@@ -110,6 +112,24 @@ def test_values_of_the_contact_plant_are_per_nominal_inertia():
     # The centre of mass is ahead of the driven axle by a bit less than that of the frame alone.
     assert 0.12 < light["body.com_x"] - WHILL_CR.rear_x < 0.2
     assert 2.0 < light["body.yaw_inertia"] < 8.0
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("vehicle", ["scooter", "robot"])
+def test_known_values_of_the_plants_vehicles_lie_within_the_bounds_of_their_fit(vehicle):
+    """Coverage is of no use where a truth cannot be reached."""
+    nominal = VEHICLES[vehicle].nominal
+    spec = in_proportion(WHILL_CR, vehicle, nominal.radius, nominal.track, nominal.wheelbase, nominal.mass)
+    start = preset_params(spec, "physical")
+    start = with_effects(start, measured_effects(start, spec, ()))
+    space = make_space(start, spec, searched(start))
+    known = fit_coverage.plant_values(VEHICLES[vehicle], spec)
+    searched_too = [name for name in known if name in space.names]
+    assert len(searched_too) >= 10
+    for name in searched_too:
+        i = space.names.index(name)
+        assert space.low[i] < known[name] < space.high[i], name
+    assert set(fit_coverage.KINDS) == {"synthetic", "plant", "scooter", "robot"}
 
 
 @pytest.mark.quick

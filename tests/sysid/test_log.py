@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from sysid.log import load_log, manoeuvre_of
 from sysid.synthetic import write_csv, write_text
+from whill_mjx.model import box_inertia
+from whill_mjx.specs import HUSKY, WHILL_CR
 
 pytestmark = pytest.mark.quick
 TOML = 'schema = 1\nvehicle = "a chair"\nwheel_radius = 0.13\ntrack = 0.5\nwheelbase = 0.5\nmass = 60.0\n'
@@ -71,7 +75,23 @@ def test_replicates_share_the_name_before_the_number():
 
 def test_a_missing_mass_is_assumed_and_noted(dataset):
     replace_in(dataset / "dataset.toml", "mass = 60.0\n", "")
-    assert any("mass" in note for note in load_log(dataset).notes)
+    log = load_log(dataset)
+    assert any("mass" in note and "whill_cr" in note for note in log.notes)
+    assert log.spec.mass == pytest.approx(WHILL_CR.mass * (log.spec.track / WHILL_CR.track) ** 3)
+
+
+@pytest.mark.parametrize(("drive", "like"), [("differential", WHILL_CR), ("skid", HUSKY)])
+def test_a_vehicle_that_is_not_built_in_has_the_proportions_of_one_that_is(dataset, drive, like):
+    """Half as large in all directions, it has half the lengths and an eighth of the mass."""
+    sizes = {"wheel_radius": like.wheel_radius / 2, "track": like.track / 2, "wheelbase": like.wheelbase / 2}
+    fields = {"schema": 1, "vehicle": "a small one", "drive": drive, **sizes}
+    (dataset / "dataset.toml").write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in fields.items()))
+    spec = load_log(dataset).spec
+    assert spec.drive == drive and spec.mass == pytest.approx(like.mass / 8)
+    assert spec.wheel_inertia == pytest.approx(like.wheel_inertia / 32)
+    for length in ("body_length", "body_width", "body_height", "rear_x", "front_x"):
+        assert getattr(spec, length) == pytest.approx(getattr(like, length) / 2), length
+    np.testing.assert_allclose(box_inertia(spec), np.array(box_inertia(like)) / 32)
 
 
 BAD_TOML = {

@@ -25,9 +25,9 @@ class TwoValleys:
     steep: float
     """How much it costs that the first parameter stays behind the second."""
     counted = 1
+
     def renewed(self, u):
         return self
-
 
     def residuals(self, u):
         behind, x = self.steep * (u[:, 0] - u[:, 1]), u[:, 1]
@@ -92,9 +92,9 @@ class Folded:
     from a = 0.385 to 0.415."""
 
     counted = 1
+
     def renewed(self, u):
         return self
-
 
     def residuals(self, u):
         a, b = u[:, 0], u[:, 1]
@@ -378,6 +378,21 @@ def test_how_high_the_mass_lies_is_searched_where_wheels_skid_by_their_load():
     assert "lateral_damping.c_rear" in searched(physical, ("lateral_damping",))
     paper = searched(preset_params(WHILL_CR, "paper"))
     assert "body.com_z" not in paper and "lateral_damping.c_rear" in paper
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ["whill_cr", "husky", "warthog", "create"])
+def test_the_mass_lies_above_the_floor_and_below_where_the_vehicle_would_tip(name):
+    """Bounds in metres for all vehicles would let that of a small robot lie under the floor."""
+    from sysid.space import make_space
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import find_spec
+
+    spec = find_spec(name)
+    space = make_space(preset_params(spec, "physical"), spec, ["body.com_z"])
+    assert spec.wheel_radius + space.low[0] == pytest.approx(0.0)
+    tips_at = 9.81 * spec.track / 2 / (spec.wheel_radius + space.high[0])  # m/s2, sideways
+    assert tips_at == pytest.approx(9.81 / 3)
 
 
 @pytest.mark.quick
