@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -119,8 +119,10 @@ def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
             "body.com_z": float(middle[2]), "command_delay.delay": chair.delay, "slip_traction.mu": chair.friction}
 
 
-KINDS = {"synthetic": synthetic_log, "plant": plant_log, "scooter": partial(plant_log, vehicle="scooter"),
-         "robot": partial(plant_log, vehicle="robot")}
+KINDS: dict[str, Callable[[Path, int], tuple[Log, dict[str, float]]]] = {
+    "synthetic": synthetic_log, "plant": plant_log, "scooter": partial(plant_log, vehicle="scooter"),
+    "robot": partial(plant_log, vehicle="robot"),
+}
 """Logs by the kind in their label. Figures of all but the synthetic ones begin with it."""
 
 

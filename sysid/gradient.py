@@ -52,6 +52,9 @@ class Residuals(Protocol):
     """
 
     @property
+    def space(self) -> Space: ...
+
+    @property
     def counted(self) -> int: ...
 
     def residuals(self, u: np.ndarray) -> np.ndarray: ...
@@ -104,7 +107,7 @@ def fit(
         nonlocal evaluations
         evaluations += len(starts) * len(dampings)
         at, slopes, curvatures = (np.repeat(one, len(dampings), axis=0) for one in (u[starts], gradient, hessian))
-        points = damped_steps(at, slopes, curvatures, np.outer(damping[starts], dampings).ravel(), free)
+        points = damped_steps(at, slopes, curvatures, np.outer(damping[starts], dampings).ravel(), free, space)
         return points.reshape(len(starts), len(dampings), -1)
 
     def step(at: _Points) -> _Points:
@@ -222,7 +225,7 @@ def _followed(
     residual = objective.residuals(points)
     weight = huber_weight(residual) if robust else np.ones_like(residual)
     pulls = np.einsum("bkp,nbk->np", jacobian, residual * weight, optimize=True)
-    moved = damped_steps(points, pulls, hessian, 1e-3, index != held[:, None])
+    moved = damped_steps(points, pulls, hessian, 1e-3, index != held[:, None], objective.space)
     costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))]) / objective.counted
     return costs.min(0), np.where((costs[1] < costs[0])[:, None], moved, points)
 
@@ -308,9 +311,10 @@ def normal_sums(residual: np.ndarray, jacobian: np.ndarray, robust: bool) -> tup
 
 
 def damped_steps(
-    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any, free: np.ndarray
+    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any, free: np.ndarray, space: Space
 ) -> np.ndarray:
-    """The damped Gauss-Newton points (N, P) of u (N, P) within the box; what is not `free` (P,) or (N, P) stays.
+    """The damped Gauss-Newton points (N, P) of u (N, P) within the box, along its valleys (`Space.moved`); what is not
+    `free` (P,) or (N, P) stays.
 
     Args:
         gradient, hessian: by half, (N, P) and (N, P, P); without N where they are the same for all.
@@ -328,7 +332,7 @@ def damped_steps(
         matrix = hessian[left] * (moving[:, :, None] & moving[:, None])
         matrix[:, np.arange(size), np.arange(size)] += np.where(moving, scale[left], 1.0)
         step = -np.linalg.solve(matrix, np.where(moving, gradient[left], 0.0)[..., None])[..., 0]
-        moved = u[left] + np.clip(step, -MAX_STEP, MAX_STEP)
+        moved = np.where(free[left], space.moved(u[left], np.clip(step, -MAX_STEP, MAX_STEP)), u[left])
         outside = (moved < 0.0) | (moved > 1.0)
         new[left] = np.clip(moved, 0.0, 1.0)
         # Hold what hit its wall at once; what merely reached it keeps the cut step.

@@ -267,7 +267,7 @@ def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
 def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, list[str]]:
     """Vehicle spec from the fields of dataset.toml, and notes on what had to be assumed."""
     name = fields["vehicle"]
-    sizes: dict[str, float] = {}
+    sizes: dict[str, Any] = {}  # m, kg
     for key, limit in (("wheel_radius", 2.0), ("track", 5.0), ("wheelbase", 10.0), ("mass", 1e4)):
         if key not in fields:
             if key in ("wheel_radius", "track") and name not in SPECS:

@@ -88,7 +88,7 @@ def profile(
         grid = np.unique(np.round(np.append(np.linspace(low, high, points), u[index]), 9))
         # Along the valley: what the others do when this one is moved, to first order.
         slope = known.covariance[:, index] / max(known.covariance[index, index], 1e-16)
-        starts = np.clip(u + (grid - u[index])[:, None] * slope, 0.0, 1.0)
+        starts = np.clip(space.moved(np.tile(u, (len(grid), 1)), (grid - u[index])[:, None] * slope), 0.0, 1.0)
         starts[:, index] = grid
         result = gradient.fit(objective, space, starts=starts, iterations=iterations, robust=robust, frozen=(name,),
                               progress=progress)

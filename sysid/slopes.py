@@ -48,9 +48,10 @@ def average_slopes(
     weights = np.linalg.pinv(np.column_stack([moves, np.ones(len(moves))]))[:size]  # (P, N)
     residual = objective.residuals(u[None])[0]
     slopes, count = np.zeros((*residual.shape, size)), max(AT_ONCE // residual.size, 1)
+    points = np.clip(objective.space.moved(np.tile(u, (len(moves), 1)), moves), 0.0, 1.0)
     for first in range(0, len(moves), count):
         part = slice(first, first + count)
-        slopes += np.einsum("pn,nbk->bkp", weights[:, part], objective.residuals(u + moves[part]))
+        slopes += np.einsum("pn,nbk->bkp", weights[:, part], objective.residuals(points[part]))
     return residual, slopes
 
 
@@ -96,7 +97,8 @@ def descend(
         covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
         residual, slopes = average_slopes(objective, u, covariance, seed + number)
         (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], robust)
-        points = damped_steps(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS), free)
+        points = damped_steps(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS), free,
+                              objective.space)
         costs = robust_cost(objective.residuals(points), robust) / objective.counted
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)
         if costs.min() < cost:

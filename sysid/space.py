@@ -30,6 +30,37 @@ NUISANCE = {
 LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns tell how high the mass lies
 
 
+RATIO, YAW, ALONG = "wheel_inertia.ratio", "body.yaw_inertia", "body.com_x"
+PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torque_drive.kff", "wheel_damping.damping",
+               "rolling_resistance.mu_r", "yaw_scrub.torque", "lateral_damping.c_front")
+"""Torques and forces that drives tell per inertia that they speed up, wheels included."""
+
+
+@dataclass(frozen=True)
+class Turned:
+    """What one side's motor turns, from the nominal vehicle."""
+
+    mass: float
+    """Inertia of half of the vehicle, at the wheel [kg m^2]."""
+    wheel: float
+    """Nominal spin inertia of the wheels of one side [kg m^2]."""
+    yaw: float
+    """By how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]."""
+    driven: float
+    """Where the driven wheels are in the chassis frame [m]: centrifugal force tells how far before them the mass is."""
+
+    @classmethod
+    def of(cls, spec: VehicleSpec) -> Turned:
+        """That of a vehicle."""
+        yaw = spec.track**2 / 2 / spec.wheel_radius**2
+        return cls(spec.mass / 2 * spec.wheel_radius**2, spec.wheel_inertia, yaw, spec.reference_x)
+
+    @property
+    def besides(self) -> dict[str, tuple[float, float]]:
+        """What is told per inertia, as a constant and a share of the wheel's inertia that count besides its value."""
+        return {**dict.fromkeys(PER_INERTIA, (0.0, 0.0)), YAW: (0.0, self.yaw), ALONG: (-self.driven, 0.0)}
+
+
 @dataclass(frozen=True)
 class Space:
     """P searched parameters."""
@@ -41,6 +72,8 @@ class Space:
     log: np.ndarray  # (P,) bool
     fixed: tuple[tuple[str, str], ...] = ()
     """Names that keep their value, each with the reason."""
+    turned: Turned | None = None
+    """Of the vehicle, where it is one."""
 
     def __post_init__(self) -> None:
         for name, low, high, value in zip(self.names, self.low, self.high, self.initial, strict=True):
@@ -73,6 +106,37 @@ class Space:
         """d value / d u (..., P)."""
         low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
         return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
+
+    def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Unit coordinates (N, P), which may lie outside the range, a step (N, P) from u (N, P): along the valley of
+        all that is told per inertia.
+
+        Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
+        wheels' is one of two terms: in these coordinates that valley is curved, the more so the lighter the vehicle,
+        and a straight step of one standard error leads far up its sides. To first order the step is as it is.
+        """
+        end = u + step
+        if self.turned is None or RATIO not in self.names:
+            return end
+        at, moves, ratio = self.to_values(u), self.slope(u) * step, self.names.index(RATIO)
+        wheel, later = (self.turned.wheel * self.to_values(x)[:, ratio] for x in (u, end))
+        heavier = self.turned.wheel * moves[:, ratio]
+        inertia, grown = self.turned.mass + wheel, self.turned.mass + later
+        bent = end.copy()
+        for i, name in enumerate(self.names):
+            if name in self.turned.besides:
+                constant, share = self.turned.besides[name]
+                told = (at[:, i] + constant + share * wheel) / inertia
+                move = (moves[:, i] + share * heavier - told * heavier) / inertia
+                told = told * np.exp(move / told) if self.log[i] else told + move
+                bent[:, i] = self._unit(told * grown - constant - share * later, i)
+        return bent
+
+    def _unit(self, values: np.ndarray, i: int) -> np.ndarray:
+        """Coordinate (N,) of values (N,) of the i-th parameter, also beyond its range."""
+        if self.log[i]:
+            return np.log(np.maximum(values / self.low[i], 1e-300)) / np.log(self.high[i] / self.low[i])
+        return (values - self.low[i]) / (self.high[i] - self.low[i])
 
     def subset(self, keep: Sequence[str]) -> Space:
         """The space of the named parameters only."""
@@ -145,7 +209,7 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
     low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range
     log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
     kept = [(name, FIXED.get(name, "not selected")) for name in about if name not in names]
-    return Space(tuple(names), low, high, initial, log, tuple(kept))
+    return Space(tuple(names), low, high, initial, log, tuple(kept), Turned.of(spec))
 
 
 def is_delay(name: str) -> bool:

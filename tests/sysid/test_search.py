@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
@@ -12,10 +13,17 @@ from sysid import gradient, tpe, uncertainty
 from sysid.fit import FitConfig
 from sysid.objective import Noise
 from sysid.rollout import Replay, make_batch, predictions
-from sysid.space import Space
+from sysid.space import RATIO, Space
 from sysid.valleys import gradient_search
+from whill_mjx.parameters import set_values
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
+
+
+def unit_space(*names):
+    """Parameters between 0 and 1."""
+    size = len(names)
+    return Space(names, np.zeros(size), np.ones(size), np.full(size, 0.5), np.zeros(size, bool))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +32,7 @@ class TwoValleys:
 
     steep: float
     """How much it costs that the first parameter stays behind the second."""
-    counted = 1
+    counted, space = 1, unit_space("a", "b")
 
     def renewed(self, u):
         return self
@@ -42,8 +50,8 @@ class TwoValleys:
 @pytest.mark.quick
 @pytest.mark.parametrize(("dear", "cost"), [(10.0, 0.04), (0.01, 1.0)])
 def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, cost, monkeypatch):
-    space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
     valleys, start = TwoValleys(4.0), np.full((1, 2), 0.5)
+    space = valleys.space
     stuck = gradient.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
     monkeypatch.setattr("sysid.valleys.DEAR", dear)
@@ -59,7 +67,8 @@ def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, c
 class NeverMet:
     """A gain and the limit of what it drives: while the limit is above all that is driven nothing tells of it."""
 
-    counted = 1
+    counted, space = 1, unit_space("gain", "limit")
+
     def renewed(self, u):
         return self
 
@@ -78,12 +87,12 @@ class NeverMet:
 
 @pytest.mark.quick
 def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
-    space = Space(("gain", "limit"), np.zeros(2), np.ones(2), np.array([0.5, 1.0]), np.zeros(2, bool))
-    stuck = gradient.fit(NeverMet(), space, iterations=20)
+    space, start = NeverMet.space, np.array([[0.5, 1.0]])
+    stuck = gradient.fit(NeverMet(), space, starts=start, iterations=20)
     assert stuck.u[1] == 1.0 and stuck.cost > 1.0
     costs, points = gradient.far_points(NeverMet(), stuck.u)
     assert points[0, 1] < 0.6 and len(costs) == 3  # the limit behind level ground, a smaller gain and a larger one
-    result, _, _ = gradient_search(NeverMet(), space, np.array([[0.5, 1.0]]), 20, FitConfig(), None)
+    result, _, _ = gradient_search(NeverMet(), space, start, 20, FitConfig(), None)
     np.testing.assert_allclose(result.u, [0.9, 0.37], atol=1e-3)
 
 
@@ -91,7 +100,7 @@ class Folded:
     """A steep valley b = a^2 with a fold every 0.02 along its floor, which is lowest, at cost 1, in five points
     from a = 0.385 to 0.415."""
 
-    counted = 1
+    counted, space = 1, unit_space("a", "b")
 
     def renewed(self, u):
         return self
@@ -108,11 +117,9 @@ class Folded:
 
 @pytest.mark.quick
 def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_lowest(monkeypatch):
-    space = Space(("a", "b"), np.zeros(2), np.ones(2), np.full(2, 0.5), np.zeros(2, bool))
-
     def ends():
         starts = np.array([[0.9, 0.9], [0.8, 0.2]])
-        return [gradient_search(Folded(), space, start[None], 40, FitConfig(), None)[0] for start in starts]
+        return [gradient_search(Folded(), Folded.space, start[None], 40, FitConfig(), None)[0] for start in starts]
 
     found, again = ends(), ends()
     assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=1e-5)  # no fold beside it costs as little
@@ -125,6 +132,8 @@ def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_l
 
 class Hidden(Folded):
     """A third parameter c is better at 1 than at 0 and 0.5, where a search finds it, but only the floor shows that."""
+
+    space = unit_space("a", "b", "c")
 
     def residuals(self, u):
         a, c = u[:, 0], u[:, 2]
@@ -140,10 +149,9 @@ class Hidden(Folded):
 @pytest.mark.quick
 @pytest.mark.parametrize(("rounds", "end", "cost"), [(6, 1.0, 1.04), (0, 0.0, 2.6)])
 def test_ends_of_ranges_are_tried_again_from_the_floor_of_the_valley(rounds, end, cost, monkeypatch):
-    space = Space(("a", "b", "c"), np.zeros(3), np.ones(3), np.full(3, 0.5), np.zeros(3, bool))
     monkeypatch.setattr("sysid.valleys.DEAR", 0.01)  # far along the ranges lies nothing
     monkeypatch.setattr("sysid.slopes.ROUNDS", rounds)
-    found, _, _ = gradient_search(Hidden(), space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
+    found, _, _ = gradient_search(Hidden(), Hidden.space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
     assert found.u[2] == pytest.approx(end, abs=0.02)
     assert found.cost == pytest.approx(cost, rel=0.1)
 
@@ -357,6 +365,80 @@ def test_unit_coordinates_and_values_are_inverse():
         dataclasses.replace(space, initial=np.array([20.0, 0.0]))
     with pytest.raises(ValueError, match="low must be below high"):
         dataclasses.replace(space, low=np.array([10.0, -2.0]))
+
+
+def light_space():
+    """Of a small robot, whose wheels are a large part of what its motors turn."""
+    from sysid.models import measured_effects, with_effects
+    from sysid.space import make_space, searched
+    from whill_mjx.presets import preset_params
+    from whill_mjx.specs import WHILL_CR, in_proportion
+
+    spec = in_proportion(WHILL_CR, "robot", 0.1, 0.4, 0.3, 20.0)
+    params = preset_params(spec, "physical")
+    params = with_effects(params, measured_effects(params, spec, ()))
+    usual = {"wheel_inertia.ratio": 4.0, "torque_drive.kff": 0.02, "wheel_damping.damping": 0.05}
+    params = set_values(params, tuple(usual), jnp.array(list(usual.values())))
+    return spec, params, make_space(params, spec, searched(params))
+
+
+def along_the_valley(space, u, step):
+    """The step (1, P) with which, to first order, all that is told per inertia goes along with heavier wheels."""
+    turned, values, slope = space.turned, space.to_values(u), space.slope(u)
+    ratio = space.names.index(RATIO)
+    wheel, heavier = (turned.wheel * one[ratio] for one in (values, slope * step))
+    moves = np.zeros(space.size)
+    moves[ratio] = step
+    for name, (constant, share) in turned.besides.items():
+        i = space.names.index(name)
+        told = (values[i] + constant + share * wheel) / (turned.mass + wheel)
+        moves[i] = (told - share) * heavier / slope[i]
+    return moves[None]
+
+
+@pytest.mark.quick
+def test_a_step_along_the_valley_of_what_is_told_per_inertia_stays_on_its_floor():
+    _, _, space = light_space()
+    u = space.to_unit(space.initial)
+    step = along_the_valley(space, u, 0.2)
+    ends = space.to_values(u), space.to_values(space.moved(u[None], step)[0])
+    before, after = (dict(zip(space.names, one, strict=True)) for one in ends)
+    turned = space.turned
+    inertia, later = (turned.mass + turned.wheel * one[RATIO] for one in (before, after))
+    assert after[RATIO] > 2 * before[RATIO]
+    for name, (constant, share) in turned.besides.items():
+        told = [(one[name] + constant + share * turned.wheel * one[RATIO]) / size
+                for one, size in ((before, inertia), (after, later))]
+        assert told[1] == pytest.approx(told[0]), name
+    other = np.array([name not in turned.besides for name in space.names])
+    np.testing.assert_array_equal(space.moved(u[None], step)[0, other], (u + step[0])[other])
+    # To first order a step is as it is, and where wheels keep their inertia altogether.
+    random = np.random.default_rng(0).standard_normal((5, space.size))
+    small = (space.moved(np.tile(u, (5, 1)), 1e-5 * random) - u) / 1e-5
+    np.testing.assert_allclose(small, random, atol=1e-3)
+    fixed = space.without(RATIO, "known")
+    at = fixed.to_unit(fixed.initial)[None]
+    np.testing.assert_array_equal(fixed.moved(at, np.full_like(at, 0.01)), at + 0.01)
+
+
+def test_along_that_valley_a_vehicle_drives_nearly_alike(tmp_path):
+    """The list of what is told per inertia is what the vehicle's equations say; a straight step leaves the valley."""
+    from sysid.fit import fitted_plant
+    from sysid.log import load_log
+    from sysid.models import make_replay
+    from sysid.synthetic import write_dataset
+
+    spec, params, space = light_space()
+    plant = fitted_plant(spec)
+    log = load_log(write_dataset(tmp_path / "log", spec, params, manoeuvres=("s_curve",), held_out=(), replicates=1,
+                                 plant=plant))
+    replay, _ = make_replay(plant, params, space, log.training)
+    u = space.to_unit(space.initial)
+    step = along_the_valley(space, u, 0.15)
+    ends = np.clip(np.concatenate([u[None], space.moved(u[None], step), u + step]), 0.0, 1.0)
+    drives = np.asarray(replay.simulate(space.to_values(ends)).odometry)[:, 0, :, 3:]  # v, omega
+    bent, straight = (np.sqrt(np.square(drives[k] - drives[0]).mean()) for k in (1, 2))
+    assert bent < 0.4 * straight
 
 
 @pytest.mark.quick
