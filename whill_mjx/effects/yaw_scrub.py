@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, yaw_rate
+from whill_mjx.effects.lateral_damping import GRAVITY, resting_mass
 from whill_mjx.types import Motion, Wrench, parameter
 
 REST_RATE = 0.05  # [rad/s], smooths the change of sign at rest
@@ -16,7 +17,11 @@ REST_RATE = 0.05  # [rad/s], smooths the change of sign at rest
 
 @struct.dataclass
 class YawScrub(Effect):
-    """Torque against turning: T_z = -T_s tanh(omega / omega_0). Typical 2 to 15 N m for a powered chair (estimate)."""
+    """Torque against turning: T_z = -T_s L tanh(omega / omega_0), L the load of the driven wheels over that at rest.
+
+    Typical 2 to 15 N m for a powered chair (estimate), without what is on board. Where the wheels are braked, the load
+    goes forward, and the vehicle turns more easily.
+    """
 
     name = "yaw_scrub"
     typical = {"torque": (2.0, 15.0)}
@@ -25,4 +30,7 @@ class YawScrub(Effect):
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench with a yaw torque only."""
-        return memory, replace(Wrench.zero(), tz=-self.torque * jnp.tanh(yaw_rate(motion) / REST_RATE))
+        driven = motion.world.geometry.driven
+        rest = (driven * resting_mass(motion)).sum() * motion.mass / motion.total_mass
+        share = (driven * motion.normal_force).sum() / (GRAVITY * rest)
+        return memory, replace(Wrench.zero(), tz=-self.torque * share * jnp.tanh(yaw_rate(motion) / REST_RATE))
