@@ -31,6 +31,8 @@ LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes an
 
 
 RATIO, YAW, ALONG = "wheel_inertia.ratio", "body.yaw_inertia", "body.com_x"
+TERMS = {RATIO: "drives tell the inertia that motors turn, of which that of the wheels is one of two terms"}
+"""Searched by their logarithm, but told as they are: intervals reach as far down as up."""
 PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torque_drive.kff", "wheel_damping.damping",
                "rolling_resistance.mu_r", "yaw_scrub.torque", "lateral_damping.c_front")
 """Torques and forces that drives tell per inertia that they speed up, wheels included."""

@@ -17,7 +17,7 @@ from sysid.metrics import replicate_groups
 from sysid.objective import Told, without_prior
 from sysid.prior import UNKNOWN
 from sysid.slopes import average_slopes, likely
-from sysid.space import NUISANCE, Space
+from sysid.space import NUISANCE, TERMS, Space
 
 PIECES = 8
 """That each trial is cut into."""
@@ -107,8 +107,11 @@ def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDE
     information, directions = np.linalg.eigh(evidence.blocks.sum((0, 1)) / evidence.scale)
     reach = errors.quantile * errors.deviation
     ends = space.to_values(u - reach), space.to_values(u + reach)
+    straight = space.to_values(u) + np.multiply.outer((-1, 1), reach * space.slope(u))
     estimates = []
     for index, (name, low, high) in enumerate(zip(space.names, *ends, strict=True)):
+        if name in TERMS:
+            low, high = np.clip(straight[:, index], space.low[index], space.high[index])
         narrow = errors.deviation[index] < UNIDENTIFIABLE * PRIOR_SD and name not in NUISANCE
         remark = "" if narrow else f"not identifiable: {NUISANCE.get(name, 'the log hardly narrows its bounds')}"
         if narrow and min(u[index], 1 - u[index]) < WALL:

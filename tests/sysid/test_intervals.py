@@ -224,3 +224,19 @@ def test_a_nuisance_is_never_told_and_its_interval_is_its_bounds():
     assert usual[1].identifiable and not known[1].identifiable and "not identifiable" in known[1].remark
     assert (known[1].low, known[1].high) == (0.0, 1.0)
     assert (known[0].low, known[2].high) == (usual[0].low, usual[2].high)
+
+
+@pytest.mark.quick
+def test_an_interval_reaches_as_far_down_as_up_on_the_scale_on_which_it_is_told():
+    """The wheels' inertia is a term of what drives tell, not a factor."""
+    names = ("wheel_inertia.ratio", "torque_drive.kp")
+    space = Space(names, np.full(2, 0.2), np.full(2, 20.0), np.full(2, 2.0), np.ones(2, bool))
+    scores = 5.0 * np.random.default_rng(0).standard_normal((12, 8, 2))
+    told = independence.Evidence(np.full(2, 0.5), scores - scores.mean((0, 1)), np.tile(9.0 * np.eye(2), (12, 8, 1, 1)),
+                                 np.arange(12) // 2, 1.0, 1.0, np.eye(2), 1.0)
+    wheels, gain = uncertainty.uncertainty_of(told, space).estimates
+    assert wheels.identifiable and gain.identifiable and wheels.high > 2.5
+    assert wheels.high - wheels.value == pytest.approx(wheels.value - wheels.low)
+    assert gain.high / gain.value == pytest.approx(gain.value / gain.low)
+    wide = dataclasses.replace(told, scores=6 * told.scores)
+    assert uncertainty.uncertainty_of(wide, space).estimates[0].low == 0.2  # no further than its bound
