@@ -99,10 +99,13 @@ class Space:
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
         """Unit coordinates (..., P) of values (..., P)."""
+        return self._unit(np.clip(values, self.low, self.high))
+
+    def _unit(self, values: np.ndarray) -> np.ndarray:
+        """Those of values (..., P) that may lie outside the range."""
         low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
-        clipped = np.clip(values, self.low, self.high)
-        logarithm = np.log(np.where(self.log, clipped, 1.0) / low) / np.log(high / low)
-        return np.where(self.log, logarithm, (clipped - self.low) / (self.high - self.low))
+        logarithm = np.log(np.maximum(np.where(self.log, values, 1.0) / low, 1e-300)) / np.log(high / low)
+        return np.where(self.log, logarithm, (values - self.low) / (self.high - self.low))
 
     def slope(self, u: np.ndarray) -> np.ndarray:
         """d value / d u (..., P)."""
@@ -124,21 +127,15 @@ class Space:
         wheel, later = (self.turned.wheel * self.to_values(x)[:, ratio] for x in (u, end))
         heavier = self.turned.wheel * moves[:, ratio]
         inertia, grown = self.turned.mass + wheel, self.turned.mass + later
-        bent = end.copy()
+        besides, values = self.turned.besides, at.copy()
         for i, name in enumerate(self.names):
-            if name in self.turned.besides:
-                constant, share = self.turned.besides[name]
+            if name in besides:
+                constant, share = besides[name]
                 told = (at[:, i] + constant + share * wheel) / inertia
                 move = (moves[:, i] + share * heavier - told * heavier) / inertia
                 told = told * np.exp(move / told) if self.log[i] else told + move
-                bent[:, i] = self._unit(told * grown - constant - share * later, i)
-        return bent
-
-    def _unit(self, values: np.ndarray, i: int) -> np.ndarray:
-        """Coordinate (N,) of values (N,) of the i-th parameter, also beyond its range."""
-        if self.log[i]:
-            return np.log(np.maximum(values / self.low[i], 1e-300)) / np.log(self.high[i] / self.low[i])
-        return (values - self.low[i]) / (self.high[i] - self.low[i])
+                values[:, i] = told * grown - constant - share * later
+        return np.where([name in besides for name in self.names], self._unit(values), end)
 
     def subset(self, keep: Sequence[str]) -> Space:
         """The space of the named parameters only."""

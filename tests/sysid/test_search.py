@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
@@ -13,9 +12,8 @@ from sysid import gradient, tpe, uncertainty
 from sysid.fit import FitConfig
 from sysid.objective import Noise
 from sysid.rollout import Replay, make_batch, predictions
-from sysid.space import RATIO, Space
+from sysid.space import Space
 from sysid.valleys import gradient_search
-from whill_mjx.parameters import set_values
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -353,139 +351,6 @@ def test_a_diverged_simulation_is_dear_and_not_a_number_nowhere(objective):
 
 
 @pytest.mark.quick
-def test_unit_coordinates_and_values_are_inverse():
-    space = Space(("a", "b"), np.array([0.1, -2.0]), np.array([10.0, 2.0]), np.array([1.0, 0.0]),
-                  np.array([True, False]))
-    u = np.array([[0.0, 0.0], [0.3, 0.7], [1.0, 1.0]])
-    np.testing.assert_allclose(space.to_unit(space.to_values(u)), u, atol=1e-12)
-    inside = u[1]
-    slope = (space.to_values(inside + 1e-6) - space.to_values(inside - 1e-6)) / 2e-6
-    np.testing.assert_allclose(space.slope(inside), slope, rtol=1e-6)
-    with pytest.raises(ValueError, match="outside"):
-        dataclasses.replace(space, initial=np.array([20.0, 0.0]))
-    with pytest.raises(ValueError, match="low must be below high"):
-        dataclasses.replace(space, low=np.array([10.0, -2.0]))
-
-
-def light_space():
-    """Of a small robot, whose wheels are a large part of what its motors turn."""
-    from sysid.models import measured_effects, with_effects
-    from sysid.space import make_space, searched
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR, in_proportion
-
-    spec = in_proportion(WHILL_CR, "robot", 0.1, 0.4, 0.3, 20.0)
-    params = preset_params(spec, "physical")
-    params = with_effects(params, measured_effects(params, spec, ()))
-    usual = {"wheel_inertia.ratio": 4.0, "torque_drive.kff": 0.02, "wheel_damping.damping": 0.05}
-    params = set_values(params, tuple(usual), jnp.array(list(usual.values())))
-    return spec, params, make_space(params, spec, searched(params))
-
-
-def along_the_valley(space, u, step):
-    """The step (1, P) with which, to first order, all that is told per inertia goes along with heavier wheels."""
-    turned, values, slope = space.turned, space.to_values(u), space.slope(u)
-    ratio = space.names.index(RATIO)
-    wheel, heavier = (turned.wheel * one[ratio] for one in (values, slope * step))
-    moves = np.zeros(space.size)
-    moves[ratio] = step
-    for name, (constant, share) in turned.besides.items():
-        i = space.names.index(name)
-        told = (values[i] + constant + share * wheel) / (turned.mass + wheel)
-        moves[i] = (told - share) * heavier / slope[i]
-    return moves[None]
-
-
-@pytest.mark.quick
-def test_a_step_along_the_valley_of_what_is_told_per_inertia_stays_on_its_floor():
-    _, _, space = light_space()
-    u = space.to_unit(space.initial)
-    step = along_the_valley(space, u, 0.2)
-    ends = space.to_values(u), space.to_values(space.moved(u[None], step)[0])
-    before, after = (dict(zip(space.names, one, strict=True)) for one in ends)
-    turned = space.turned
-    inertia, later = (turned.mass + turned.wheel * one[RATIO] for one in (before, after))
-    assert after[RATIO] > 2 * before[RATIO]
-    for name, (constant, share) in turned.besides.items():
-        told = [(one[name] + constant + share * turned.wheel * one[RATIO]) / size
-                for one, size in ((before, inertia), (after, later))]
-        assert told[1] == pytest.approx(told[0]), name
-    other = np.array([name not in turned.besides for name in space.names])
-    np.testing.assert_array_equal(space.moved(u[None], step)[0, other], (u + step[0])[other])
-    # To first order a step is as it is, and where wheels keep their inertia altogether.
-    random = np.random.default_rng(0).standard_normal((5, space.size))
-    small = (space.moved(np.tile(u, (5, 1)), 1e-5 * random) - u) / 1e-5
-    np.testing.assert_allclose(small, random, atol=1e-3)
-    fixed = space.without(RATIO, "known")
-    at = fixed.to_unit(fixed.initial)[None]
-    np.testing.assert_array_equal(fixed.moved(at, np.full_like(at, 0.01)), at + 0.01)
-
-
-def test_along_that_valley_a_vehicle_drives_nearly_alike(tmp_path):
-    """The list of what is told per inertia is what the vehicle's equations say; a straight step leaves the valley."""
-    from sysid.fit import fitted_plant
-    from sysid.log import load_log
-    from sysid.models import make_replay
-    from sysid.synthetic import write_dataset
-
-    spec, params, space = light_space()
-    plant = fitted_plant(spec)
-    log = load_log(write_dataset(tmp_path / "log", spec, params, manoeuvres=("s_curve",), held_out=(), replicates=1,
-                                 plant=plant))
-    replay, _ = make_replay(plant, params, space, log.training)
-    u = space.to_unit(space.initial)
-    step = along_the_valley(space, u, 0.15)
-    ends = np.clip(np.concatenate([u[None], space.moved(u[None], step), u + step]), 0.0, 1.0)
-    drives = np.asarray(replay.simulate(space.to_values(ends)).odometry)[:, 0, :, 3:]  # v, omega
-    bent, straight = (np.sqrt(np.square(drives[k] - drives[0]).mean()) for k in (1, 2))
-    assert bent < 0.4 * straight
-
-
-@pytest.mark.quick
 def test_noise_scales_are_named():
     noise = Noise(np.ones(3), np.arange(5.0), "defaults")
     assert noise.as_dict()["odometry.omega"] == 4.0
-
-
-@pytest.mark.quick
-def test_how_high_the_mass_lies_is_searched_where_wheels_skid_by_their_load():
-    from sysid.models import with_effects
-    from sysid.space import searched
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
-
-    physical = with_effects(preset_params(WHILL_CR, "physical"), ("lateral_damping",))
-    assert {"body.com_z", "lateral_damping.c_front"} <= set(searched(physical))
-    assert "lateral_damping.c_rear" not in searched(physical)
-    assert "lateral_damping.c_rear" in searched(physical, ("lateral_damping",))
-    paper = searched(preset_params(WHILL_CR, "paper"))
-    assert "body.com_z" not in paper and "lateral_damping.c_rear" in paper
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("name", ["whill_cr", "husky", "warthog", "create"])
-def test_the_mass_lies_above_the_floor_and_below_where_the_vehicle_would_tip(name):
-    """Bounds in metres for all vehicles would let that of a small robot lie under the floor."""
-    from sysid.space import make_space
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import find_spec
-
-    spec = find_spec(name)
-    space = make_space(preset_params(spec, "physical"), spec, ["body.com_z"])
-    assert spec.wheel_radius + space.low[0] == pytest.approx(0.0)
-    tips_at = 9.81 * spec.track / 2 / (spec.wheel_radius + space.high[0])  # m/s2, sideways
-    assert tips_at == pytest.approx(9.81 / 3)
-
-
-@pytest.mark.quick
-def test_a_fit_gives_a_differential_drive_with_slip_losses_that_rise_with_speed():
-    from sysid.models import measured_effects
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WARTHOG, WHILL_CR
-
-    physical = preset_params(WHILL_CR, "physical")
-    added = measured_effects(physical, WHILL_CR, ())
-    assert {"suspension", "wheel_damping", "wheel_inertia"} <= set(added)
-    assert set(added) - set(measured_effects(physical, WHILL_CR, (), losses=False)) == {"wheel_damping"}
-    assert measured_effects(preset_params(WARTHOG, "physical"), WARTHOG, ()) == ("suspension",)
-    assert measured_effects(preset_params(WHILL_CR, "paper"), WHILL_CR, ()) == ()

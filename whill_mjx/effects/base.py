@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from whill_mjx.types import Motion, Wrench
 
+GRAVITY = 9.81  # [m/s^2], turns the load of a contact into the mass that it carries
 PLACES = ("command", "actuation", "force", "world", "sensing", "outside")
 
 
@@ -119,3 +120,10 @@ def side_forces(motion: Motion, force: jax.Array) -> jax.Array:
     """Forces (4,) at the contacts for the drive force (2,) of each side, shared by the driven contacts."""
     driven = motion.world.geometry.driven
     return to_contacts(force) * driven / (driven.sum() / 2)
+
+
+def resting_mass(motion: Motion) -> jax.Array:
+    """Mass (4,) [kg] that the contacts carry at rest on level ground, the same on both sides."""
+    x = motion.world.geometry.contact_x
+    front = jnp.clip((motion.com[0] - x[0]) / (x[2] - x[0]), 0.01, 0.99)
+    return motion.total_mass / 2 * jnp.stack([1 - front, 1 - front, front, front])

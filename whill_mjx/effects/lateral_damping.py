@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect, contact_wrench
+from whill_mjx.effects.base import GRAVITY, Effect, contact_wrench, resting_mass
 from whill_mjx.types import Motion, Wrench, parameter
 
-GRAVITY = 9.81  # [m/s^2], turns the load of a contact into the mass it carries
 TOUCHING = 3.0  # a passive wheel loses its damping smoothly below a third of the load that it has at rest
 
 
@@ -37,10 +36,3 @@ class LateralDamping(Effect):
         passive = rest * jnp.tanh(TOUCHING * carried / rest)
         lateral = -damping * (driven * carried + (1 - driven) * passive) * motion.contact_vy
         return memory, contact_wrench(motion, jnp.zeros(4), lateral)
-
-
-def resting_mass(motion: Motion) -> jax.Array:
-    """Mass (4,) [kg] that the contacts carry at rest on level ground, the same on both sides."""
-    x = motion.world.geometry.contact_x
-    front = jnp.clip((motion.com[0] - x[0]) / (x[2] - x[0]), 0.01, 0.99)
-    return motion.total_mass / 2 * jnp.stack([1 - front, 1 - front, front, front])
