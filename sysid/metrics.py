@@ -172,6 +172,24 @@ def noise_floor(trials: tuple[Trial, ...]) -> dict[str, dict[str, float | None]]
     }
 
 
+def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
+    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
+
+    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
+    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
+    """
+    manoeuvres = [one.manoeuvre for one in trials if one.held_out is held_out]
+    each = {name: noise_floor(tuple(one for one in trials if one.manoeuvre == name)) for name in set(manoeuvres)}
+    floors = [floor for name in manoeuvres if (floor := each[name])]
+    out: dict[str, dict[str, float | None]] = {}
+    for channel in floors[0] if floors else ():
+        out[channel] = {}
+        for metric in floors[0][channel]:
+            values = [value for floor in floors if (value := floor[channel][metric]) is not None]
+            out[channel][metric] = float(np.mean(values)) if values else None
+    return out
+
+
 def _relative(trial: Trial, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
     if channel == "ground_truth":
         if trial.ground_truth is None:

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.log import Trial
-from sysid.metrics import METRICS, UNITS, Prediction, ideal_replay, noise_floor, score
+from sysid.metrics import METRICS, UNITS, Prediction, ideal_replay, own_floor, score
 
 if TYPE_CHECKING:
     from sysid.html import Section
@@ -79,7 +79,7 @@ def summarise(rows: Iterable[dict[str, Any]], floor: dict[str, dict[str, float |
 def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str, Any]:
     """`noise_floor`, `summary` and `groups` of the report."""
     parts = {"training": False, "held_out": True}
-    floors = {part: noise_floor(tuple(t for t in trials if t.held_out is held)) for part, held in parts.items()}
+    floors = {part: own_floor(trials, held) or None for part, held in parts.items()}
     groups = sorted({row["group"] for row in rows})
     return {
         "noise_floor": floors,

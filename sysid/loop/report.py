@@ -56,7 +56,7 @@ from sysid.loop.power import POWER, Days, false_alarms, power_curve, simulated_d
 from sysid.loop.solver import Solver
 from sysid.loop.trust import CONFIDENCE, beside_still_base, contradicted, intervals, warnings
 from sysid.loop.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
-from sysid.metrics import METRICS, Prediction, noise_floor
+from sysid.metrics import METRICS, Prediction, own_floor
 from sysid.report import code_hashes, error_rows
 from sysid.rollout import predictions
 from whill_mjx.effects import EFFECTS
@@ -142,23 +142,6 @@ def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> 
             out[part][channel] = {metric: float(np.mean(values)) for metric, values in means.items() if values}
             if floor and mine:
                 out[part][channel]["noise_floor"] = floor.get(channel)
-    return out
-
-
-def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
-    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
-
-    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
-    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
-    """
-    floors = [floor for one in trials if one.held_out is held_out
-              if (floor := noise_floor(tuple(t for t in trials if t.manoeuvre == one.manoeuvre)))]
-    out: dict[str, dict[str, float | None]] = {}
-    for channel in floors[0] if floors else ():
-        out[channel] = {}
-        for metric in floors[0][channel]:
-            values = [value for each in floors if (value := each[channel][metric]) is not None]
-            out[channel][metric] = float(np.mean(values)) if values else None
     return out
 
 

@@ -31,11 +31,11 @@ from sysid.loop.noise import deviations, replicate_groups
 from sysid.loop.null_refits import NullRefits, checked
 from sysid.loop.null_refits import run as run_null_refits
 from sysid.loop.refit import without_each
-from sysid.loop.report import effects, make_report, own_floor, replay, write_run
+from sysid.loop.report import effects, make_report, replay, write_run
 from sysid.loop.tables import Table
 from sysid.loop.trust import beside_still_base, warnings
 from sysid.loop.unnamed import vehicle_of, with_start_angles
-from sysid.metrics import score
+from sysid.metrics import own_floor, score
 from sysid.models import with_effects
 from sysid.rollout import Measured, vehicle_plant
 from sysid.synthetic import write_dataset

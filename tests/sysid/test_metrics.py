@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.metrics import Prediction, ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
+from sysid.report import summaries
 from sysid.scenarios import SCENARIOS, Scenario, command_sequence
 
 pytestmark = pytest.mark.quick
@@ -79,6 +82,25 @@ def test_replicate_noise_is_found_whatever_the_start_pose():
     assert floor["ground_truth"]["trajectory"] == pytest.approx(0.02 * np.sqrt(2), rel=0.05)
     assert floor["ground_truth"]["yaw"] == pytest.approx(0.01, rel=0.05)
     assert noise_floor(tuple(trials[:1])) is None
+
+
+def test_a_held_out_drive_is_held_against_its_replicates_in_the_training_trials():
+    """In a report, beside drives that repeat better: of each part the mean over its trials."""
+    random = np.random.default_rng(0)
+    t = np.arange(0.0, 10.0, 0.02)
+    trials = []
+    for manoeuvre, spread in (("straight", 0.02), ("circle", 0.1)):
+        command = command_sequence(manoeuvre, Scenario())
+        for i in range(1, 4):
+            x, y, yaw = integrate(command, Start(0.0, 0.0, 0.0), t)
+            truth = PoseStream(t, x + spread * random.normal(size=len(t)), y, yaw)
+            trial = trial_of(truth, command, f"{manoeuvre}_{i}")
+            trials.append(replace(trial, held_out=manoeuvre == "straight" or i == 3))
+    floors = {part: floor["ground_truth"]["trajectory"]
+              for part, floor in summaries([], tuple(trials))["noise_floor"].items()}
+    assert floors["training"] == pytest.approx(0.1, rel=0.05)
+    assert floors["held_out"] == pytest.approx((3 * 0.02 + 0.1) / 4, rel=0.05)
+    assert summaries([], (trials[0], trials[3]))["noise_floor"] == {"training": None, "held_out": None}
 
 
 def test_only_numbered_trials_with_equal_commands_are_replicates():
