@@ -30,6 +30,7 @@ from sysid.log import Log, Trial
 from sysid.loop.late_pose import NAME, PARAMETER
 from sysid.loop.report import effects, replay
 from sysid.loop.unnamed import find_unnamed, replay_unnamed
+from sysid.lost_pose import without_lost
 from sysid.measured import load_drive, load_mrclam, split
 from sysid.metrics import Prediction, ideal_replay, score
 from sysid.models import with_effects
@@ -70,10 +71,10 @@ class Benchmark:
 
 
 def drive_log(settings: Benchmark, terrains: tuple[str, ...]) -> Log:
-    """Steps of 6 s, training ones thinned."""
+    """Steps of 6 s; training ones without those whose outside pose was lost, and thinned."""
     log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", RUNS, chained=True)
     log = split(log, tuple(TRAIN[name] for name in terrains), tuple(HELD_OUT[name] for name in terrains))
-    return thin(log, settings.windows)
+    return thin(without_lost(log), settings.windows)
 
 
 def errors(trials: tuple[Trial, ...], seen: list[Prediction]) -> dict[str, list[float]]:

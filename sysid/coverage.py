@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.log import Log, Trial
+from sysid.lost_pose import LOST, lost
 from sysid.metrics import CHANNELS, command_in_force, ideal_replay, replicate_groups, replicate_noise
 from sysid.streams import speeds, standstill
 
@@ -125,6 +126,11 @@ def sanity(log: Log) -> list[str]:
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
+    gone = lost(log)
+    if gone:
+        found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "
+                     f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
+                     "against it tell little of a model; a fit leaves such trials out.")
     return found
 
 

@@ -265,7 +265,9 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         if config.vehicle is not None:
             params, intervals = _earlier(config.vehicle, log)
         params = preset_params(log.spec, config.preset) if params is None else params
-        params = with_effects(params, (*config.effects, *(() if given else measured_effects(params, log.spec, trials))))
+        receipt = log.fields.get("pose_stamps") == "receipt"
+        measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
+        params = with_effects(params, (*config.effects, *measured))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
     plant = replace(plant, frame=frame)
     if frame is not None and frames.AGE in space.names and frames.AGE not in config.parameters:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
+from sysid.lost_pose import without_lost
 from whill_mjx.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
@@ -330,7 +331,10 @@ def _selected(log: Log, selection: str) -> list[str]:
 
 def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), held_out: tuple[str, ...] = (),
              chained: bool = False) -> Log:
-    """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials."""
+    """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
+
+    Training trials of DRIVE whose outside pose was lost are left out (`sysid.lost_pose`), which a note says.
+    """
     from sysid.log import load_log
 
     form = detect_format(path) if form == "auto" else form
@@ -343,7 +347,7 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
                          + ", and --held-out.")
     keys: list[Any] = [selection.partition(":")[0] for selection in (*train, *held_out)]
     if form == "drive_norlab":
-        return split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out)
+        return without_lost(split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out))
     if form == "mrclam":
         robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
         return split(load_mrclam(path, robots), train, held_out)

@@ -81,15 +81,16 @@ def acts_around(name: str) -> bool:
     return any(hasattr(EFFECTS[name], place) for place in AROUND)
 
 
-def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], losses: bool = True
-                     ) -> tuple[str, ...]:
+def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], losses: bool = True,
+                     receipt: bool = False) -> tuple[str, ...]:
     """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
 
     On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
     wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
     torque is at its limit nothing makes up for it. A wheel that skids is thrown by its own inertia, of which the
     rotor of its motor may be the most. Soft springs let a vehicle nod, and its wheels turn with that.
-    Readings of the odometry have an age of their own, which shows against an outside pose.
+    Readings of the odometry have an age of their own, which shows against an outside pose; so has an outside pose that
+    is stamped when it is received (`receipt`), which shows against the odometry.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
@@ -98,7 +99,9 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
         loss = ("wheel_damping",) if losses else ()
         rolling = ("axle_pivot", "lateral_damping", *loss, "suspension", "wheel_inertia")
     both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
-    return (*rolling, "sensor_delay") if both else rolling
+    if not both:
+        return rolling
+    return (*rolling, "sensor_delay", "pose_delay") if receipt else (*rolling, "sensor_delay")
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:
