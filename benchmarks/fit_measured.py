@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -78,7 +79,9 @@ def mrclam(settings: Benchmark) -> None:
     log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
     log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
     for preset in settings.presets:
-        fit = fit_log(thin(log, settings.windows // 2), measured_config(settings, preset))
+        # Poses alone tell little of such slow robots within a bin: a short global search finds the better starts.
+        config = replace(measured_config(settings, preset), method="both", trials=96, starts=3)
+        fit = fit_log(thin(log, settings.windows // 2), config)
         figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")
         figures[f"seconds_mrclam_{preset}"] = figure([fit.seconds], "s")
         record("measured", CLAIM, figures)

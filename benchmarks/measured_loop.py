@@ -60,7 +60,7 @@ class Benchmark:
     parts: tuple[Literal["ladder", "change", "mrclam"], ...] = ("ladder", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
-    windows: int = 48
+    windows: int = 96
     """Training steps of drive_norlab, spread evenly over each terrain; all held-out ones are scored."""
     robot_windows: int = 16
     """Windows of 15 s of each robot of mrclam."""
