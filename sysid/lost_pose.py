@@ -62,10 +62,10 @@ def without_lost(log: Log) -> Log:
     left = len(log.training) - len(gone)
     if not gone:
         return log
-    count = f"of {len(gone)} of {len(gone) + left} training trials the outside yaw contradicts the gyro by more than "
+    contradicted = (f"{len(gone)} of {len(gone) + left} training trials have an outside yaw that contradicts the gyro "
+                    f"by more than {LOST:g} rad: their outside pose was lost")
     if left < LEAST:
-        return replace(log, notes=(*log.notes, f"{count}{LOST:g} rad; they are fitted all the same, since too few "
-                                               "others are left"))
+        return replace(log, notes=(*log.notes, f"{contradicted}; they are fitted all the same, since too few others "
+                                               "are left"))
     kept = log.select(lambda trial: trial.held_out or trial.name not in gone)
-    return replace(kept, notes=(*log.notes, f"{count}{LOST:g} rad: their outside pose was lost, and they are not "
-                                            "fitted"))
+    return replace(kept, notes=(*log.notes, f"{contradicted}, and they are not fitted"))
