@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.log import Log, Trial
+from sysid.streams import added_up
 
 LOST = 0.5
 """Yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later."""
@@ -35,11 +36,9 @@ def yaw_contradiction(trial: Trial, rate: tuple[np.ndarray, np.ndarray]) -> floa
         return float("nan")
     t = np.concatenate([[0.0], pose.t])
     yaw = np.concatenate([[0.0], pose.yaw - trial.start.yaw])
-    turned = np.concatenate([[0.0], np.cumsum((turning[1:] + turning[:-1]) / 2 * np.diff(when))])
     parted = []
     for delay in np.arange(0.0, LATEST + STEP / 2, STEP):
-        at = t - delay
-        follows = np.interp(at, when, turned) + np.minimum(at - when[0], 0.0) * turning[0]
+        follows = added_up(when, turning, t - delay)
         follows -= follows[0]
         factor = np.clip(follows @ yaw / max(follows @ follows, 1e-12), 1 - FACTOR, 1 + FACTOR)
         parted.append(np.abs(yaw - factor * follows).max())

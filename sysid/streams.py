@@ -249,3 +249,9 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     a, b = a - a.mean(), b - b.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / norm) if norm > 1e-12 else 0.0
+
+
+def added_up(when: np.ndarray, rate: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """What a rate (T,) at times `when` (T,) [s] adds up to at times t (M,) from its first; before it was as then."""
+    added = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(when))])
+    return np.asarray(np.interp(t, when, added) + np.minimum(t - when[0], 0.0) * rate[0])

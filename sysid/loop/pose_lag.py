@@ -16,6 +16,7 @@ import numpy as np
 from scipy import stats
 
 from sysid.log import Trial
+from sysid.streams import added_up
 
 GRID = np.linspace(0.0, 1.0, 41)  # s
 FLIPS = 20000
@@ -127,10 +128,7 @@ def _moments(
     when: np.ndarray, rate: np.ndarray, delay: float, t: np.ndarray, seen: np.ndarray, piece: np.ndarray
 ) -> tuple[float, float, float]:
     """Mean xx, xy and yy of what a rate adds up to, x, and what was seen, y, from the start of each piece."""
-    began = when[0] - GRID[-1] - 1.0  # before the drive the first rate held
-    when, rate = np.concatenate([[began], when]), np.concatenate([rate[:1], rate])
-    added = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(when))])
-    x, y = np.interp(t - delay, when, added), seen.astype(float)
+    x, y = added_up(when, rate, t - delay), seen.astype(float)
     first = np.searchsorted(piece, np.arange(piece[-1] + 1))[piece]
     x, y = x - x[first], y - y[first]
     return float(np.mean(x * x)), float(np.mean(x * y)), float(np.mean(y * y))
