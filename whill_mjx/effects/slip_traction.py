@@ -13,20 +13,23 @@ from whill_mjx.effects.planar import held, look_ahead
 from whill_mjx.types import Motion, Wrench, parameter
 
 ROUNDS = 2  # of the implicit step
-TINY = 1e-6  # [N], keeps the ratio defined where nothing grips
+NEWTON = 2  # steps towards how fast a wheel slides beyond its creep
+TINY = 1e-6  # [N], [m/s] or [-], keeps ratios defined where nothing grips and slopes where nothing slides
 
 
 @struct.dataclass
 class SlipTraction(Effect):
-    """Slip force of driven wheels, within a friction circle: F_i = mu N s_i / sqrt(s0_i^2 + |s|^2), i along and across.
+    """Slip force of driven wheels, within a friction circle: F_i = mu N s_i / (s0_i + p), i along and across.
 
     s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact; s0 and s0_y are the sliding speeds along
-    and across the wheel at which the force has 1/sqrt(2) of its limit. A wheel that creeps is as stiff each way as
-    these say; one that slides is held by mu N against the way that it slides (Coulomb), whatever they are: with each
-    s_i measured by its own s0_i, a skid that is hardly sideways would be held sideways. The wheel gets the reaction
-    -r F_x. Both
-    are advanced implicitly: F is taken at the speeds that wheels and chassis will have after the step, so that any s0
-    and s0_y are stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
+    and across the wheel at which the force has 1/sqrt(2) of its limit. A tyre creeps as its force bends it, by s0_i F_i
+    / (mu N) each way, and beyond that it slides against its force, by p F / (mu N): p is what makes |F| / (mu N) =
+    q / sqrt(1 + q^2) with q = |(s_x / s0, s_y / s0_y)|, along one axis F = mu N s / sqrt(s0^2 + s^2). A wheel that
+    slides is held by mu N against the way that it slides (Coulomb), whatever s0 are; one that creeps across, as all do
+    in a bend, grips along as it does on a straight. (With sqrt(s0_i^2 + |s|^2) each way by itself, 6 mm/s across made
+    a wheel of s0 = 1 mm/s six times softer along, and a chair's bends a thousandth too wide.) The wheel gets the
+    reaction -r F_x. Both are advanced implicitly: F is taken at the speeds that wheels and chassis will have after the
+    step, so that any s0 and s0_y are stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
     """
 
     name = "slip_traction"
@@ -54,9 +57,9 @@ class SlipTraction(Effect):
         forward = ahead.forward
         for _ in range(ROUNDS):
             # Forces of the form stiffness * sliding, the stiffness taken at the sliding of the previous round.
-            sliding = slide_x**2 + slide_y**2
-            stiffness = grip / jnp.sqrt(self.slip_speed**2 + sliding)  # [N s/m]
-            across = grip / jnp.sqrt(self.side_slip_speed**2 + sliding)
+            beyond = self._beyond_creep(slide_x, slide_y)
+            stiffness = grip / (self.slip_speed + beyond)  # [N s/m]
+            across = grip / (self.side_slip_speed + beyond)
             sideways = across + carried / jnp.sqrt(slide_y**2 + self.side_slip_speed**2)
             # Implicit step of the spin, I (w' - w) / dt = T - r C (r w' - v'), put into the force C (r w' - v'). The
             # torque is T + unlimited - slope w', or at a limit.
@@ -80,3 +83,17 @@ class SlipTraction(Effect):
         reaction = -radius * per_side(forward)
         change, _ = yielding.change((free_spin + relaxation * (unlimited + reaction)) / (1 + relaxation * slope))
         return memory, replace(wrench, spin_torque=reaction + yielding.factor * change)
+
+    def _beyond_creep(self, along: jax.Array, across: jax.Array) -> jax.Array:
+        """p (4,) [m/s] of sliding velocities (4,) along and across: by Newton's method on |F|, from what is right along
+        one axis."""
+        share = (along / self.slip_speed) ** 2 + (across / self.side_slip_speed) ** 2 + TINY  # q^2
+        speed = jnp.sqrt(along**2 + across**2 + TINY**2)
+        beyond = speed * jnp.sqrt(share) / (1.0 + jnp.sqrt(1.0 + share))
+        for _ in range(NEWTON):
+            stiff = self.slip_speed + beyond, self.side_slip_speed + beyond
+            force = (along / stiff[0]) ** 2, (across / stiff[1]) ** 2
+            square = force[0] + force[1] + TINY
+            width = square / (force[0] / stiff[0] + force[1] / stiff[1] + TINY / stiff[0])
+            beyond = jnp.maximum(beyond + width * (jnp.sqrt(square * (1.0 + share) / share) - 1.0), 0.0)
+        return beyond
