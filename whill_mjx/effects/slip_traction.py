@@ -19,17 +19,17 @@ TINY = 1e-6  # [N], [m/s] or [-], keeps ratios defined where nothing grips and s
 
 @struct.dataclass
 class SlipTraction(Effect):
-    """Slip force of driven wheels, within a friction circle: F_i = mu N s_i / (s0_i + p), i along and across.
+    """Slip force of driven wheels in a friction circle: mu N q / sqrt(1 + q^2), q^2 = (s_x / s0)^2 + (s_y / s0_y)^2.
 
     s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact; s0 and s0_y are the sliding speeds along
     and across the wheel at which the force has 1/sqrt(2) of its limit. A tyre creeps as its force bends it, by s0_i F_i
-    / (mu N) each way, and beyond that it slides against its force, by p F / (mu N): p is what makes |F| / (mu N) =
-    q / sqrt(1 + q^2) with q = |(s_x / s0, s_y / s0_y)|, along one axis F = mu N s / sqrt(s0^2 + s^2). A wheel that
-    slides is held by mu N against the way that it slides (Coulomb), whatever s0 are; one that creeps across, as all do
-    in a bend, grips along as it does on a straight. (With sqrt(s0_i^2 + |s|^2) each way by itself, 6 mm/s across made
-    a wheel of s0 = 1 mm/s six times softer along, and a chair's bends a thousandth too wide.) The wheel gets the
-    reaction -r F_x. Both are advanced implicitly: F is taken at the speeds that wheels and chassis will have after the
-    step, so that any s0 and s0_y are stable at any step. Passive wheels roll: they carry `mu_free` N sideways only.
+    / (mu N) each way, and beyond that it slides against its force, by p F / (mu N): F_i = mu N s_i / (s0_i + p), with
+    the p that gives F its size. A wheel that slides is held by mu N against the way that it slides (Coulomb), whatever
+    s0 are; one that creeps across, as all do in a bend, grips along as it does on a straight. (With sqrt(s0_i^2 +
+    |s|^2) in place of s0_i + p, each way by itself, 6 mm/s across made a wheel of s0 = 1 mm/s six times softer along,
+    and a chair's bends a thousandth too wide.) The wheel gets the reaction -r F_x. Both are advanced implicitly: F is
+    taken at the speeds that wheels and chassis will have after the step, so that any s0 and s0_y are stable at any
+    step. Passive wheels roll: they carry `mu_free` N sideways only.
     """
 
     name = "slip_traction"
