@@ -90,10 +90,11 @@ class SlipTraction(Effect):
         share = (along / self.slip_speed) ** 2 + (across / self.side_slip_speed) ** 2 + TINY  # q^2
         speed = jnp.sqrt(along**2 + across**2 + TINY**2)
         beyond = speed * jnp.sqrt(share) / (1.0 + jnp.sqrt(1.0 + share))
+        wanted = (1.0 + share) / share
         for _ in range(NEWTON):
-            stiff = self.slip_speed + beyond, self.side_slip_speed + beyond
-            force = (along / stiff[0]) ** 2, (across / stiff[1]) ** 2
+            loose = 1.0 / (self.slip_speed + beyond), 1.0 / (self.side_slip_speed + beyond)
+            force = (along * loose[0]) ** 2, (across * loose[1]) ** 2
             square = force[0] + force[1] + TINY
-            width = square / (force[0] / stiff[0] + force[1] / stiff[1] + TINY / stiff[0])
-            beyond = jnp.maximum(beyond + width * (jnp.sqrt(square * (1.0 + share) / share) - 1.0), 0.0)
+            width = square / (force[0] * loose[0] + force[1] * loose[1] + TINY * loose[0])
+            beyond = jnp.maximum(beyond + width * (jnp.sqrt(square * wanted) - 1.0), 0.0)
         return beyond
