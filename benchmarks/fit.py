@@ -66,6 +66,8 @@ class Benchmark:
     """Logs of the contact plant of the coverage."""
     other_logs: int = 0
     """Logs of each of the contact plant's other vehicles, a scooter and a robot, of the coverage."""
+    told_again: bool = False
+    """Of the coverage: search nothing, take intervals by the present code where the searches kept in `work` ended."""
     search_log: str = "plant"
     """Log of starts, tpe and searches: plant (the shared plain chair), planted, or a folder."""
     search_trials: int = 18
@@ -234,12 +236,19 @@ def coverage(settings: Benchmark) -> None:
     labels = [f"{kind}_{n:03d}" for kind in fit_coverage.KINDS for n in range(counts.get(kind, settings.other_logs))]
     if not settings.collect:
         share_compilations(settings.work / "compiled")
+        if settings.told_again:
+            kept = {one["label"]: one for one in read_results(folder)}
+            labels, again = [label for label in labels if label in kept], settings.work / "told_again"
+            run_jobs(again, labels_of(settings.part, labels), lambda label: fit_coverage.told_again(
+                kept[label], settings.work / "compiled"))
+            return
         run_jobs(folder, labels_of(settings.part, labels), lambda label: fit_coverage.job(
             label, settings.iterations, folder, settings.work / "compiled"))
         return
     for kind in fit_coverage.KINDS:
         prefix = "" if kind == "synthetic" else f"{kind}_"
-        results = [fit_coverage.judged_again(one, folder) for one in read_results(folder, f"{kind}_*")]
+        results = ([fit_coverage.judged_again(one, folder) for one in read_results(folder, f"{kind}_*")]
+                   if not settings.told_again else read_results(again, f"{kind}_*"))
         if results:
             figures = on_device(fit_coverage.summarise(results, prefix), results)
             record("fit", CLAIM, figures, replacing=tuple(f"{prefix}{stem}" for stem in fit_coverage.PER_PARAMETER))

@@ -18,7 +18,7 @@ the widest intervals counts. Source: Cameron, Gelbach and Miller (2008).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -47,6 +47,13 @@ class Evidence:
     precision: np.ndarray  # (P, P) of what is known besides
     share: float
     """Variance that the precision is stated for."""
+    ahead: np.ndarray = field(default_factory=lambda: np.ones((2, 1)))
+    """(2, P) how many times as wide the intervals would be from their lower and upper ends."""
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """(P, P) of the information, with what is known besides."""
+        return np.linalg.inv(self.blocks.sum((0, 1)) + self.precision)
 
     @property
     def scale(self) -> float:
@@ -92,8 +99,7 @@ def errors_of(evidence: Evidence, confidence: float = CONFIDENCE, seed: int = 0)
     Args:
         seed: of the signs of blocks.
     """
-    hessian = evidence.blocks.sum((0, 1))
-    inverse = np.linalg.inv(hessian + evidence.precision)
+    hessian, inverse = evidence.blocks.sum((0, 1)), evidence.inverse
     independent = np.sqrt(np.diag(inverse @ hessian @ inverse) * evidence.variance)
     kinds = _kinds(evidence, inverse)
     deviation, quantile = (one[0] for one in _widest(kinds, evidence.scores[None], independent, confidence))

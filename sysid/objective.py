@@ -8,13 +8,17 @@ noise as prior.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sysid.arrays import added, namespace
+from sysid.cores import on_processor
 from sysid.gradient import huber_weight
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
@@ -147,17 +151,32 @@ class Objective:
         """Replay at unit coordinates (N, P)."""
         return self.replay.simulate(self.space.to_values(u))
 
-    def paper_cost(self, u: np.ndarray) -> np.ndarray:
-        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one."""
-        simulated = self.simulate(u)
-        outside = self.measured.pose_mask[..., 0].sum() > 0
+    def paper_cost(self, u: np.ndarray, quick: bool = False) -> np.ndarray:
+        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one.
+
+        Args:
+            quick: on an accelerator with long drives in pieces side by side (`sysid.pieces`). J of a vehicle of a plant
+                log is then larger by 0.6 % in the median, and by 7 at most in 95 % of what a search tries.
+        """
+        if quick and not on_processor():
+            return self._paper_cost_in_pieces(u)
+        return np.asarray(self._paper_cost_of(self.simulate(u)))
+
+    @cached_property
+    def _paper_cost_in_pieces(self) -> Callable[[np.ndarray], np.ndarray]:
+        replay: Any = getattr(self.replay, "in_pieces", self.replay)
+        cost = jax.jit(lambda u: self._paper_cost_of(replay.traced(self.space.to_values(u))))
+        return lambda u: np.asarray(cost(jnp.asarray(u, jnp.result_type(float))), float)
+
+    def _paper_cost_of(self, simulated: Simulated) -> Any:
+        xp, outside = namespace(simulated.pose), self.measured.pose_mask[..., 0].sum() > 0
         values, target, mask = (
             (simulated.pose, self.measured.pose, self.measured.pose_mask) if outside
             else (simulated.odometry, self.measured.odometry, self.measured.odometry_mask))
-        error = np.square(values[..., :2] - target[..., :2]).sum(-1) * mask[..., 0]
+        error = xp.square(values[..., :2] - target[..., :2]).sum(-1) * mask[..., 0]
         samples = np.maximum(mask[..., 0].sum(-1), 1)
-        cost = np.sqrt(error.sum(-1) / samples).sum(-1)
-        return np.where(self.bad(simulated).any(-1) | ~np.isfinite(cost), HUGE, cost)
+        cost = xp.sqrt(error.sum(-1) / samples).sum(-1)
+        return xp.where(self.bad(simulated).any(-1) | ~xp.isfinite(cost), HUGE, cost)
 
     def weighted_cost(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
         """Mean squared residual (N,), 1 at the noise level; `simulated` is what `simulate(u)` gave, if it is known."""

@@ -27,6 +27,8 @@ NUISANCE = {
     "torque_drive.period": "it is fitted for what others go along with; the cost bends too little for an interval",
 }
 """Searched, but never reported as told: what its curvature at one point says holds nowhere else."""
+BENT = ("body.com_z",)
+"""Of which a log tells the less or the more by their own value: the load that driving shifts goes with the height."""
 LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns tell how high the mass lies
 
 

@@ -3,6 +3,12 @@
 What a log tells at the fitted point is summed over pieces of its trials; which of them have errors of their own
 `sysid.independence` decides. Slopes are averaged over the errors (`sysid.slopes`): by differences over a fixed share of
 their ranges, delays are told half as well as they are, and friction, slip and torque limits up to one and a half times.
+
+What a log tells of the height of the mass depends on that height. An estimate that came out where the log tells much
+would have a narrow interval, whatever it tells of the truth. Such an interval reaches as far as the information between
+adds up to: its half-width h at the fit and h' at the end that this has are measured, and the end lies where
+the integral of dx / h(x) is 1, with h a straight line through both. Where h does not change this is the usual interval.
+It is what a variance-stabilising transformation of the parameter would give (Bartlett 1947).
 """
 
 from __future__ import annotations
@@ -11,13 +17,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid import gradient
 from sysid.gradient import HUBER, huber_weight, robust_cost
 from sysid.independence import CONFIDENCE, Evidence, errors_of, shared_error
 from sysid.metrics import replicate_groups
 from sysid.objective import Told, without_prior
 from sysid.prior import UNKNOWN
 from sysid.slopes import average_slopes, likely
-from sysid.space import NUISANCE, TERMS, Space
+from sysid.space import BENT, NUISANCE, TERMS, Space
 
 PIECES = 8
 """That each trial is cut into."""
@@ -27,6 +34,10 @@ PRIOR_SD = UNKNOWN
 UNIDENTIFIABLE = 0.5
 """Share of the prior's standard deviation above which a parameter counts as not told by the log."""
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
+FOLLOW = 4  # iterations of all others at the end of an interval
+NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
+WIDEST = 3.0
+"""Times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,43 @@ def estimate(
 
 def evidence_of(objective: Told, u: np.ndarray, robust: bool = False) -> Evidence:
     """What the drives of an objective tell at the fitted point u (P,); `robust` as of `estimate`."""
+    found = _evidence_at(objective, u, robust)
+    return replace(found, ahead=_ahead(objective, found, robust))
+
+
+def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
+    """(2, P) how many times the half-width of each parameter's interval is that which it has from its lower and upper
+    end, the others following there. 1 unless the parameter is one of `BENT`."""
+    space, u = objective.space, found.u
+    errors, ahead = errors_of(found), np.ones((2, space.size))
+    reach, inverse = errors.quantile * errors.deviation, found.inverse
+    for index in np.flatnonzero([name in BENT for name in space.names]):
+        if errors.deviation[index] > UNIDENTIFIABLE * PRIOR_SD:
+            continue
+        for end, room in enumerate((-u[index], 1.0 - u[index])):
+            step = np.clip(room, -reach[index], reach[index])
+            share = abs(step) / reach[index]
+            if share < NEAR:
+                continue
+            start = space.moved(u[None], step * inverse[None, :, index] / inverse[index, index])
+            start[:, index] = u[index] + step
+            there = gradient.fit(objective, space, starts=np.clip(start, 0.0, 1.0), iterations=FOLLOW, robust=robust,
+                                 frozen=(space.names[index],)).u
+            known = errors_of(_evidence_at(objective, there, robust))
+            wide = known.quantile[index] * known.deviation[index] / reach[index]
+            ahead[end, index] = 1.0 + (wide - 1.0) / share
+    return ahead
+
+
+def stretched(ahead: np.ndarray) -> np.ndarray:
+    """Half-widths that an interval reaches, of how many times as wide it is from its end on a straight line: the x at
+    which the integral of 1 / (1 + (ahead - 1) x) is 1."""
+    rise = np.clip(ahead - 1.0, -1.0, WIDEST - 1.0)
+    level = np.abs(rise) < 1e-6
+    return np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
+
+
+def _evidence_at(objective: Told, u: np.ndarray, robust: bool) -> Evidence:
     space = objective.space
     residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
     size = float(robust_cost(residual[None], robust)[0]) / objective.counted
@@ -105,9 +153,9 @@ def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDE
     """Intervals by what a log tells."""
     u, errors = evidence.u, errors_of(evidence, confidence)
     information, directions = np.linalg.eigh(evidence.blocks.sum((0, 1)) / evidence.scale)
-    reach = errors.quantile * errors.deviation
-    ends = space.to_values(u - reach), space.to_values(u + reach)
-    straight = space.to_values(u) + np.multiply.outer((-1, 1), reach * space.slope(u))
+    reach = errors.quantile * errors.deviation * np.array([[-1], [1]]) * stretched(evidence.ahead)  # (2, P)
+    ends = space.to_values(u + reach)
+    straight = space.to_values(u) + reach * space.slope(u)
     estimates = []
     for index, (name, low, high) in enumerate(zip(space.names, *ends, strict=True)):
         if name in TERMS:

@@ -157,7 +157,7 @@ def test_a_search_that_was_stopped_asks_for_nothing_again(tmp_path):
     calls = []
 
     class Objective:
-        def paper_cost(self, u):
+        def paper_cost(self, u, quick):
             calls.append(u)
             return u.sum(-1)
 

@@ -49,9 +49,52 @@ class Linear:
         return residual
 
 
+class Growing(Linear):
+    """Residuals of y = X g(u) + errors, of which a log tells the more the larger the parameter is."""
+
+    RATE = 3.0
+
+    def level(self, u):
+        return np.exp(self.RATE * (u - 0.5)) / self.RATE
+
+    def residuals(self, u):
+        return super().residuals(self.level(u) - self.level(0.5) + 0.5)
+
+    def jacobian(self, u):
+        slope = np.exp(self.RATE * (u - 0.5))
+        return self.residuals(u), slope[:, None, None] * self._design
+
+
 def drive(manoeuvre: int, replicate: int) -> Trial:
     command = Command(np.zeros(1), np.full(1, float(manoeuvre)), np.zeros(1))
     return Trial(f"m{manoeuvre}_{replicate}", f"m{manoeuvre}", command, None, None, Start())
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("ahead", [0.0, 0.4, 1.0, 1.0 + 1e-9, 2.0, 3.0])
+def test_an_interval_reaches_as_far_as_what_is_told_between_adds_up_to(ahead):
+    reach = float(uncertainty.stretched(np.array(ahead)))
+    x = np.linspace(0.0, reach, 200_001)
+    assert np.trapezoid(1 / (1 + (ahead - 1) * x), x) == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.quick
+def test_an_interval_reaches_three_half_widths_at_most():
+    assert uncertainty.stretched(np.array(50.0)) == uncertainty.stretched(np.array(uncertainty.WIDEST)) < 3.2
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name, alike", [("body.com_z", 1.0), ("body.com_x", 0.7)])
+def test_the_height_of_the_mass_is_told_as_far_on_either_side_where_a_log_tells_more_of_a_high_one(name, alike):
+    random = np.random.default_rng(5)
+    design = random.standard_normal((DRIVES, SAMPLES, 1))
+    objective = Growing(design, 2.6 * random.standard_normal((DRIVES, SAMPLES)))
+    objective.space = dataclasses.replace(objective.space, names=(name,))
+    u = gradient.fit(objective, objective.space, iterations=20).u
+    (told,) = uncertainty.estimate(objective, u).estimates
+    low, middle, high = (objective.level(one) for one in (told.low, u[0], told.high))
+    assert told.high - told.low > 0.2
+    assert (middle - low) / (high - middle) == pytest.approx(alike, abs=0.08)
 
 
 def correlated(random: np.random.Generator, rho: float) -> np.ndarray:
