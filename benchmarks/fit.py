@@ -232,13 +232,14 @@ def many_starts(settings: Benchmark) -> None:
 def coverage(settings: Benchmark) -> None:
     """Coverage of the 90 % intervals on logs with known values."""
     folder = settings.work / "coverage"
+    again = settings.work / "told_again"
     counts = {"synthetic": settings.logs, "plant": settings.plant_logs}
     labels = [f"{kind}_{n:03d}" for kind in fit_coverage.KINDS for n in range(counts.get(kind, settings.other_logs))]
     if not settings.collect:
         share_compilations(settings.work / "compiled")
         if settings.told_again:
             kept = {one["label"]: one for one in read_results(folder)}
-            labels, again = [label for label in labels if label in kept], settings.work / "told_again"
+            labels = [label for label in labels if label in kept]
             run_jobs(again, labels_of(settings.part, labels), lambda label: fit_coverage.told_again(
                 kept[label], settings.work / "compiled"))
             return

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks import fit_coverage, fit_searches
+from benchmarks import fit, fit_coverage, fit_searches
+from benchmarks.fit import Benchmark
 from benchmarks.fit_jobs import (
     RememberedCosts,
     compile_once,
@@ -17,6 +19,7 @@ from benchmarks.fit_jobs import (
     read_results,
     run_jobs,
     staged,
+    write_result,
 )
 from benchmarks.plant.chair import VEHICLES, Chair
 from sysid.independence import Evidence
@@ -86,6 +89,22 @@ def test_intervals_of_a_kept_search_are_made_anew(tmp_path):
     sd = 10 / (12 * 8 * 1e3) ** 0.5
     assert name == "b" and again["truth"] == 3.1 and again["value"] == pytest.approx(3.0) and again["identifiable"]
     assert again["high"] - again["low"] == pytest.approx(2 * 1.645 * sd, rel=0.3)
+
+
+@pytest.mark.quick
+def test_searches_that_were_kept_are_told_again_and_counted(tmp_path, monkeypatch):
+    """Of the logs that are asked for only those whose search is there, and figures are of what is told now."""
+    settings = Benchmark(parts=("coverage",), told_again=True, logs=5, plant_logs=0, work=tmp_path)
+    for number in (0, 3):
+        write_result(tmp_path / "coverage" / f"synthetic_{number:03d}.json", {
+            "label": f"synthetic_{number:03d}", "parameters": {"a": row(1.0, 2.0, 3.0)}, "seconds": 1.0})
+    monkeypatch.setattr(fit_coverage, "told_again", lambda kept, compiled: {
+        **kept, "parameters": {"a": row(1.0, 0.5, 3.0 if kept["label"].endswith("3") else 0.9)}})
+    recorded = {}
+    monkeypatch.setattr(fit, "record", lambda name, claim, figures, replacing: recorded.update(figures))
+    for collect in (False, True):
+        fit.coverage(dataclasses.replace(settings, collect=collect))
+    assert recorded["coverage_90_a"]["value"] == 0.5 and recorded["coverage_logs"]["value"] == 2.0
 
 
 @pytest.mark.quick
