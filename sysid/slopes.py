@@ -81,7 +81,11 @@ def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
     """Covariance (P, P) of errors in unit coordinates, for residuals with these derivatives (B, K, P)."""
-    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
+    return likely_by(np.einsum("bkp,bkq->pq", jacobian, jacobian), variance)
+
+
+def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:
+    """The same of J^T J (P, P)."""
     return np.linalg.inv(hessian / max(variance, EXACT) + np.eye(len(hessian)) / REACH**2)
 
 

@@ -23,7 +23,7 @@ from sysid.independence import CONFIDENCE, Evidence, errors_of, shared_error
 from sysid.metrics import replicate_groups
 from sysid.objective import Told, without_prior
 from sysid.prior import UNKNOWN
-from sysid.slopes import average_slopes, likely
+from sysid.slopes import average_slopes, likely, likely_by
 from sysid.space import BENT, NUISANCE, TERMS, Space
 
 PIECES = 8
@@ -34,7 +34,7 @@ PRIOR_SD = UNKNOWN
 UNIDENTIFIABLE = 0.5
 """Share of the prior's standard deviation above which a parameter counts as not told by the log."""
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
-FOLLOW = 4  # iterations of all others at the end of an interval
+FOLLOW = 2  # iterations of all others at the end of an interval
 NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
 WIDEST = 3.0
 """Times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them."""
@@ -101,6 +101,7 @@ def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
     space, u = objective.space, found.u
     errors, ahead = errors_of(found), np.ones((2, space.size))
     reach, inverse = errors.quantile * errors.deviation, found.inverse
+    over = likely_by(found.blocks.sum((0, 1)), found.variance)
     for index in np.flatnonzero([name in BENT for name in space.names]):
         if errors.deviation[index] > UNIDENTIFIABLE * PRIOR_SD:
             continue
@@ -113,7 +114,7 @@ def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
             start[:, index] = u[index] + step
             there = gradient.fit(objective, space, starts=np.clip(start, 0.0, 1.0), iterations=FOLLOW, robust=robust,
                                  frozen=(space.names[index],)).u
-            known = errors_of(_evidence_at(objective, there, robust))
+            known = errors_of(_evidence_at(objective, there, robust, over))
             wide = known.quantile[index] * known.deviation[index] / reach[index]
             ahead[end, index] = 1.0 + (wide - 1.0) / share
     return ahead
@@ -127,12 +128,17 @@ def stretched(ahead: np.ndarray) -> np.ndarray:
     return np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
 
 
-def _evidence_at(objective: Told, u: np.ndarray, robust: bool) -> Evidence:
+def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Evidence:
+    """What drives tell at any point u (P,), by slopes averaged over errors of a covariance `over` (P, P): those of
+    slopes at u unless it is given."""
     space = objective.space
-    residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
-    size = float(robust_cost(residual[None], robust)[0]) / objective.counted
-    for _ in range(PASSES):
-        residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
+    if over is not None:
+        residual, jacobian = average_slopes(objective, u, over)
+    else:
+        residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
+        size = float(robust_cost(residual[None], robust)[0]) / objective.counted
+        for _ in range(PASSES):
+            residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
     residual, jacobian = (without_prior(objective, one) for one in (residual, jacobian))  # it is no measurement
     told = jacobian
     if robust:

@@ -100,6 +100,7 @@ def test_searches_that_were_kept_are_told_again_and_counted(tmp_path, monkeypatc
             "label": f"synthetic_{number:03d}", "parameters": {"a": row(1.0, 2.0, 3.0)}, "seconds": 1.0})
     monkeypatch.setattr(fit_coverage, "told_again", lambda kept, compiled: {
         **kept, "parameters": {"a": row(1.0, 0.5, 3.0 if kept["label"].endswith("3") else 0.9)}})
+    monkeypatch.setattr(fit, "share_compilations", lambda folder: None)
     recorded = {}
     monkeypatch.setattr(fit, "record", lambda name, claim, figures, replacing: recorded.update(figures))
     for collect in (False, True):
