@@ -146,9 +146,9 @@ def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, 
     log, truth, _ = _drawn(label, compiled)
     fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))
     save_evidence(folder / "evidence" / f"{label}.npz", fit.uncertainty.evidence, fit.space)
-    rows = {one.name: _row(one, truth[one.name]) for one in fit.uncertainty.estimates if one.name in truth}
     values = dict(zip(fit.space.names, fit.space.to_values(fit.u).tolist(), strict=True))
-    return {"parameters": rows, "values": values, "cost": fit.cost, "seconds": fit.seconds}
+    return {"parameters": _rows(fit.uncertainty.estimates, truth), "values": values, "cost": fit.cost,
+            "seconds": fit.seconds}
 
 
 def told_again(kept: Mapping[str, Any], compiled: Path) -> dict[str, Any]:
@@ -163,11 +163,13 @@ def told_again(kept: Mapping[str, Any], compiled: Path) -> dict[str, Any]:
     u = space.to_unit(np.array([kept["values"][name] for name in space.names]))
     objective = choose(problem.objective, u, log.spec.track, config).renewed(u)
     estimates = estimate(objective, u, robust=config.robust).estimates
-    return {**kept, "parameters": {one.name: _row(one, truth[one.name]) for one in estimates if one.name in truth}}
+    return {**kept, "parameters": _rows(estimates, truth)}
 
 
-def _row(one: Estimate, truth: float) -> dict[str, Any]:
-    return {"truth": truth, "value": one.value, "low": one.low, "high": one.high, "identifiable": one.identifiable}
+def _rows(estimates: Sequence[Estimate], truth: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Each known value by its name, with its estimate."""
+    return {one.name: {"truth": truth[one.name], "value": one.value, "low": one.low, "high": one.high,
+                       "identifiable": one.identifiable} for one in estimates if one.name in truth}
 
 
 def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
@@ -196,7 +198,7 @@ def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     numbers: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in arrays.items()}
     known = {name: row["truth"] for name, row in result["parameters"].items()}
     estimates = uncertainty_of(Evidence(**numbers), space).estimates
-    return {**result, "parameters": {one.name: _row(one, known[one.name]) for one in estimates if one.name in known}}
+    return {**result, "parameters": _rows(estimates, known)}
 
 
 def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, dict[str, Any]]:

@@ -109,6 +109,14 @@ def test_a_vehicle_is_recorded_the_same_on_an_accelerator(monkeypatch):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_the_papers_cost_of_short_drives_is_that_of_whole_ones_on_an_accelerator_too(objective, monkeypatch):
+    u = np.random.default_rng(0).uniform(0.2, 0.8, (4, 3))
+    whole = objective.paper_cost(u)
+    monkeypatch.setattr("sysid.objective.on_processor", lambda: False)
+    monkeypatch.setattr(pieces, "LENGTH", 1e3)
+    np.testing.assert_array_equal(objective.paper_cost(u, quick=True), whole)
+
+
 def test_a_global_search_in_pieces_tells_the_best_by_whole_drives(objective, short_pieces, monkeypatch):
     u = np.random.default_rng(0).uniform(0.2, 0.8, (16, 3))
     whole = objective.paper_cost(u)
