@@ -24,8 +24,8 @@ from sysid.cores import on_processor
 BATCH = 16
 """Candidates that an accelerator simulates together, and the population of CMA-ES."""
 FEW = 4
-"""Candidates of TPE that a processor simulates together: as many as it replays at no loss, and the fewer are asked for
-at once, the more is known of those before."""
+"""Candidates of TPE that a processor simulates together: as many as it replays at no loss. The fewer are asked for at
+once, the more is known of those before; on an accelerator so many are asked for in the second half of a search."""
 LEASE = 600.0
 """Seconds after which a process on another machine that has not been heard of counts as dead."""
 POLL = 0.2  # s between looks while others finish
@@ -99,6 +99,7 @@ class SharedStudy:
         self._optuna, self._names, self._storage = optuna, names, storage
         self._worker = uuid.uuid4().hex[:12]
         self.batch = FEW if method == "tpe" and on_processor() else BATCH
+        self._late = FEW if method == "tpe" else BATCH
         self._study = optuna.create_study(study_name=study if storage is not None else None, storage=storage,
                                           direction="minimize", load_if_exists=storage is not None)
         wanted = {"parameters": ", ".join(names), "method": method, **(problem or {})}
@@ -135,7 +136,8 @@ class SharedStudy:
             trials = self._study.get_trials(deepcopy=False)
             done = sum(trial.state.name == "COMPLETE" for trial in trials)
             in_hand = sum(trial.state.name == "RUNNING" and "worker" in trial.user_attrs for trial in trials)
-            count = min(self.batch, evaluations - done - in_hand)
+            at_once = self.batch if 2 * (done + in_hand) < evaluations else self._late
+            count = min(at_once, evaluations - done - in_hand)
             if done >= evaluations and not self._unsettled(trials):
                 return
             if count <= 0:

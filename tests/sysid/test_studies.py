@@ -203,6 +203,23 @@ def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_f
 
 
 @pytest.mark.quick
+def test_on_an_accelerator_tpe_is_asked_for_many_at_first_and_for_few_in_the_second_half(monkeypatch):
+    monkeypatch.setattr(studies, "on_processor", lambda: False)
+    rows, asked = set(), []
+
+    def costs(u):
+        rows.add(len(u))
+        asked.append(len(np.unique(u, axis=0)))
+        return quadratic(u)
+
+    study = SharedStudy(NAMES, np.array([0.5, 0.6]), seed=3)
+    study.run(costs, 100)
+    assert rows == {BATCH}  # one compiled replay serves both
+    assert asked == [1] + 4 * [BATCH] + 8 * [FEW] + [3]
+    assert len(study.table()[0]) == 100
+
+
+@pytest.mark.quick
 def test_a_line_that_was_not_written_to_its_end_is_cut_off(tmp_path):
     path = tmp_path / "study.log"
     SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}")).run(quadratic, 5)
