@@ -119,15 +119,15 @@ class RememberedCosts:
         """The other cost, which is not kept."""
         return np.asarray(self._objective.weighted_cost(u))
 
-    def paper_cost(self, u: np.ndarray, quick: bool = False) -> np.ndarray:
-        """J (N,) of unit coordinates (N, P); `quick` as of the objective's."""
+    def paper_cost(self, u: np.ndarray) -> np.ndarray:
+        """J (N,) of unit coordinates (N, P)."""
         if self._next < len(self._kept):
             one = self._kept[self._next]
             if np.allclose(one["u"], u, atol=1e-9):
                 self._next, self._before, self._began = self._next + 1, one["seconds"], time.perf_counter()
                 return np.array(one["cost"])
             raise ValueError(f"{self._path}: costs of other points than the search asks for. Remove the file.")
-        cost = np.asarray(self._objective.paper_cost(u, quick))
+        cost = np.asarray(self._objective.paper_cost(u))
         with open(self._path, "a") as file:
             file.write(json.dumps({"u": np.asarray(u).tolist(), "cost": cost.tolist(), "seconds": self.seconds}) + "\n")
         return cost

@@ -130,8 +130,7 @@ def tpe_batched(problem: Problem, evaluations: int, seed: int, kept: Path) -> di
         kept: file for the costs so far.
     """
     objective, space = problem.objective, problem.space
-    for quick in (True, False):
-        objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH, 1)), quick)
+    objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH["tpe"], 1)))
     costs: Any = RememberedCosts(objective, kept)
     found = tpe.fit(costs, space, evaluations=evaluations, seed=seed, cost="paper", progress=reporter(kept.stem))
     return {"cost": found.cost, "seconds": costs.seconds}

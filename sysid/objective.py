@@ -151,24 +151,17 @@ class Objective:
         """Replay at unit coordinates (N, P)."""
         return self.replay.simulate(self.space.to_values(u))
 
-    def paper_cost(self, u: np.ndarray, quick: bool = False) -> np.ndarray:
-        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one.
-
-        Args:
-            quick: on an accelerator with long drives in pieces side by side (`sysid.pieces`). Of the 200 best
-                candidates of a search on a plant log J is then larger by 0.6 % in the median, and by 7 at most in 95 %.
-        """
-        if quick and not on_processor():
-            return self._paper_cost_in_pieces(u)
-        return np.asarray(self._paper_cost_of(self.simulate(u)))
+    def paper_cost(self, u: np.ndarray) -> np.ndarray:
+        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one."""
+        if on_processor() or not hasattr(self.replay, "traced"):
+            return np.asarray(self._paper_cost_of(self.simulate(u)))
+        return np.asarray(self._paper_cost_on_accelerator(jnp.asarray(u, jnp.result_type(float))), float)
 
     @cached_property
-    def _paper_cost_in_pieces(self) -> Callable[[np.ndarray], np.ndarray]:
-        replay: Any = getattr(self.replay, "in_pieces", self.replay)
-        if replay is self.replay:
-            return self.paper_cost
-        cost = jax.jit(lambda u: self._paper_cost_of(replay.traced(self.space.to_values(u))))
-        return lambda u: np.asarray(cost(jnp.asarray(u, jnp.result_type(float))), float)
+    def _paper_cost_on_accelerator(self) -> Callable[[jax.Array], jax.Array]:
+        """Drives stay there; at each number of sets it is compiled anew."""
+        replay: Any = self.replay
+        return jax.jit(lambda u: self._paper_cost_of(replay.traced(self.space.to_values(u))))
 
     def _paper_cost_of(self, simulated: Simulated) -> Any:
         xp, outside = namespace(simulated.pose), self.measured.pose_mask[..., 0].sum() > 0

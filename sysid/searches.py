@@ -244,7 +244,7 @@ def write(out: Path, log: Log, traces: Sequence[Trace], names: Sequence[str]) ->
 
 def _compile(objective: Objective, method: str, start_count: int) -> None:
     """Compile what a search will call, before its clock starts."""
-    u = np.tile(objective.space.to_unit(objective.space.initial), (BATCH, 1))
+    u = np.tile(objective.space.to_unit(objective.space.initial), (max(BATCH.values()), 1))
     objective.simulate(u)
     if method not in ("tpe", "cmaes"):
         objective.simulate(np.tile(u[:1], (start_count * len(gradient.DAMPINGS), 1)))

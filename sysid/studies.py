@@ -19,19 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from sysid.cores import on_processor
-
-BATCH = 16
-"""Candidates that an accelerator simulates together, and the population of CMA-ES."""
-FEW = 4
-"""Candidates of TPE that a processor simulates together: as many as it replays at no loss. The fewer are asked for at
-once, the more is known of those before; on an accelerator so many are asked for in the second half of a search."""
+BATCH = {"tpe": 4, "cmaes": 16}
+"""Candidates that are asked for and simulated together. Of TPE as many as a processor replays at no loss: the fewer are
+asked for at once, the more is known of those before. Of CMA-ES its population."""
+STARTUP = 32  # random candidates of TPE before it draws from those that it knows
 LEASE = 600.0
 """Seconds after which a process on another machine that has not been heard of counts as dead."""
 POLL = 0.2  # s between looks while others finish
 UNNAMED = 10.0
 """Seconds after which a candidate without a process's name on it was made by one that died in between."""
-METHODS = ("tpe", "cmaes")
 SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
 
 
@@ -93,13 +89,12 @@ class SharedStudy:
         """
         import optuna
 
-        if method not in METHODS:
-            raise ValueError(f"method {method!r} is no global search (known: {', '.join(METHODS)}).")
+        if method not in BATCH:
+            raise ValueError(f"method {method!r} is no global search (known: {', '.join(BATCH)}).")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self._optuna, self._names, self._storage = optuna, names, storage
         self._worker = uuid.uuid4().hex[:12]
-        self.batch = FEW if method == "tpe" and on_processor() else BATCH
-        self._late = FEW if method == "tpe" else BATCH
+        self.batch = BATCH[method]
         self._study = optuna.create_study(study_name=study if storage is not None else None, storage=storage,
                                           direction="minimize", load_if_exists=storage is not None)
         wanted = {"parameters": ", ".join(names), "method": method, **(problem or {})}
@@ -136,8 +131,7 @@ class SharedStudy:
             trials = self._study.get_trials(deepcopy=False)
             done = sum(trial.state.name == "COMPLETE" for trial in trials)
             in_hand = sum(trial.state.name == "RUNNING" and "worker" in trial.user_attrs for trial in trials)
-            at_once = self.batch if 2 * (done + in_hand) < evaluations else self._late
-            count = min(at_once, evaluations - done - in_hand)
+            count = min(self.batch, evaluations - done - in_hand)
             if done >= evaluations and not self._unsettled(trials):
                 return
             if count <= 0:
@@ -192,10 +186,10 @@ class SharedStudy:
     def _sampler(self, method: str, seed: int, start: dict[str, float]) -> Any:
         samplers = self._optuna.samplers
         if method == "tpe":
-            return samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=2 * BATCH)
+            return samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=STARTUP)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # x0 and sigma0 are to go in Optuna 6
-            return samplers.CmaEsSampler(seed=seed, x0=start, sigma0=SIGMA, popsize=BATCH,
+            return samplers.CmaEsSampler(seed=seed, x0=start, sigma0=SIGMA, popsize=self.batch,
                                          warn_independent_sampling=False)
 
     def _labelled(self, sampler: Any) -> Any:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from sysid.cores import on_processor
 from sysid.objective import Objective
 from sysid.result import FitResult, Progress
 from sysid.space import Space
-from sysid.studies import BATCH, SharedStudy, open_storage
+from sysid.studies import SharedStudy, open_storage
 
-__all__ = ["BATCH", "fit"]
+__all__ = ["fit"]
 
 
 def fit(
@@ -34,20 +32,15 @@ def fit(
         study: its name there.
         problem: what the study is about (`sysid.studies.SharedStudy`).
     """
-    costs: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        "weighted": objective.weighted_cost, "paper": partial(objective.paper_cost, quick=True)}
+    costs: Callable[[np.ndarray], np.ndarray] = {
+        "weighted": objective.weighted_cost, "paper": objective.paper_cost}[cost]
     about = {"cost": cost, "initial values": ", ".join(f"{value:.6g}" for value in space.initial),
              "bounds": ", ".join(f"{low:.6g} to {high:.6g}" for low, high in zip(space.low, space.high, strict=True)),
              **(problem or {})}
     shared = SharedStudy(space.names, space.to_unit(space.initial), method=method, seed=seed,
                          storage=open_storage(storage), study=study, problem=about)
-    shared.run(costs[cost], evaluations, progress)
+    shared.run(costs, evaluations, progress)
     u, values, initial = shared.table()
-    history, order = np.minimum.accumulate(values), np.argsort(values)
-    if cost == "paper" and not on_processor():  # drives were in pieces: the best are told by whole ones
-        first = order[: BATCH - 1]
-        whole = np.append(first, initial)
-        values[whole] = objective.paper_cost(u[whole])
-        order[: BATCH - 1] = first[np.argsort(values[first])]
+    order = np.argsort(values)
     return FitResult(u=u[order[0]], cost=float(values[order[0]]), initial_cost=float(values[initial]),
-                     evaluations=len(values), starts=u[order[:best]], history=history)
+                     evaluations=len(values), starts=u[order[:best]], history=np.minimum.accumulate(values))

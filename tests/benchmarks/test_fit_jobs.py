@@ -177,7 +177,7 @@ def test_a_search_that_was_stopped_asks_for_nothing_again(tmp_path):
     calls = []
 
     class Objective:
-        def paper_cost(self, u, quick):
+        def paper_cost(self, u):
             calls.append(u)
             return u.sum(-1)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import feature_objective, gradient, pieces, rollout, tpe
+from sysid import feature_objective, gradient, pieces, rollout
 from sysid.courses import CourseReplay
 from sysid.differences import DifferenceReplay
 from sysid.feature_objective import make_features_objective
@@ -107,28 +107,3 @@ def test_a_vehicle_is_recorded_the_same_on_an_accelerator(monkeypatch):
     found = jax.jit(lambda c: rollout.path_of(plant, params, c, jnp.zeros(5)))(command)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_the_papers_cost_of_short_drives_is_that_of_whole_ones_on_an_accelerator_too(objective, monkeypatch):
-    u = np.random.default_rng(0).uniform(0.2, 0.8, (4, 3))
-    whole = objective.paper_cost(u)
-    monkeypatch.setattr("sysid.objective.on_processor", lambda: False)
-    monkeypatch.setattr(pieces, "LENGTH", 1e3)
-    np.testing.assert_array_equal(objective.paper_cost(u, quick=True), whole)
-
-
-def test_a_global_search_in_pieces_tells_the_best_by_whole_drives(objective, short_pieces, monkeypatch):
-    u = np.random.default_rng(0).uniform(0.2, 0.8, (16, 3))
-    whole = objective.paper_cost(u)
-    np.testing.assert_array_equal(objective.paper_cost(u, quick=True), whole)  # on a processor
-    monkeypatch.setattr("sysid.objective.on_processor", lambda: False)
-    monkeypatch.setattr("sysid.tpe.on_processor", lambda: False)
-    cut = objective.paper_cost(u, quick=True)
-    np.testing.assert_allclose(cut, whole, rtol=0.02)
-    assert (cut != whole).any()
-    found = tpe.fit(objective, objective.space, evaluations=48, cost="paper", best=3)
-    best, first = objective.paper_cost(np.stack([found.u, UNICYCLE_SPACE.to_unit(UNICYCLE_SPACE.initial)]))
-    assert found.cost == pytest.approx(best, rel=1e-9) and found.initial_cost == pytest.approx(first, rel=1e-9)
-    assert best < first
-    np.testing.assert_array_equal(found.starts[0], found.u)
-    assert (np.diff(objective.paper_cost(found.starts)) >= 0).all()

@@ -243,6 +243,20 @@ def test_the_papers_cost_is_the_sum_of_the_position_rmse(objective):
     assert objective.paper_cost(u)[0] == pytest.approx(sum(errors), rel=1e-4)
 
 
+def test_the_papers_cost_is_the_same_where_an_accelerator_sums_it(objective, monkeypatch):
+    class Broken:
+        def traced(self, values):
+            simulated = objective.replay.traced(values)
+            return dataclasses.replace(simulated, pose=simulated.pose.at[0].set(np.nan))
+
+    u = np.random.default_rng(0).uniform(0.2, 0.8, (4, 3))
+    expected = objective.paper_cost(u)
+    monkeypatch.setattr("sysid.objective.on_processor", lambda: False)
+    np.testing.assert_allclose(objective.paper_cost(u), expected, rtol=1e-4)
+    broken = dataclasses.replace(objective, replay=Broken()).paper_cost(u)
+    assert broken[0] > 100 and broken[1:] == pytest.approx(expected[1:], rel=1e-4)
+
+
 def test_intervals_hold_the_truth_and_are_not_wide(objective):
     result = gradient.fit(objective, objective.space)
     known = uncertainty.estimate(objective, result.u)

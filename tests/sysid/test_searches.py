@@ -12,7 +12,7 @@ from cart import cart
 from sysid import gradient, searches
 from sysid.fit import FitConfig, make_problem
 from sysid.searches import Arguments, Judge, Recorder, Trace, arrivals, trace
-from sysid.studies import BATCH, FEW
+from sysid.studies import BATCH
 
 LAG = "(0.1, 0.02, 1.0)"
 MODEL = cart("tau_v", "tau_omega", f'{{"tau_v": {LAG}, "tau_omega": {LAG}, "turn": (1.0, 0.5, 1.5)}}')
@@ -40,7 +40,7 @@ def test_each_search_is_followed_to_its_end(compared, problem):
         assert one.cost[-1] < 0.2 * one.cost[0]
         assert one.cost[-1] == pytest.approx(problem.objective.weighted_cost(one.u[-1:])[0], rel=1e-6)
     by = {one.method: one for one in compared}
-    asked = {"tpe": FEW * (1 + -(-63 // FEW)), "cmaes": BATCH * (1 + -(-63 // BATCH))}
+    asked = {method: batch * (1 + -(-63 // batch)) for method, batch in BATCH.items()}
     assert {name: by[name].evaluations[-1] for name in asked} == asked  # whole batches, the initial values' own first
     assert by["lm"].cost[-1] == pytest.approx(min(one.cost[-1] for one in compared), rel=0.01)
     assert by["lm"].held_out[-1] < 0.1 * by["lm"].held_out[0]

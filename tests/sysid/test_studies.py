@@ -18,7 +18,7 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
 from sysid import studies, tpe
-from sysid.studies import BATCH, FEW, SharedStudy, open_storage
+from sysid.studies import BATCH, SharedStudy, open_storage
 
 NAMES = ("a", "b")
 GOAL = np.array([0.3, 0.8])
@@ -115,21 +115,21 @@ def test_a_killed_process_loses_no_trial_of_a_journal(tmp_path):
     assert given_up and len(given_up) - len(named) <= 1
     assert {process_of(storage, worker) for worker in named} <= {first.pid}
     assert len({trial.user_attrs["worker"] for trial in trials if "worker" in trial.user_attrs}) == 3
-    assert len(trials) < 96 + 3 * FEW + len(given_up)
+    assert len(trials) < 96 + 3 * BATCH["tpe"] + len(given_up)
 
 
 def test_a_study_that_lost_its_only_process_goes_on_where_it_was(tmp_path):
     storage = f"journal:{tmp_path / 'study.log'}"
     alone = start_worker(storage, 10**6, 0.05, "cmaes")
-    wait_for(lambda: counted(storage, "COMPLETE") >= 3 * BATCH)
+    wait_for(lambda: counted(storage, "COMPLETE") >= 3 * BATCH["cmaes"])
     alone.kill()
     alone.wait()
     before = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
     study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(storage), study="shared", method="cmaes")
-    study.run(quadratic, len(before) + 2 * BATCH)
+    study.run(quadratic, len(before) + 2 * BATCH["cmaes"])
     after = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
     assert before.items() <= after.items()
-    check_nothing_is_lost(trials_of(storage), len(before) + 2 * BATCH)
+    check_nothing_is_lost(trials_of(storage), len(before) + 2 * BATCH["cmaes"])
 
 
 @pytest.fixture
@@ -176,14 +176,14 @@ def test_processes_share_a_study_in_postgresql_and_one_may_be_killed(postgresql)
 
 
 def test_cmaes_finds_the_planted_parameters(objective):
-    result = tpe.fit(objective, objective.space, evaluations=15 * BATCH, seed=1, method="cmaes")
-    assert result.evaluations == 15 * BATCH
+    result = tpe.fit(objective, objective.space, evaluations=15 * BATCH["cmaes"], seed=1, method="cmaes")
+    assert result.evaluations == 15 * BATCH["cmaes"]
     assert result.cost < 1.5 < result.initial_cost
     np.testing.assert_allclose(UNICYCLE_SPACE.to_values(result.u), TRUTH, rtol=0.15)
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize(("method", "batch"), [("tpe", FEW), ("cmaes", BATCH)])
+@pytest.mark.parametrize(("method", "batch"), BATCH.items())
 def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_first(method, batch):
     sizes, first = [], []
 
@@ -200,23 +200,6 @@ def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_f
     np.testing.assert_allclose(u[initial], [0.5, 0.6])
     np.testing.assert_allclose(values, quadratic(u))
     assert values.min() < 0.1 * values[initial]
-
-
-@pytest.mark.quick
-def test_on_an_accelerator_tpe_is_asked_for_many_at_first_and_for_few_in_the_second_half(monkeypatch):
-    monkeypatch.setattr(studies, "on_processor", lambda: False)
-    rows, asked = set(), []
-
-    def costs(u):
-        rows.add(len(u))
-        asked.append(len(np.unique(u, axis=0)))
-        return quadratic(u)
-
-    study = SharedStudy(NAMES, np.array([0.5, 0.6]), seed=3)
-    study.run(costs, 100)
-    assert rows == {BATCH}  # one compiled replay serves both
-    assert asked == [1] + 4 * [BATCH] + 8 * [FEW] + [3]
-    assert len(study.table()[0]) == 100
 
 
 @pytest.mark.quick
