@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
 from benchmarks.harness import device_name, versions
 
@@ -147,5 +148,6 @@ def compile_once(folder: Path, name: str, compile: Callable[[], Any]) -> None:
 def share_compilations(folder: Path) -> None:
     """Let all processes on this machine use what one of them has compiled."""
     folder.mkdir(parents=True, exist_ok=True)
+    compilation_cache.reset_cache()  # whether one is used is looked up once, at the first thing compiled
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
