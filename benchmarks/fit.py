@@ -171,7 +171,8 @@ def planted(settings: Benchmark) -> None:
 
 def speed(settings: Benchmark) -> None:
     """Seconds of one start to convergence, features and poses, on 18 trials of 22 s, and of the whole fit, which also
-    looks elsewhere; compilation included, and of one start also where a fit before it has compiled all.
+    looks elsewhere; compilation included. Of one start also where a fit before it has compiled all, and of the whole
+    fit the processor time, also without compiling.
     """
     log = load_log(settings.shared / "data" / "plant" / "plain")
     kept = {trial.name for trial in log.training[:18]}

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
-from sysid.fit import FitConfig, Problem, choose, fit_log, fitted_plant, make_problem
+from sysid.fit import FitConfig, choose, fit_log, fitted_plant, make_problem
 from sysid.independence import Evidence
 from sysid.log import Log, load_log
 from sysid.models import with_effects
@@ -126,14 +126,13 @@ KINDS: dict[str, Callable[[Path, int], tuple[Log, dict[str, float]]]] = {
 """Logs by the kind in their label. Figures of all but the synthetic ones begin with it."""
 
 
-def _drawn(label: str, compiled: Path) -> tuple[Log, dict[str, float], Problem]:
-    """The log of a label, its known values and the search for them, with what it needs compiled."""
+def _drawn(label: str, compiled: Path) -> tuple[Log, dict[str, float]]:
+    """The log of a label and its known values, with what a search for them needs compiled."""
     kind, _, number = label.partition("_")
     with tempfile.TemporaryDirectory() as scratch:
         log, truth = KINDS[kind](Path(scratch), 50000 + int(number))
-    problem = make_problem(log, FitConfig())
-    compile_once(compiled, f"coverage_{kind}", lambda: compile_replay(problem.objective))
-    return log, truth, problem
+    compile_once(compiled, f"coverage_{kind}", lambda: compile_replay(make_problem(log, FitConfig()).objective))
+    return log, truth
 
 
 def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, Any]:
@@ -143,7 +142,7 @@ def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, 
         folder: where what the log tells is kept, as evidence/LABEL.npz.
         compiled: folder of what the processes share.
     """
-    log, truth, _ = _drawn(label, compiled)
+    log, truth = _drawn(label, compiled)
     fit = fit_log(log, FitConfig(iterations=iterations), reporter(label))
     save_evidence(folder / "evidence" / f"{label}.npz", fit.uncertainty.evidence, fit.space)
     values = dict(zip(fit.space.names, fit.space.to_values(fit.u).tolist(), strict=True))
@@ -158,8 +157,10 @@ def told_again(kept: Mapping[str, Any], compiled: Path) -> dict[str, Any]:
         kept: result of `job`.
         compiled: folder of what the processes share.
     """
-    log, truth, problem = _drawn(kept["label"], compiled)
-    space, config = problem.space, FitConfig()
+    log, truth = _drawn(kept["label"], compiled)
+    config = FitConfig()
+    problem = make_problem(log, config)
+    space = problem.space
     u = space.to_unit(np.array([kept["values"][name] for name in space.names]))
     objective = choose(problem.objective, u, log.spec.track, config).renewed(u)
     estimates = estimate(objective, u, robust=config.robust).estimates

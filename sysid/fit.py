@@ -39,6 +39,7 @@ from sysid.result import FitResult, Progress
 from sysid.rollout import Plant, predictions, vehicle_plant
 from sysid.series import collect, save
 from sysid.space import Space, make_space, searched
+from sysid.studies import BATCH
 from sysid.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.config import VehicleConfig
 from whill_mjx.presets import preset_params
@@ -49,7 +50,7 @@ QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
 TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count what they tell
 FEATURE_ITERATIONS = 20
-GLOBAL = ("tpe", "cmaes")  # methods that end with their global search
+GLOBAL = tuple(BATCH)  # methods that end with their global search
 
 
 @dataclass(frozen=True)

@@ -135,10 +135,15 @@ class NormalEquations:
                             *parts)
 
 
+def summed_there(replay: Any) -> bool:
+    """Whether an accelerator computes this replay and can sum what it gives, so that drives need not be fetched."""
+    return not on_processor() and hasattr(replay, "traced")
+
+
 def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
     """Let an accelerator compile side by side what a search by these objectives will need, and what it fetches of a
     replay with values (P,); a processor compiles in seconds what it comes to."""
-    if not on_processor() and hasattr(replay, "traced"):
+    if summed_there(replay):
         _COMPILERS.submit(replay.simulate, values[None])
         for objective in objectives:
             _ = objective.equations
@@ -146,7 +151,7 @@ def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) ->
 
 def make_equations(objective: Traceable) -> NormalEquations | None:
     """Those of an objective whose replay an accelerator computes; None on a processor, where residuals are at hand."""
-    if on_processor() or not hasattr(objective.replay, "traced"):
-        return None
     replay = objective.replay
+    if not summed_there(replay):
+        return None
     return NormalEquations(objective, max(min(DRIVES // replay.drives, STATES // replay.states), 1))

@@ -18,11 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.arrays import added, namespace
-from sysid.cores import on_processor
 from sysid.gradient import huber_weight
 from sysid.log import Trial
 from sysid.metrics import replicate_noise
-from sysid.normal_equations import NormalEquations, make_equations
+from sysid.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.prior import Prior
 from sysid.rollout import Measured, Simulated
 from sysid.space import Space
@@ -153,13 +152,13 @@ class Objective:
 
     def paper_cost(self, u: np.ndarray) -> np.ndarray:
         """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one."""
-        if on_processor() or not hasattr(self.replay, "traced"):
-            return np.asarray(self._paper_cost_of(self.simulate(u)))
-        return np.asarray(self._paper_cost_on_accelerator(jnp.asarray(u, jnp.result_type(float))), float)
+        if summed_there(self.replay):
+            return np.asarray(self._paper_cost_there(jnp.asarray(u, jnp.result_type(float))), float)
+        return np.asarray(self._paper_cost_of(self.simulate(u)))
 
     @cached_property
-    def _paper_cost_on_accelerator(self) -> Callable[[jax.Array], jax.Array]:
-        """Drives stay there; at each number of sets it is compiled anew."""
+    def _paper_cost_there(self) -> Callable[[jax.Array], jax.Array]:
+        """J on an accelerator, where drives stay; compiled anew for each number of sets."""
         replay: Any = self.replay
         return jax.jit(lambda u: self._paper_cost_of(replay.traced(self.space.to_values(u))))
 

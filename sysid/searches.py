@@ -109,7 +109,7 @@ def trace(
     recorder = Recorder(objective.replay, objective)
     watched = replace(objective, replay=recorder)
     points = gradient.random_starts(space, start_count, seed)
-    if method in ("tpe", "cmaes"):
+    if method in BATCH:
         tpe.fit(watched, space, evaluations=evaluations, seed=seed, cost="weighted", method=method, progress=progress)
     else:
         if method == "both":  # as a fit does it: from the initial values, and from the best of a short global search
@@ -246,7 +246,7 @@ def _compile(objective: Objective, method: str, start_count: int) -> None:
     """Compile what a search will call, before its clock starts."""
     u = np.tile(objective.space.to_unit(objective.space.initial), (max(BATCH.values()), 1))
     objective.simulate(u)
-    if method not in ("tpe", "cmaes"):
+    if method not in BATCH:
         objective.simulate(np.tile(u[:1], (start_count * len(gradient.DAMPINGS), 1)))
         objective.jacobian(u[:1])
         objective.jacobian(np.tile(u[:1], (start_count, 1)))

@@ -251,7 +251,7 @@ def test_the_papers_cost_is_the_same_where_an_accelerator_sums_it(objective, mon
 
     u = np.random.default_rng(0).uniform(0.2, 0.8, (4, 3))
     expected = objective.paper_cost(u)
-    monkeypatch.setattr("sysid.objective.on_processor", lambda: False)
+    monkeypatch.setattr("sysid.normal_equations.on_processor", lambda: False)
     np.testing.assert_allclose(objective.paper_cost(u), expected, rtol=1e-4)
     broken = dataclasses.replace(objective, replay=Broken()).paper_cost(u)
     assert broken[0] > 100 and broken[1:] == pytest.approx(expected[1:], rel=1e-4)
