@@ -20,6 +20,7 @@ import numpy as np
 
 from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.lost_pose import without_lost
+from sysid.streams import without_held
 from whill_mjx.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
@@ -333,13 +334,14 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
              chained: bool = False) -> Log:
     """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
 
-    Training trials of DRIVE whose outside pose was lost are left out (`sysid.lost_pose`), which a note says.
+    Training trials of DRIVE whose outside pose was lost are left out (`sysid.lost_pose`), and so are a dataset's rows
+    that were held between updates (`sysid.streams.without_held`); a note says either.
     """
     from sysid.log import load_log
 
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
-        log: Log = load_log(path)
+        log: Log = _without_held(load_log(path))
         return split(log, train, held_out) if train else log
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
@@ -352,3 +354,17 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
         robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
         return split(load_mrclam(path, robots), train, held_out)
     raise ValueError(f"unknown format {form!r} (known: auto, dataset, drive_norlab, mrclam).")
+
+
+def _without_held(log: Log) -> Log:
+    """The log without held rows, and a note where there were any."""
+    def rows(trial: Trial) -> int:
+        return sum(len(stream.t) for stream in (trial.odometry, trial.ground_truth) if stream is not None)
+
+    trials = tuple(without_held(trial) for trial in log.trials)
+    before, after = sum(map(rows, log.trials)), sum(map(rows, trials))
+    if after == before:
+        return log
+    return replace(log, trials=trials, notes=(*log.notes,
+        f"{before - after} of {before} rows of odometry and outside pose repeat the row before while the vehicle "
+        "moves: they were held between updates and are not scored again"))

@@ -8,7 +8,8 @@ of clock offset and transport delay, which no drive can tell apart.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ GRID_DT = 0.02  # s, of the signals that are compared
 SMOOTHING = 0.2  # s, over which positions are differenced
 LAGS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)  # s, first-order responses that are tried
 GAP = 2.5  # sampling periods without a sample
+MOVING = 0.05  # m/s or rad/s, above which a vehicle should not repeat its pose
 MIN_SIGNAL = {"v": 0.03, "omega": 0.03}  # m/s, rad/s of standard deviation below which a channel tells no shift
 
 
@@ -84,10 +86,42 @@ def trial_quality(trial: Trial) -> dict[str, StreamQuality]:
             values.append(np.column_stack([stream.x, stream.y, stream.yaw]))
         if isinstance(stream, OdometryStream):
             values.append(np.column_stack([stream.v, stream.omega]))
-        held = np.maximum(command_in_force(trial.command, stream.t), 0)
-        moving = (np.abs(trial.command.v[held]) > 0.05) | (np.abs(trial.command.omega[held]) > 0.05)
-        found[name] = quality(stream.t, values, moving)
+        found[name] = quality(stream.t, values, _commanded(trial, stream.t))
     return found
+
+
+def without_held(trial: Trial) -> Trial:
+    """The trial without rows that repeat the one before while the vehicle moves: held between two updates, they would
+    be scored again, each later than it was measured.
+
+    An outside pose should move where the command does, a row of odometry where it reports a speed itself: wheels that
+    have not begun to turn rightly repeat their row.
+    """
+    pose, odometry = trial.ground_truth, trial.odometry
+    if pose is not None:
+        trial = replace(trial, ground_truth=_new_rows(pose, _commanded(trial, pose.t)))
+    if odometry is not None and not any(one is None for one in (odometry.x, odometry.y, odometry.yaw)):
+        trial = replace(trial, odometry=_new_rows(odometry, _moving(odometry.v, odometry.omega)))
+    return trial
+
+
+def _new_rows(stream: Any, moving: np.ndarray) -> Any:
+    """The stream's rows that differ from the one before or are at rest; itself where all are, or hardly any is."""
+    columns = {one.name: getattr(stream, one.name) for one in fields(stream)}
+    repeated = np.all([np.diff(column) == 0 for name, column in columns.items() if name != "t"], axis=0)
+    kept = np.append(True, ~repeated | ~moving[1:])
+    return stream if kept.all() or kept.sum() < 2 else type(stream)(**{
+        name: column[kept] for name, column in columns.items()})
+
+
+def _commanded(trial: Trial, t: np.ndarray) -> np.ndarray:
+    """(T,) whether the command at times (T,) is to move."""
+    held = np.maximum(command_in_force(trial.command, t), 0)
+    return _moving(trial.command.v[held], trial.command.omega[held])
+
+
+def _moving(v: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    return (np.abs(v) > MOVING) | (np.abs(omega) > MOVING)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from sysid.log import load_log, manoeuvre_of
+from sysid.measured import load_any
+from sysid.streams import trial_quality
 from sysid.synthetic import write_csv, write_text
 from whill_mjx.model import box_inertia
 from whill_mjx.specs import HUSKY, WHILL_CR
@@ -46,6 +48,29 @@ def test_a_dataset_is_read_with_spec_start_pose_and_held_out_trials(dataset):
     assert [trial.name for trial in log.held_out] == ["straight_2"]
     start = log.trials[0].start
     np.testing.assert_allclose([start.x, start.y, start.yaw], [2.0, -1.0, np.pi / 2], atol=1e-5)
+
+
+def test_rows_that_were_held_between_updates_are_scored_once(dataset):
+    """Each row of both streams three times, 0.03 s apart, as a recorder repeats them that is quicker than they are."""
+    folder = dataset / "trials" / "straight_1"
+    plain = load_any(dataset).trials[0]
+    for file in ("odometry.csv", "ground_truth.csv"):
+        header, *rows = (folder / file).read_text().splitlines()
+        table = np.array([row.split(",") for row in rows], float)
+        more = np.repeat(table, 3, axis=0)
+        more[:, 0] += np.tile([0.0, 0.03, 0.06], len(table))
+        write_csv(folder / file, header, more)
+    log, inspected = load_any(dataset), load_log(dataset)
+    for name in ("odometry", "ground_truth"):
+        found, whole, expected = (getattr(one, name) for one in (log.trials[0], inspected.trials[0], plain))
+        driven, once = found.t > 1.05, expected.t > 1.05
+        assert driven.sum() == 19
+        np.testing.assert_allclose(found.t[driven], expected.t[once], atol=1e-6)
+        np.testing.assert_allclose(found.x[driven], expected.x[once], atol=1e-5)
+        # At rest a vehicle rightly repeats its row.
+        assert (found.t < 0.95).sum() == (whole.t < 0.95).sum() == 29 and len(whole.t) == 90
+        assert trial_quality(inspected.trials[0])[name].held > 0.5  # what inspect tells
+    assert any("not scored again" in note for note in log.notes) and not inspected.notes
 
 
 def test_odometry_is_counted_from_the_start_of_the_drive(dataset):
