@@ -12,6 +12,8 @@
     fixed                 name, value, reason
     prior                 file, assumed_spread, moved (name, before, after, deviations, within); null without
     profiles              name, unit, values, cost, statistic, threshold, interval (null where open), remark
+    spectrum              information, combination: eigenvalues of the Fisher information (by shares of the bounds),
+                          weakest first, and the parameters along their eigenvectors
     weak_combinations     combinations of parameters that the log does not tell
     search                evaluations, seconds, cost before and after, costs of the starts, number that agree, delays
     code                  SHA-256 over the sources of the packages, their versions and those of what they run on

@@ -121,6 +121,13 @@ def parameters(report: dict[str, Any]) -> str:
                        "is the initial value.", "dim")]
     if report["weak_combinations"]:
         parts += [heading("Combinations that this log does not tell"), bullets(report["weak_combinations"])]
+    if report.get("spectrum"):
+        parts += [heading("Fisher information"),
+                  table(["combination", "information", "standard error"], [
+                      [one["combination"], one["information"], max(one["information"], 1e-12) ** -0.5]
+                      for one in report["spectrum"]]),
+                  paragraph("Eigenvalues, weakest first; the standard error along each is a share of the range between "
+                            "the bounds.", "dim")]
     if report["fixed"]:
         parts += [heading("Not fitted"), table(["parameter", "value", "reason"], [
             [one["name"], one["value"], one["reason"]] for one in report["fixed"]])]

@@ -46,6 +46,7 @@ def make_report(
         "profiles": [{"name": one.name, "unit": about[one.name].unit, "values": one.values, "cost": one.cost,
                       "statistic": one.statistic, "threshold": one.threshold, "interval": list(one.interval),
                       "remark": one.remark(fit.space)} for one in fit.likelihoods],
+        "spectrum": [{"information": value, "combination": parts} for value, parts in fit.uncertainty.spectrum()],
         "weak_combinations": fit.uncertainty.weak_combinations(),
         "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
                    "cost_initial": fit.initial_cost, "cost": fit.cost,

@@ -67,15 +67,18 @@ class Uncertainty:
     quantile: np.ndarray  # (P,) standard errors that the intervals reach on either side
     evidence: Evidence
 
+    def spectrum(self) -> list[tuple[float, str]]:
+        """Fisher information along each of its eigenvectors, weakest first, with the parameters that make it up."""
+        names, found = [estimate.name for estimate in self.estimates], []
+        for value, direction in zip(self.information, self.directions.T, strict=True):
+            parts = sorted(zip(np.abs(direction), names, direction, strict=True), reverse=True)
+            made_of = " ".join(f"{sign:+.2f} {name}" for size, name, sign in parts[:4] if size > 0.2)
+            found.append((float(value), made_of))
+        return found
+
     def weak_combinations(self) -> list[str]:
         """Directions that the log does not tell, as the parameters that make them up."""
-        names = [estimate.name for estimate in self.estimates]
-        found = []
-        for value, direction in zip(self.information, self.directions.T, strict=True):
-            if value * PRIOR_SD**2 < 1.0 / UNIDENTIFIABLE**2:
-                parts = sorted(zip(np.abs(direction), names, direction, strict=True), reverse=True)
-                found.append(" ".join(f"{sign:+.2f} {name}" for size, name, sign in parts[:4] if size > 0.2))
-        return found
+        return [parts for value, parts in self.spectrum() if value * PRIOR_SD**2 < 1.0 / UNIDENTIFIABLE**2]
 
 
 def estimate(

@@ -75,7 +75,10 @@ def test_the_report_has_its_schema_and_a_row_per_trial_and_channel(planted):
     report = json.loads((folder / "run" / "report.json").read_text())
     assert (report["schema"], report["kind"]) == (1, "sysid-report")
     assert set(report) >= {"dataset", "settings", "model", "noise", "noise_floor", "parameters", "fixed",
-                           "weak_combinations", "search", "errors", "summary", "groups"}
+                           "spectrum", "weak_combinations", "search", "errors", "summary", "groups"}
+    information = [one["information"] for one in report["spectrum"]]
+    assert len(information) == len(report["parameters"]) and information == sorted(information)
+    assert {one["combination"] for one in report["spectrum"]} >= set(report["weak_combinations"])
     assert len(report["errors"]) == 10 * 2
     assert {row["trial"] for row in report["errors"] if row["held_out"]} == {"figure_eight_1", "figure_eight_2"}
     for row in report["errors"]:

@@ -76,6 +76,8 @@ def run(tmp_path_factory, unicycle_log):
                        {"name": "turn", "unit": "-", "initial": 1.1, "value": 0.9, "interval": [0.5, 1.5],
                         "confidence": 0.9, "bounds": [0.5, 1.5], "identifiable": False, "remark": "not told"}],
         "fixed": [{"name": "mass", "value": 52.0, "reason": "weigh it"}], "weak_combinations": ["+1.00 turn"],
+        "spectrum": [{"information": 4.0, "combination": "+1.00 turn"},
+                     {"information": 2500.0, "combination": "+1.00 tau_v"}],
         "search": {"evaluations": 10, "seconds": 1.0, "cost_initial": 9.0, "cost": 1.0, "start_costs": [1.0, 1.01, 5.0],
                    "delay_profiles": [{"name": "delay", "values": [0.0, 0.1, 0.2], "cost": [3.0, 1.0, 2.0]}]},
         **summaries(rows, trials), "errors": rows}
@@ -87,7 +89,8 @@ def run(tmp_path_factory, unicycle_log):
 def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run):
     text = check(write_html(run).read_text())
     for word in ("Held-out trials: predicted, never fitted", "tau_v", "not told", "weigh it", "a note", "+1.00 turn",
-                 "2 of 3", "figure_eight_1 (held out)", "sysid sources SHA-256", "toy & <co>"):
+                 "Fisher information", "0.02000", "2 of 3", "figure_eight_1 (held out)",
+                 "sysid sources SHA-256", "toy & <co>"):
         assert word in text, word
     report = read_report(run)
     assert report["dataset"]["sha256"] in text and report["code"]["sysid sources SHA-256"] in text
