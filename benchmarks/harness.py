@@ -17,6 +17,8 @@ from typing import Any
 
 import jax
 
+from whill_mjx import __version__
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -76,9 +78,9 @@ def record(
 
 
 def provenance() -> dict[str, Any]:
-    """Command, versions, commit and date of what is running."""
-    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "versions": versions(),
-            "commit": _commit(), "date": datetime.date.today().isoformat()}
+    """Command, release, versions, commit and date of what is running."""
+    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "release": __version__,
+            "versions": versions(), "commit": _commit(), "date": datetime.date.today().isoformat()}
 
 
 def versions() -> dict[str, str]:

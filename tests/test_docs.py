@@ -1,0 +1,103 @@
+"""README, the pages of docs/ and the CHANGELOG: short sentences, plain words, links that lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.quick
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+MOST_WORDS = 35
+"""Of a sentence."""
+
+
+def prose(text: str) -> list[str]:
+    """Paragraphs, headings and list items of a page, without code, tables, pictures and comments."""
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    text = re.sub(r"^```.*?^```", "\n", text, flags=re.DOTALL | re.MULTILINE)
+    blocks: list[str] = []
+    begin, listed = True, False
+    for line in text.splitlines():
+        item = re.match(r"\s*(?:[-*]|\d+\.) +", line)
+        if not line.strip():
+            begin = True
+        elif line.startswith("|") or (begin and not listed and not item and re.match(r" {4}", line)):
+            continue  # a table, or code that is indented
+        elif line.startswith("#"):
+            blocks.append(line.lstrip("# "))
+            begin, listed = True, False
+        elif item:
+            blocks.append(line[item.end() :])
+            begin, listed = False, True
+        elif begin:
+            blocks.append(line.strip())
+            begin, listed = False, line.startswith(" ") and listed
+        else:
+            blocks[-1] += " " + line.strip()
+    return blocks
+
+
+def sentences(text: str) -> list[str]:
+    """Sentences of a page; each ends by . ! ? : or ; before a space."""
+    found = []
+    for block in prose(text):
+        block = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", block)
+        block = re.sub(r"`[^`]*`", "code", block)
+        found += [part.strip() for part in re.split(r"(?<=[.!?:;])[)*_\"]*\s+", block) if part.strip()]
+    return found
+
+
+def anchors(text: str) -> set[str]:
+    """Names by which the headings of a page can be linked."""
+    headings = re.findall(r"^#+ +(.*)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_sentences_are_counted_without_code_and_tables():
+    text = "# A title\n\nOne two; three `four five` six. Seven\neight\n\n| a | table |\n\n    code here\n\n- an item\n"
+    assert sentences(text) == ["A title", "One two;", "three code six.", "Seven eight", "an item"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_sentence_is_longer_than_35_words(page):
+    long = [sentence for sentence in sentences(page.read_text()) if len(sentence.split()) > MOST_WORDS]
+    assert not long, f"{page.name}: {len(long)} sentences of more than {MOST_WORDS} words. Split them: {long[0]!r}"
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "benchmarks" / "README.md"], ids=str)
+def test_links_between_pages_lead_somewhere(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in target:
+            continue
+        name, _, anchor = target.partition("#")
+        linked = page.parent / name if name else page
+        assert linked.exists(), f"{page.name}: {target} does not exist."
+        if anchor:
+            assert anchor in anchors(linked.read_text()), f"{page.name}: {target} has no such heading."
+
+
+def test_pages_identify_and_report_instead_of_telling():
+    count = sum(len(re.findall(r"\b(?:tell|tells|told|telling)\b", page.read_text(), re.IGNORECASE)) for page in PAGES)
+    assert count <= 10
+
+
+def test_readme_fits_150_lines_and_the_page_of_figures_60_kB():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    assert (ROOT / "benchmarks" / "README.md").stat().st_size <= 60_000
+
+
+def test_readme_moves_and_cites_the_reference_paper():
+    text = (ROOT / "README.md").read_text()
+    assert "docs/images/drive.webp" in text and (ROOT / "docs" / "images" / "drive.webp").stat().st_size < 2_000_000
+    assert "Sim-to-Real Aware End-to-End Learning Environment for Micromobility" in text
+    assert "sysid/data/chair" in text
+
+
+def test_every_page_of_docs_is_linked_from_readme():
+    text = (ROOT / "README.md").read_text()
+    missing = [page.name for page in sorted((ROOT / "docs").glob("*.md")) if f"docs/{page.name}" not in text]
+    assert not missing, f"README.md links no {', '.join(missing)}."
