@@ -381,7 +381,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         return None
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     try:
@@ -390,3 +391,7 @@ if __name__ == "__main__":
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("stopped; give the same command again to go on from the last checkpoint.")
+
+
+if __name__ == "__main__":
+    cli()
