@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import re
 from pathlib import Path
 
@@ -97,6 +99,25 @@ def test_readme_moves_and_cites_the_reference_paper():
     assert "docs/images/drive.webp" in text and (ROOT / "docs" / "images" / "drive.webp").stat().st_size < 2_000_000
     assert "Sim-to-Real Aware End-to-End Learning Environment for Micromobility" in text
     assert "sysid/data/chair" in text
+
+
+OURS = r"(?:whill_mjx|sysid|dreamer|bridge|benchmarks)"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_commands_that_a_page_shows_can_be_started(page):
+    for module in set(re.findall(rf"python -m ({OURS}(?:\.\w+)*)", page.read_text())):
+        path = ROOT / module.replace(".", "/")
+        assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), f"{page.name}: python -m {module}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_names_that_a_page_imports_exist(page):
+    for module, names in re.findall(rf"^ *from ({OURS}[\w.]*) import ([\w, ]+)", page.read_text(), re.MULTILINE):
+        found = importlib.import_module(module)
+        for name in names.split(","):
+            assert hasattr(found, name.strip()) or importlib.util.find_spec(f"{module}.{name.strip()}"), (
+                f"{page.name}: from {module} import {name.strip()}")
 
 
 def test_every_page_of_docs_is_linked_from_readme():
