@@ -19,7 +19,7 @@ from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
 from benchmarks.plant.make import make_log
 from sysid.fit import FitConfig, fit_log, predict
-from sysid.log import Log, load_log
+from sysid.logs.log import Log, load_log
 
 FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
 

@@ -41,7 +41,7 @@ from benchmarks.fit_measured import drive, mrclam
 from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, show_parameters
 from benchmarks.harness import device_name, figure, record
 from sysid.fit import Fit, FitConfig, fit_log, fitted_plant, make_objective, make_problem
-from sysid.log import Log, load_log
+from sysid.logs.log import Log, load_log
 from sysid.searches import Judge
 
 
@@ -145,11 +145,11 @@ def contact(settings: Benchmark) -> None:
 
 def planted(settings: Benchmark) -> None:
     """Planted truth of the same model: held-out error against the sensor noise, and starts that agree."""
-    from sysid.space import make_space
-    from sysid.synthetic import write_dataset
-    from whill_mjx.parameters import get_values, set_values
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from sysid.errors.space import make_space
+    from sysid.logs.synthetic import write_dataset
+    from whill_mjx.vehicle.parameters import get_values, set_values
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     start = preset_params(WHILL_CR, "paper")
     space = make_space(start, WHILL_CR)

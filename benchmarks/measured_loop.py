@@ -26,17 +26,17 @@ from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
 from sysid.close_loop import LoopConfig, Result, close_loop, refit_poses
-from sysid.log import Log, Trial
-from sysid.loop.late_pose import NAME, PARAMETER
-from sysid.loop.report import effects, replay
-from sysid.loop.unnamed import find_unnamed, replay_unnamed
-from sysid.lost_pose import without_lost
-from sysid.measured import load_drive, load_mrclam, split
-from sysid.metrics import Prediction, ideal_replay, score
-from sysid.models import with_effects
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from sysid.logs.log import Log, Trial
+from sysid.logs.lost_pose import without_lost
+from sysid.logs.measured import load_drive, load_mrclam, split
+from sysid.logs.metrics import Prediction, ideal_replay, score
+from sysid.missing.late_pose import NAME, PARAMETER
+from sysid.missing.unnamed import find_unnamed, replay_unnamed
+from sysid.pages.loop_report import effects, replay
+from sysid.replay.models import with_effects
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}

@@ -27,16 +27,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
-from whill_mjx.config import VehicleConfig
 from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.manoeuvres import command_table
-from whill_mjx.model import VehicleModel, build_model
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset
-from whill_mjx.specs import VehicleSpec
-from whill_mjx.types import VehicleParams, VehicleState, parameters_of
-from whill_mjx.vehicle import drive, place
+from whill_mjx.logs.manoeuvres import command_table
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import VehicleModel, build_model
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams, VehicleState, parameters_of
 
 CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
 SPREAD = 0.1  # relative spread of every parameter between instances

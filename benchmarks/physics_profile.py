@@ -69,7 +69,7 @@ def work_of(vehicle: str, count: int = 64) -> Work:
     The host's compiler counts, on any machine: an accelerator's may not.
     """
     from benchmarks.physics import random_instances
-    from whill_mjx.vehicle import substep
+    from whill_mjx.vehicle.dynamics import substep
 
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         model, params, states = random_instances(vehicle, count)

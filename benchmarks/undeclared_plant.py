@@ -26,11 +26,11 @@ from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.make import make_log
 from benchmarks.undeclared_reference import USUAL, Driven, reference_days
 from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
-from sysid.log import load_log
-from sysid.loop.report import effects as named_effects
-from sysid.loop.report import make_report, write_run
-from sysid.loop.trust import warnings
+from sysid.logs.log import load_log
+from sysid.pages.loop_report import effects as named_effects
+from sysid.pages.loop_report import make_report, write_run
 from sysid.report import write_report
+from sysid.verdict.trust import warnings
 
 RECORDED = RESULTS / "undeclared.json"
 POWER = 0.84

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from benchmarks.plant.make import make_log
 from sysid.close_loop import LoopConfig, Prepared, prepare
-from sysid.log import Log, load_log
-from sysid.loop.reference import Reference, make_reference
+from sysid.logs.log import Log, load_log
+from sysid.missing.reference import Reference, make_reference
+from sysid.replay.rollout import vehicle_plant
 from sysid.report import code_hashes
-from sysid.rollout import vehicle_plant
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset_params
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset_params
 
 
 @dataclass(frozen=True)

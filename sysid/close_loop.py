@@ -11,7 +11,7 @@ within their day-to-day spread, and the verdict is one of
 Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
 scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
 
-Writes RUN/report.json (`sysid.loop.report`), RUN/report.html and RUN/vehicle.toml with the effect in it.
+Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html and RUN/vehicle.toml with the effect in it.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid import command_line
-from sysid.log import Log, Trial
-from sysid.loop.alone import judged, stands_alone
-from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.loop.drives import Drives, make_drives, rows_of_call
-from sysid.loop.evidence import PARTS, Evidence, column_layout, gather
-from sysid.loop.falsifiers import FALSIFIERS
-from sysid.loop.found import Search, Thresholds
-from sysid.loop.guards import Stood, guarded, stand
-from sysid.loop.late_pose import PARAMETER, told_late
-from sysid.loop.null_refits import NullRefits, checked
-from sysid.loop.null_refits import run as run_null_refits
-from sysid.loop.reference import Reference, make_reference
-from sysid.loop.refit import Refitter
-from sysid.loop.search import search
-from sysid.loop.unexplained import best_gain
-from sysid.loop.wander import Wander, estimate
-from sysid.models import measured_effects, with_effects
-from sysid.result import Progress
-from sysid.rollout import PathReplay, Plant, vehicle_plant
-from sysid.space import FIXED, make_space, searched
-from whill_mjx.config import VehicleConfig
-from whill_mjx.parameters import describe, get_values, set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import VehicleSpec
+from sysid.errors.space import FIXED, make_space, searched
+from sysid.logs.log import Log, Trial
+from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.drives import Drives, make_drives, rows_of_call
+from sysid.missing.evidence import PARTS, Evidence, column_layout, gather
+from sysid.missing.late_pose import PARAMETER, told_late
+from sysid.missing.reference import Reference, make_reference
+from sysid.missing.refit import Refitter
+from sysid.missing.unexplained import best_gain
+from sysid.missing.wander import Wander, estimate
+from sysid.replay.models import measured_effects, with_effects
+from sysid.replay.rollout import PathReplay, Plant, vehicle_plant
+from sysid.search.result import Progress
+from sysid.verdict.alone import judged, stands_alone
+from sysid.verdict.falsifiers import FALSIFIERS
+from sysid.verdict.found import Search, Thresholds
+from sysid.verdict.guards import Stood, guarded, stand
+from sysid.verdict.null_refits import NullRefits, checked
+from sysid.verdict.null_refits import run as run_null_refits
+from sysid.verdict.search import search
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     the wander of days. Drives without one would only be fitted closer by them: on a measured robot the errors of drives
     left out grew by 3 %.
     """
-    from sysid.loop.poses import fit_poses
+    from sysid.missing.pose_fit import fit_poses
 
     known, trials = result.reference.known, result.log.training
     extra = measured_effects(vehicle, result.log.spec, trials, losses=False) if known else ()
@@ -381,13 +381,13 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Load, close the loop, open the held-out trials, write and print the verdict."""
-    from sysid.measured import load_any
+    from sysid.logs.measured import load_any
 
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
     vehicle = None
     if arguments.vehicle is not None:
-        from whill_mjx.vehicle_file import load_vehicle
+        from whill_mjx.vehicle.vehicle_file import load_vehicle
 
         if references:
             raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
@@ -400,7 +400,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 def run(log: Log, references: Sequence[Log], out: Path, config: LoopConfig, vehicle: Any = None) -> dict[str, Any]:
     """Close the loop with a progress bar, open the held-out trials, write the folder `out` and print the verdict."""
-    from sysid.loop.report import make_report, summary, write_run
+    from sysid.pages.loop_report import make_report, summary, write_run
 
     progress, close = command_line.progress_bar(
         expected_steps(config, len(references), vehicle is not None), "close the loop", "step")

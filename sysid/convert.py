@@ -18,10 +18,10 @@ from typing import Literal
 import numpy as np
 
 from sysid import command_line
-from sysid.log import Log, Trial, load_log
-from sysid.rosbag import Bag, find_bags, read_bag, stream_times
-from whill_mjx.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
-from whill_mjx.specs import SPECS, VehicleSpec, find_spec
+from sysid.logs.log import Log, Trial, load_log
+from sysid.logs.rosbag import Bag, find_bags, read_bag, stream_times
+from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
+from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
 HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER}
 STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow

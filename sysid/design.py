@@ -18,15 +18,15 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid import command_line
-from sysid.candidates import Candidate, Limits, as_trial, library, placement
-from sysid.log import Command
-from sysid.objective import DEFAULT_NOISE, Noise, Objective
-from sysid.rollout import Measured, Plant, Replay, Simulated, make_batch, vehicle_plant
-from sysid.space import Space, make_space
-from sysid.uncertainty import PRIOR_SD, UNIDENTIFIABLE
-from whill_mjx.config import VehicleConfig
-from whill_mjx.parameters import set_values
-from whill_mjx.specs import VehicleSpec
+from sysid.errors.pose_objective import DEFAULT_NOISE, Noise, Objective
+from sysid.errors.space import Space, make_space
+from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
+from sysid.logs.log import Command
+from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
+from sysid.replay.rollout import Measured, Plant, Replay, Simulated, make_batch, vehicle_plant
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.specs import VehicleSpec
 
 INFLATION = 13.7
 """Samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large."""
@@ -229,7 +229,7 @@ def best_splitting_manoeuvre(
         params: the base vehicle.
         base_space: base parameters that a fit would adapt; its initial values are those of `params`.
         effect_a_params, effect_b_params: the base vehicle with one effect each, at a size worth knowing.
-        candidates: from `sysid.candidates.library`.
+        candidates: from `sysid.logs.manoeuvre_library.library`.
         plant: by default the simulator's vehicle of `spec`.
         apply: values (P,) of the base space -> the plant's parameters; by default they are set in `params`.
 
@@ -302,8 +302,8 @@ class DesignConfig:
 
 def main(config: DesignConfig) -> list[Path]:
     """Propose, write the command files and the page, and print the reasons."""
-    from sysid.design_page import text, write_page
-    from whill_mjx.dataset import COMMAND_HEADER, write_csv
+    from sysid.pages.design_page import text, write_page
+    from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 
     spec, params, intervals, noise = load_subject(config.vehicle)
     limits = Limits(
@@ -330,7 +330,7 @@ def main(config: DesignConfig) -> list[Path]:
 def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, float]], Noise]:
     """Spec, parameters, known intervals and noise of a built-in vehicle, a vehicle file, or the folder of a fit."""
     from whill_mjx.drive import find_vehicle
-    from whill_mjx.vehicle_file import load_intervals
+    from whill_mjx.vehicle.vehicle_file import load_intervals
 
     if not Path(name).is_dir():
         spec, params = find_vehicle(name)

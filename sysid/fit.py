@@ -14,12 +14,20 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from sysid import command_line, frames, gradient, slopes, starts, tpe, uncertainty
-from sysid.feature_objective import FeatureObjective, make_features_objective
-from sysid.log import Log, Trial
-from sysid.measured import load_any
-from sysid.metrics import Prediction
-from sysid.models import (
+from sysid import command_line
+from sysid.errors.bin_objective import FeatureObjective, make_features_objective
+from sysid.errors.pose_objective import Noise, Objective, Told, estimate_noise
+from sysid.errors.prior import SPREAD, Prior, bounds_alone, make_prior
+from sysid.errors.space import Space, make_space, searched
+from sysid.intervals import uncertainty
+from sysid.intervals.profiles import Profile, check_names, profile
+from sysid.logs import odometry_frames
+from sysid.logs.log import Log, Trial
+from sysid.logs.measured import load_any
+from sysid.logs.metrics import Prediction
+from sysid.pages.fit_report import make_report, provenance
+from sysid.pages.series import collect, save
+from sysid.replay.models import (
     Model,
     get_parameters,
     load_model,
@@ -30,20 +38,15 @@ from sysid.models import (
     set_parameters,
     with_effects,
 )
-from sysid.objective import Noise, Objective, Told, estimate_noise
-from sysid.prior import SPREAD, Prior, bounds_alone, make_prior
-from sysid.profiles import Profile, check_names, profile
+from sysid.replay.rollout import Plant, predictions, vehicle_plant
 from sysid.report import error_rows, parameter_table, table, write_html, write_report
-from sysid.report_json import make_report, provenance
-from sysid.result import FitResult, Progress
-from sysid.rollout import Plant, predictions, vehicle_plant
-from sysid.series import collect, save
-from sysid.space import Space, make_space, searched
-from sysid.studies import BATCH
-from sysid.valleys import FIRST, LOOK, gradient_search
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import VehicleSpec
+from sysid.search import least_squares, slopes, starts, tpe
+from sysid.search.result import FitResult, Progress
+from sysid.search.studies import BATCH
+from sysid.search.valleys import FIRST, LOOK, gradient_search
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
@@ -132,7 +135,7 @@ class Fit:
     likelihoods: tuple[Profile, ...] = ()
     """Profile likelihoods of the parameters that `profile` names."""
     frame: float | None = None
-    """Time between the frames of the odometry [s] (`sysid.frames`), where they show."""
+    """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
 
 
 def fit_log(
@@ -158,7 +161,7 @@ def fit_log(
                          "profile starts from. Use --method features, lm or both.")
 
     scan = coarse = search = None
-    points = gradient.random_starts(space, config.starts, config.seed)
+    points = least_squares.random_starts(space, config.starts, config.seed)
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
     if config.method in (*GLOBAL, "both"):
@@ -186,7 +189,7 @@ def fit_log(
         search, told, profiles = gradient_search(told, space, points, iterations, config, progress)
         u, final_cost = search.u, search.cost
         first = told.residuals(space.to_unit(space.initial)[None])
-        initial_cost = float(gradient.robust_cost(first, config.robust)[0]) / told.counted
+        initial_cost = float(least_squares.robust_cost(first, config.robust)[0]) / told.counted
     known = uncertainty.estimate(told, u, robust=config.robust and config.method not in GLOBAL)
     traced = profile(told, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
     objective = objective.renewed(u)  # its noise is reported
@@ -212,7 +215,7 @@ def choose(
     """
     if config.method in GLOBAL:
         return objective
-    near = gradient.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
+    near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
                         progress=progress)
     share = uncertainty.inflation(objective, near.u)
     told: Objective | FeatureObjective = objective
@@ -248,8 +251,8 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
-    frame = frames.find_period(trials)
-    trials = frames.at_frames(trials, frame)
+    frame = odometry_frames.find_period(trials)
+    trials = odometry_frames.at_frames(trials, frame)
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
@@ -271,16 +274,17 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         params = with_effects(params, (*config.effects, *measured))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
     plant = replace(plant, frame=frame)
-    if frame is not None and frames.AGE in space.names and frames.AGE not in config.parameters:
-        space = space.without(frames.AGE, "speeds are those of the odometry's frames")
-    objective = make_objective(plant, params, space, trials, estimate_noise(frames.at_frames(log.training, frame)))
+    if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
+        space = space.without(odometry_frames.AGE, "speeds are those of the odometry's frames")
+    noise = estimate_noise(odometry_frames.at_frames(log.training, frame))
+    objective = make_objective(plant, params, space, trials, noise)
     objective = replace(objective, prior=bounds_alone(space))
     return Problem(plant, params, space, objective, intervals, model, frame)
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
     """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
-    from whill_mjx.vehicle_file import load_intervals, load_vehicle
+    from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
     spec, params, _ = load_vehicle(path)
     for name in ("wheel_radius", "track", "wheelbase", "drive"):
@@ -332,8 +336,8 @@ def fit_dataset(
     Returns:
         The report.
     """
-    from sysid.plots import write_plots
-    from whill_mjx.vehicle_file import save_vehicle
+    from sysid.pages.plots import write_plots
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     config = config or FitConfig()
     config = replace(config, quick=quick or config.quick)
@@ -342,7 +346,8 @@ def fit_dataset(
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
     if fit.frame is not None:
-        log = replace(log, trials=frames.at_frames(log.trials, fit.frame), notes=(*log.notes, frames.note(fit.frame)))
+        log = replace(log, trials=odometry_frames.at_frames(log.trials, fit.frame),
+                      notes=(*log.notes, odometry_frames.note(fit.frame)))
     trials = (*log.training, *log.held_out)
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)

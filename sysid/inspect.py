@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid import command_line
-from sysid.coverage import blind_spots, excitation, replicate_spread, sanity
-from sysid.log import Log, load_log
-from sysid.measured import detect_format, drive_spec, load_drive, load_mrclam, split
-from sysid.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
+from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity
+from sysid.logs.log import Log, load_log
+from sysid.logs.measured import detect_format, drive_spec, load_drive, load_mrclam, split
+from sysid.logs.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
 
 MAX_ROWS = 40  # trials listed one by one; more are summed up by group
 POSE_JITTER = 0.003  # s, more than rounding and noise of the speeds explain
@@ -211,9 +211,9 @@ def _span(names: list[str]) -> str:
 
 def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
     """Write inspect.txt, inspect.json and inspect.png; returns their paths."""
-    from sysid.inspect_plot import write_plot
+    from sysid.pages.inspect_plot import write_plot
     from sysid.report import write_report
-    from whill_mjx.dataset import write_text
+    from whill_mjx.logs.dataset import write_text
 
     paths = [folder / "inspect.txt", folder / "inspect.json", folder / "inspect.png"]
     write_text(paths[0], text(found) + "\n")

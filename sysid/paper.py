@@ -18,19 +18,19 @@ import numpy as np
 
 from sysid import command_line
 from sysid.fit import FitConfig, fit_log, predict
-from sysid.html import Cell, Section, charts, html_page, legend, paragraph, png, table
-from sysid.log import Log
-from sysid.measured import load_any
-from sysid.metrics import METRICS, UNITS
+from sysid.intervals.statistics import holm, mean_sd, sign_flip_p, smallest_p
+from sysid.logs.log import Log
+from sysid.logs.measured import load_any
+from sysid.logs.metrics import METRICS, UNITS
+from sysid.pages.html import Cell, Section, charts, html_page, legend, paragraph, png, table
+from sysid.pages.series import TrialSeries, collect, save
+from sysid.pages.svg import COLOURS, line_chart, replay_line
 from sysid.report import code_hashes, error_rows, write_report
-from sysid.result import Progress
-from sysid.series import TrialSeries, collect, save
-from sysid.statistics import holm, mean_sd, sign_flip_p, smallest_p
-from sysid.svg import COLOURS, line_chart, replay_line
-from whill_mjx.dataset import write_text
-from whill_mjx.manoeuvres import PAPER_MANOEUVRES
-from whill_mjx.parameters import describe, get_values
-from whill_mjx.presets import preset_params
+from sysid.search.result import Progress
+from whill_mjx.logs.dataset import write_text
+from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
+from whill_mjx.vehicle.parameters import describe, get_values
+from whill_mjx.vehicle.presets import preset_params
 
 PARAMETERS = (
     "lateral_damping.c_rear", "lateral_damping.c_front", "forward_slip.eta", "pid_drive.kp", "pid_drive.ki",
@@ -179,8 +179,8 @@ def caution(content: dict[str, Any]) -> str:
 
 def write(folder: Path, content: dict[str, Any], fit: Any, series: Sequence[TrialSeries], log: Log) -> None:
     """Write paper.json, paper.md, figures, paper.html, series.npz and vehicle.toml."""
-    from sysid.plots import write_paper_figures
-    from whill_mjx.vehicle_file import save_vehicle
+    from sysid.pages.plots import write_paper_figures
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     folder.mkdir(parents=True, exist_ok=True)
     write_report(folder / "paper.json", content)

@@ -36,12 +36,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid.log import Trial
-from sysid.metrics import METRICS, UNITS, Prediction, ideal_replay, own_floor, score
+from sysid.logs.log import Trial
+from sysid.logs.metrics import METRICS, UNITS, Prediction, ideal_replay, own_floor, score
 
 if TYPE_CHECKING:
-    from sysid.html import Section
-    from sysid.series import TrialSeries
+    from sysid.pages.html import Section
+    from sysid.pages.series import TrialSeries
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -121,9 +121,9 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
         sections: more sections, shown first.
     """
-    from sysid.html import html_page
-    from sysid.report_html import fit_sections
-    from sysid.series import FILE, load, replay
+    from sysid.pages.fit_page import fit_sections
+    from sysid.pages.html import html_page
+    from sysid.pages.series import FILE, load, replay
 
     run = Path(run)
     report = read_report(run)

@@ -21,20 +21,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from sysid import command_line, gradient, starts, tpe
+from sysid import command_line
+from sysid.errors.pose_objective import Objective, Replays
 from sysid.fit import FitConfig, Problem, make_problem
-from sysid.html import Section, html_page, paragraph, png, table
-from sysid.log import Log
-from sysid.measured import load_any
-from sysid.metrics import score
-from sysid.models import make_replay
-from sysid.objective import Objective, Replays
-from sysid.plots import write_search_plot
+from sysid.logs.log import Log
+from sysid.logs.measured import load_any
+from sysid.logs.metrics import score
+from sysid.pages.html import Section, html_page, paragraph, png, table
+from sysid.pages.plots import write_search_plot
+from sysid.replay.models import make_replay
+from sysid.replay.rollout import Simulated, predictions
 from sysid.report import code_hashes, write_report
-from sysid.result import Progress
-from sysid.rollout import Simulated, predictions
-from sysid.studies import BATCH
-from sysid.valleys import gradient_search
+from sysid.search import least_squares, starts, tpe
+from sysid.search.result import Progress
+from sysid.search.studies import BATCH
+from sysid.search.valleys import gradient_search
 
 KIND = "sysid-searches"
 METHODS = ("features", "lm", "both", "tpe", "cmaes")
@@ -97,7 +98,7 @@ def trace(
     """Run one search and follow its best point.
 
     Args:
-        track: of the vehicle [m] (`sysid.starts`).
+        track: of the vehicle [m] (`sysid.search.starts`).
         evaluations: of the global searches.
         iterations: of the gradient searches.
         start_count: starts of the gradient searches: the initial values, and random ones.
@@ -108,7 +109,7 @@ def trace(
     _compile(objective, method, start_count)
     recorder = Recorder(objective.replay, objective)
     watched = replace(objective, replay=recorder)
-    points = gradient.random_starts(space, start_count, seed)
+    points = least_squares.random_starts(space, start_count, seed)
     if method in BATCH:
         tpe.fit(watched, space, evaluations=evaluations, seed=seed, cost="weighted", method=method, progress=progress)
     else:
@@ -247,7 +248,7 @@ def _compile(objective: Objective, method: str, start_count: int) -> None:
     u = np.tile(objective.space.to_unit(objective.space.initial), (max(BATCH.values()), 1))
     objective.simulate(u)
     if method not in BATCH:
-        objective.simulate(np.tile(u[:1], (start_count * len(gradient.DAMPINGS), 1)))
+        objective.simulate(np.tile(u[:1], (start_count * len(least_squares.DAMPINGS), 1)))
         objective.jacobian(u[:1])
         objective.jacobian(np.tile(u[:1], (start_count, 1)))
 

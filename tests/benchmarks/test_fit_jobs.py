@@ -22,11 +22,11 @@ from benchmarks.fit_jobs import (
     write_result,
 )
 from benchmarks.plant.chair import VEHICLES, Chair
-from sysid.independence import Evidence
-from sysid.models import measured_effects, with_effects
-from sysid.space import Space, make_space, searched
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR, in_proportion
+from sysid.errors.space import Space, make_space, searched
+from sysid.intervals.independence import Evidence
+from sysid.replay.models import measured_effects, with_effects
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR, in_proportion
 
 
 @pytest.mark.quick

@@ -19,34 +19,34 @@ from sysid.close_loop import (
     vehicle_after,
     vehicle_before,
 )
+from sysid.errors.features import CHANNELS, make_features
+from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
-from sysid.log import load_log
-from sysid.loop.catalogue import base_values
-from sysid.loop.drives import make_drives
-from sysid.loop.falsifiers import Falsifier, course_of, put_to_test
-from sysid.loop.features import CHANNELS, make_features
-from sysid.loop.next_manoeuvre import refitter_of
-from sysid.loop.noise import deviations, replicate_groups
-from sysid.loop.null_refits import NullRefits, checked
-from sysid.loop.null_refits import run as run_null_refits
-from sysid.loop.refit import without_each
-from sysid.loop.report import effects, make_report, replay, write_run
-from sysid.loop.tables import Table
-from sysid.loop.trust import beside_still_base, warnings
-from sysid.loop.unnamed import vehicle_of, with_start_angles
-from sysid.metrics import own_floor, score
-from sysid.models import with_effects
-from sysid.rollout import Measured, vehicle_plant
-from sysid.synthetic import write_dataset
-from whill_mjx.config import VehicleConfig
+from sysid.logs.log import load_log
+from sysid.logs.metrics import own_floor, score
+from sysid.logs.synthetic import write_dataset
+from sysid.missing.catalogue import base_values
+from sysid.missing.drives import make_drives
+from sysid.missing.next_manoeuvre import refitter_of
+from sysid.missing.refit import without_each
+from sysid.missing.tables import Table
+from sysid.missing.unnamed import vehicle_of, with_start_angles
+from sysid.pages.loop_report import effects, make_report, replay, write_run
+from sysid.replay.models import with_effects
+from sysid.replay.rollout import Measured, vehicle_plant
+from sysid.verdict.falsifiers import Falsifier, course_of, put_to_test
+from sysid.verdict.null_refits import NullRefits, checked
+from sysid.verdict.null_refits import run as run_null_refits
+from sysid.verdict.trust import beside_still_base, warnings
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS
-from whill_mjx.manoeuvres import Scenario
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset
-from whill_mjx.types import VehicleParams
-from whill_mjx.vehicle_file import load_vehicle
+from whill_mjx.logs.manoeuvres import Scenario
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 DRIVES = ("straight", "circle", "s_curve")
 CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200, poses=False)
@@ -152,7 +152,7 @@ def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, 
                                sloping.search.scan, CONFIG.thresholds, 3).p
 
     together = days()
-    monkeypatch.setattr("sysid.loop.null_refits.TOGETHER", 1)
+    monkeypatch.setattr("sysid.verdict.null_refits.TOGETHER", 1)
     np.testing.assert_allclose(days(), together, rtol=1e-6)
 
 
@@ -162,8 +162,8 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
         if accepted:
             found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
 
-    monkeypatch.setattr("sysid.loop.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
-    monkeypatch.setattr("sysid.loop.null_refits.pair_round", rounds)
+    monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
+    monkeypatch.setattr("sysid.verdict.null_refits.pair_round", rounds)
     nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
                             sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
     assert nulls.alarms == (2 if accepted else 0)
@@ -378,8 +378,8 @@ def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
     every = np.arange(len(made.trials))
     values = np.array([list(base_values(sloping.full).values())] * len(every))
     usual = sloping.prepared.paths(values, made.batch, every)
-    monkeypatch.setattr("sysid.rollout.on_processor", lambda: False)
-    monkeypatch.setattr("sysid.rollout.FETCHED", 2)
+    monkeypatch.setattr("sysid.replay.rollout.on_processor", lambda: False)
+    monkeypatch.setattr("sysid.replay.rollout.FETCHED", 2)
     large = copy.copy(sloping.prepared.paths)
     for large.rows in (len(every) - 2, len(every) + 5):  # the second one has rows to spare, of which one is fetched
         paths = large(values, made.batch, every)

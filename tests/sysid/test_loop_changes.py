@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.loop.changes import by_manoeuvre, squared_errors, worse
-from sysid.metrics import Prediction, score
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.metrics import Prediction, score
+from sysid.verdict.changes import by_manoeuvre, squared_errors, worse
 
 pytestmark = pytest.mark.quick
 T = np.linspace(0.0, 12.0, 121)

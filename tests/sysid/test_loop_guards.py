@@ -5,15 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, Start, Trial
-from sysid.loop import falsifiers
-from sysid.loop.agreement import SCATTER, heterogeneity, interval_of_sum
-from sysid.loop.catalogue import Axis, Hypothesis, hypotheses
-from sysid.loop.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, course_of, side, sizes_in_parts
-from sysid.loop.found import Candidate, Search, Thresholds
-from sysid.loop.guards import Stood, guarded
-from sysid.loop.refit import Refit
-from whill_mjx.presets import preset
+from sysid.logs.log import Command, OdometryStream, Start, Trial
+from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
+from sysid.missing.refit import Refit
+from sysid.verdict import falsifiers
+from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
+from sysid.verdict.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, course_of, side, sizes_in_parts
+from sysid.verdict.found import Candidate, Search, Thresholds
+from sysid.verdict.guards import Stood, guarded
+from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
 TWO = Falsifier("has one size", "speed")

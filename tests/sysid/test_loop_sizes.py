@@ -6,16 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.loop.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
-from sysid.loop.evidence import column_layout
-from sysid.loop.poses import by_own_noise
-from sysid.loop.refit import Refit, Refitter
-from sysid.loop.rounds import elsewhere
-from sysid.loop.trust import at_the_end, intervals, undone
-from sysid.loop.wander import no_wander
-from sysid.metrics import replicate_noise
-from sysid.rollout import Measured
-from whill_mjx.presets import preset
+from sysid.logs.metrics import replicate_noise
+from sysid.missing.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
+from sysid.missing.evidence import column_layout
+from sysid.missing.pose_fit import by_own_noise
+from sysid.missing.refit import Refit, Refitter
+from sysid.missing.wander import no_wander
+from sysid.replay.rollout import Measured
+from sysid.verdict.rounds import elsewhere
+from sysid.verdict.trust import at_the_end, intervals, undone
+from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
 ONE = Hypothesis("slope", (Axis("slope.along_x", 0.01, signed=True, limit=50.0),))

@@ -6,11 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
-from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
-from sysid.loop.drives import make_drives
-from sysid.loop.features import BIN
-from sysid.loop.next_manoeuvre import (
+from sysid.errors.features import BIN
+from sysid.errors.noise import Whitener
+from sysid.errors.space import make_space
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
+from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
+from sysid.missing.drives import make_drives
+from sysid.missing.next_manoeuvre import (
     FILE,
     LEAST,
     absorbed,
@@ -21,12 +23,10 @@ from sysid.loop.next_manoeuvre import (
     sentence,
     write_next_command,
 )
-from sysid.loop.noise import Whitener
-from sysid.loop.refit import Refit
-from sysid.rollout import vehicle_plant
-from sysid.space import make_space
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset
+from sysid.missing.refit import Refit
+from sysid.replay.rollout import vehicle_plant
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset
 
 quick = pytest.mark.quick
 EFFECTS = ("slope", "side_force", "command_scale", "odometry_scale")

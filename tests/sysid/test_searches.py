@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from cart import cart
 
-from sysid import gradient, searches
+from sysid import searches
 from sysid.fit import FitConfig, make_problem
+from sysid.search import least_squares
+from sysid.search.studies import BATCH
 from sysid.searches import Arguments, Judge, Recorder, Trace, arrivals, trace
-from sysid.studies import BATCH
 
 LAG = "(0.1, 0.02, 1.0)"
 MODEL = cart("tau_v", "tau_omega", f'{{"tau_v": {LAG}, "tau_omega": {LAG}, "turn": (1.0, 0.5, 1.5)}}')
@@ -72,8 +73,8 @@ def test_a_derivative_counts_its_directions_and_recording_takes_no_time(problem)
 
 
 def test_a_recorded_search_is_the_search_itself(problem, compared):
-    points = gradient.random_starts(problem.space, 2, 0)
-    alone = gradient.fit(problem.objective, problem.space, starts=points, iterations=14)
+    points = least_squares.random_starts(problem.space, 2, 0)
+    alone = least_squares.fit(problem.objective, problem.space, starts=points, iterations=14)
     lm = next(one for one in compared if one.method == "lm")
     assert lm.cost[-1] == pytest.approx(alone.cost, rel=1e-3)
 

@@ -1,0 +1,65 @@
+"""What a named effect must stand: manoeuvres that were held back, agreement of those that excite it, its falsifiers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Trial
+from sysid.missing.refit import Refitter
+from sysid.verdict.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
+from sysid.verdict.falsifiers import Tested, in_words, put_to_test
+from sysid.verdict.found import Search, Thresholds
+
+
+@dataclass(frozen=True)
+class Stood:
+    """What speaks for one effect of a joint fit, and against it."""
+
+    effect: str
+    sizes: np.ndarray  # (G,) that each manoeuvre by itself asks for, as a factor on the joint fit
+    errors: np.ndarray  # (G,) their standard errors
+    agreement: Heterogeneity
+    foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
+    interval: tuple[float, float]
+    """95 % of the sum of it, manoeuvres drawn anew."""
+    falsifiers: tuple[Tested, ...]
+
+    def against(self, thresholds: Thresholds) -> list[str]:
+        """What contradicts the effect, in words."""
+        out = [in_words(one) for one in self.falsifiers if one.outcome == "falsified"]
+        seen = int(self.agreement.asked.sum())
+        if self.agreement.outcome == "differ" and self.agreement.least > thresholds.scatter:
+            out.append(f"the {seen} manoeuvres that excite {self.effect} differ on its size by "
+                       f"{self.agreement.scatter:.0%} of it (at least {self.agreement.least:.0%})")
+        if seen > 1 and self.interval[1] <= 0:
+            out.append(f"{self.effect} is wrong about manoeuvres that were held back")
+        return out
+
+
+def stand(
+    found: Search, refitter: Refitter, trials: Sequence[Trial], groups: Sequence[Sequence[int]], track: float,
+    p_excess: Callable[[float], float],
+) -> list[Stood]:
+    """The evidence for each effect of the final fit, in its order."""
+    fit, out = found.final, []
+    tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
+    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
+        sizes, errors = sizes_apart(fit, part, groups, refitter.precision)
+        told = foretold(fit, part, groups, refitter.precision)
+        out.append(Stood(one.effect, sizes, errors, heterogeneity(sizes, errors), told, interval_of_sum(told),
+                         tuple(tested[number])))
+    return out
+
+
+def guarded(found: Search, stood: Sequence[Stood], thresholds: Thresholds) -> Search:
+    """The search without a name where one of its effects is contradicted."""
+    named = {one.hypothesis.effect for one in found.accepted}
+    against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
+    if against:
+        found.verdict = "unexplained"
+        found.reason = (f"{' and '.join(sorted(named))} would explain {found.share:.0%} of what exceeds the noise, but "
+                        f"{'; '.join(against)}")
+    return found
