@@ -40,9 +40,10 @@ from benchmarks.fit_jobs import (
 from benchmarks.fit_measured import drive, mrclam
 from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, show_parameters
 from benchmarks.harness import device_name, figure, record
-from sysid.fit import Fit, FitConfig, fit_log, fitted_plant, make_objective, make_problem
 from sysid.logs.log import Log, load_log
-from sysid.searches import Judge
+from sysid.search.comparison import Judge
+from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, make_problem
+from sysid.search.settings import FitConfig
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
 from sysid.close_loop import LoopConfig, Result, close_loop, refit_poses
-from sysid.logs.log import Log, Trial
+from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
-from sysid.logs.metrics import Prediction, ideal_replay, score
+from sysid.logs.metrics import ideal_replay, score
 from sysid.missing.late_pose import NAME, PARAMETER
 from sysid.missing.unnamed import find_unnamed, replay_unnamed
 from sysid.pages.loop_report import effects, replay

@@ -200,7 +200,7 @@ def look_alikes(settings: Benchmark) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write whole or not at all."""
-    from sysid.report import write_report
+    from sysid.pages.report import write_report
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write_report(path, content)

@@ -14,7 +14,7 @@ from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_plant import RECORDED, power_sizes
 from benchmarks.undeclared_reference import USUAL, Driven
 from sysid.intervals.statistics import upper_rate
-from sysid.report import write_report
+from sysid.pages.report import write_report
 from sysid.verdict.calibrated import FILE, calibrated
 
 LEAST = 30

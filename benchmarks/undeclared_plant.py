@@ -29,7 +29,7 @@ from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
 from sysid.logs.log import load_log
 from sysid.pages.loop_report import effects as named_effects
 from sysid.pages.loop_report import make_report, write_run
-from sysid.report import write_report
+from sysid.pages.report import write_report
 from sysid.verdict.trust import warnings
 
 RECORDED = RESULTS / "undeclared.json"

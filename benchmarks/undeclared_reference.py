@@ -18,8 +18,8 @@ from benchmarks.plant.make import make_log
 from sysid.close_loop import LoopConfig, Prepared, prepare
 from sysid.logs.log import Log, load_log
 from sysid.missing.reference import Reference, make_reference
+from sysid.pages.report import code_hashes
 from sysid.replay.rollout import vehicle_plant
-from sysid.report import code_hashes
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 

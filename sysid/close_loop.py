@@ -40,7 +40,8 @@ from sysid.missing.refit import Refitter
 from sysid.missing.unexplained import best_gain
 from sysid.missing.wander import Wander, estimate
 from sysid.replay.models import measured_effects, with_effects
-from sysid.replay.rollout import PathReplay, Plant, vehicle_plant
+from sysid.replay.records import Plant
+from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
 from sysid.verdict.alone import judged, stands_alone
 from sysid.verdict.falsifiers import FALSIFIERS

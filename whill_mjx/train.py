@@ -227,7 +227,9 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         return target
     import sysid
     from sysid.command_line import progress_bar
-    from sysid.fit import FitConfig, expected_steps, fit_dataset
+    from sysid.fit import fit_dataset
+    from sysid.search.fitting import expected_steps
+    from sysid.search.settings import FitConfig
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")

@@ -19,6 +19,8 @@ import numpy as np
 
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
+ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
+
 SCHEMA = 1
 STANDSTILL = 1.0
 """Longest part of a trial's start that is used to find its start pose [s]."""
@@ -379,3 +381,16 @@ def _standard_errors(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[flo
         return 0.0, 0.0
     position = np.sqrt((x.var(ddof=1) + y.var(ddof=1)) / 2 / len(x))
     return float(position), float(np.sqrt(yaw.var(ddof=1) / len(x)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A simulated trial at the times of the measurements."""
+
+    ground_truth: PoseStream | None
+    odometry: OdometryStream | None
+
+
+def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
+    """Index of the command that holds at times t (T,); -1 before the first."""
+    return np.searchsorted(command.t, t + 1e-9, side="right") - 1

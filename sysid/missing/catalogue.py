@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.missing.drives import ROUND
+from sysid.logs.log import ROUND
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, place_of
 from whill_mjx.vehicle.parameters import describe, get_values

@@ -16,7 +16,7 @@ from sysid.logs.metrics import replicate_noise
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.reference import difference_sizes
-from sysid.replay.rollout import Measured, Simulated
+from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 
 

@@ -23,7 +23,7 @@ from sysid.errors.space import Space, make_space
 from sysid.logs.log import Log, Trial
 from sysid.missing.base_fit import fit_base
 from sysid.missing.drives import Drives, make_drives
-from sysid.replay.rollout import Plant
+from sysid.replay.records import Plant
 from sysid.search.result import Progress
 from whill_mjx.vehicle.parameters import set_values
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.errors.features import CHANNELS
-from sysid.logs.log import Trial
-from sysid.logs.metrics import command_in_force
+from sysid.logs.log import Trial, command_in_force
 
 if TYPE_CHECKING:
     from sysid.close_loop import Result

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import Prediction
+from sysid.logs.log import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.tables import Products, Table, few_terms, from_first_wave, held_back, multiplied, penalties, turned
 from sysid.missing.terms import Term, columns_of, in_words
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
-from sysid.replay.rollout import Plant, Replay, make_batch, predictions
+from sysid.replay.records import Plant
+from sysid.replay.rollout import Replay, make_batch, predictions
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.vehicle.parameters import describe, get_values, set_values

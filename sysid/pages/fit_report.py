@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
 from sysid.logs.log import Log
+from sysid.pages.report import KIND, SCHEMA, code_hashes, summaries
 from sysid.replay.models import describe_parameters, get_parameters
-from sysid.report import KIND, SCHEMA, code_hashes, summaries
 from sysid.search import starts
 
 if TYPE_CHECKING:
-    from sysid.fit import Fit, FitConfig
+    from sysid.search.fitting import Fit
+    from sysid.search.settings import FitConfig
 
 
 def make_report(

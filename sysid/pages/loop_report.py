@@ -46,16 +46,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import METRICS, Prediction, own_floor
+from sysid.logs.log import Prediction, Trial
+from sysid.logs.metrics import METRICS, own_floor
 from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.evidence import Evidence, at_fit
 from sysid.missing.next_manoeuvre import next_manoeuvre, sentence, write_next_command
 from sysid.missing.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
 from sysid.missing.ridge import Solver
 from sysid.missing.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
+from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
-from sysid.report import code_hashes, error_rows
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.calibrated import calibrated
 from sysid.verdict.changes import by_manoeuvre, worse
@@ -338,7 +338,7 @@ def summary(report: dict[str, Any]) -> str:
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
     from sysid.pages.loop_page import write_page
-    from sysid.report import write_report
+    from sysid.pages.report import write_report
     from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     out = Path(out)

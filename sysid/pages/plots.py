@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Trial
-from sysid.logs.metrics import Prediction, ideal_replay
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.metrics import ideal_replay
 from sysid.pages.series import TrialSeries
 
 if TYPE_CHECKING:
-    from sysid.searches import Trace
+    from sysid.search.result import Trace
 
 MAX_PANELS = 12
 

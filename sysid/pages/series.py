@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Trial
-from sysid.logs.metrics import CHANNELS, Prediction, ideal_replay
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.metrics import CHANNELS, ideal_replay
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")
 FILE = "series.npz"

@@ -11,24 +11,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from sysid.errors.space import Space
-from sysid.replay.courses import CourseReplay
-from sysid.replay.rollout import Simulated
+from sysid.errors.space import STEP, Space
+from sysid.replay.records import Simulated
 
-STEP = 0.01
-"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+
+class TracedReplay(Protocol):
+    """A replay that can be traced too: `sysid.replay.courses.CourseReplay`."""
+
+    @property
+    def drives(self) -> int: ...
+
+    @property
+    def states(self) -> int: ...
+
+    @property
+    def in_pieces(self) -> TracedReplay: ...
+
+    def simulate(self, values: np.ndarray) -> Simulated: ...
+
+    def traced(self, values: jax.Array) -> Simulated: ...
 
 
 @dataclass(frozen=True)
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: CourseReplay
+    replay: TracedReplay
     space: Space
     step: float = STEP
 

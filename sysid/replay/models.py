@@ -25,7 +25,7 @@ from sysid.errors.space import LOG_SPAN, Space
 from sysid.logs.log import Trial
 from sysid.replay.courses import CourseReplay, make_courses
 from sysid.replay.differences import DifferenceReplay
-from sysid.replay.rollout import Measured, Plant
+from sysid.replay.records import Measured, Plant
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, apply_chain, place_of
 from whill_mjx.vehicle.parameters import describe, get_values, set_values

@@ -19,7 +19,7 @@ from sysid.search import least_squares, slopes
 from sysid.search.result import FitResult, Progress
 
 if TYPE_CHECKING:
-    from sysid.fit import FitConfig
+    from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from

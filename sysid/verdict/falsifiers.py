@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import command_in_force
+from sysid.logs.log import Trial, command_in_force
 from sysid.missing.refit import Refit, Refitter, moved_last, without_each
 from sysid.verdict.agreement import beside
 

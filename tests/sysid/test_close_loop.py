@@ -34,7 +34,8 @@ from sysid.missing.tables import Table
 from sysid.missing.unnamed import vehicle_of, with_start_angles
 from sysid.pages.loop_report import effects, make_report, replay, write_run
 from sysid.replay.models import with_effects
-from sysid.replay.rollout import Measured, vehicle_plant
+from sysid.replay.records import Measured
+from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.falsifiers import Falsifier, course_of, put_to_test
 from sysid.verdict.null_refits import NullRefits, checked
 from sysid.verdict.null_refits import run as run_null_refits

@@ -8,26 +8,25 @@ import pytest
 from conftest import UNICYCLE_SPACE, unicycle_plant
 
 import sysid.design as design_module
-from sysid.design import (
+from sysid.design import DesignConfig, main
+from sysid.errors.space import Space
+from sysid.intervals.design import (
     INFLATION,
-    DesignConfig,
     best_splitting_manoeuvre,
     candidate_objective,
     identifiable_subspace,
     information,
-    main,
     prior_information,
     propose,
     rank,
     separation,
     splitting_scores,
 )
-from sysid.errors.space import Space
 from sysid.intervals.uncertainty import PRIOR_SD
 from sysid.logs.log import Command, read_csv
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, make_command, placement
 from sysid.logs.metrics import ideal_replay
-from sysid.replay.rollout import Plant
+from sysid.replay.records import Plant
 from whill_mjx.vehicle.parameters import get_values
 from whill_mjx.vehicle.specs import WHILL_CR
 

@@ -125,7 +125,7 @@ class Cart:
 
 
 def test_a_replay_shows_the_pose_late_and_the_odometry_in_time():
-    from sysid.replay.rollout import Plant
+    from sysid.replay.records import Plant
 
     def observe(state):
         return jnp.concatenate([state, jnp.zeros(2), state[:1], state[:1], jnp.zeros(3)])[:9]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.logs.metrics import Prediction, score
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
+from sysid.logs.metrics import score
 from sysid.verdict.changes import by_manoeuvre, squared_errors, worse
 
 pytestmark = pytest.mark.quick

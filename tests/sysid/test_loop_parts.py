@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sysid.errors.noise import fit_roughness, fit_whitener
+from sysid.logs.log import ROUND
 from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.missing.drives import DRAIN, ROUND, SESSION, Drives
+from sysid.missing.drives import DRAIN, SESSION, Drives
 from sysid.missing.evidence import Columns, signature_columns
 from sysid.missing.refit import Refit, Refitter
 from sysid.missing.wander import Wander, _pooled

@@ -12,7 +12,7 @@ from sysid.missing.evidence import column_layout
 from sysid.missing.pose_fit import by_own_noise
 from sysid.missing.refit import Refit, Refitter
 from sysid.missing.wander import no_wander
-from sysid.replay.rollout import Measured
+from sysid.replay.records import Measured
 from sysid.verdict.rounds import elsewhere
 from sysid.verdict.trust import at_the_end, intervals, undone
 from whill_mjx.vehicle.presets import preset
