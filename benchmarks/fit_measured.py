@@ -16,7 +16,7 @@ from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 
 if TYPE_CHECKING:
-    from benchmarks.fit import Benchmark
+    from benchmarks.fit_settings import Benchmark
 
 CLAIM = "A fitted vehicle predicts real robots better than an ideal one"
 DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}

@@ -27,10 +27,11 @@ from benchmarks import undeclared_figures
 from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
 from benchmarks.undeclared_reference import Driven, prepared, reference_days, reference_of
-from sysid.close_loop import LoopConfig, Prepared, close_loop, prepare
 from sysid.logs.log import load_log
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.pipeline import close_loop, prepare
+from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 
 REFERENCES = ("plain", "plain_2", "plain_3", "plain_4", "plain_5", "plain_6")
@@ -176,7 +177,7 @@ def look_alikes(settings: Benchmark) -> None:
     """Classes of effects on the nine manoeuvres, with and without an outside pose."""
     from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
     from sysid.missing.drives import make_drives
-    from sysid.missing.evidence import gather
+    from sysid.missing.signatures import gather
     from sysid.verdict.classes import classes, imitation
 
     days = reference_days(settings.work / "plant")

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.plant.make import make_log
-from sysid.close_loop import LoopConfig, Prepared, prepare
 from sysid.logs.log import Log, load_log
-from sysid.missing.reference import Reference, make_reference
+from sysid.missing.days import Reference
+from sysid.missing.reference import make_reference
 from sysid.pages.report import code_hashes
 from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.pipeline import prepare
+from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 

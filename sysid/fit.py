@@ -129,12 +129,15 @@ def main(arguments: Arguments) -> None:
     fitted = "vehicle.toml" if not settings.model else "model.toml"
     print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
     if arguments.close_loop:
-        from sysid.close_loop import LoopConfig, run
+        from sysid.pages.loop_report import write_result
+        from sysid.verdict.pipeline import watched
+        from sysid.verdict.result import LoopConfig
 
         references = [load_any(path) for path in arguments.reference]
         if settings.preset != "physical":
             print("the loop starts from the physical base model")
-        run(log, references, arguments.out / "close_loop", LoopConfig(quick=settings.quick, seed=settings.seed))
+        config = LoopConfig(quick=settings.quick, seed=settings.seed)
+        write_result(arguments.out / "close_loop", watched(log, references, config))
 
 
 def cli() -> None:

@@ -28,13 +28,8 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sysid.pages.report import write_html
-
-if TYPE_CHECKING:
-    pass
-
 
 
 def cli() -> None:

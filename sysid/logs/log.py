@@ -19,8 +19,6 @@ import numpy as np
 
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
-ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
-
 SCHEMA = 1
 STANDSTILL = 1.0
 """Longest part of a trial's start that is used to find its start pose [s]."""

@@ -12,7 +12,8 @@ import numpy as np
 
 from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import roughness
-from sysid.logs.log import ROUND, Trial
+from sysid.logs.log import Trial
+from sysid.missing.catalogue import ROUND
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, make_batch

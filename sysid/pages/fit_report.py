@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
@@ -11,10 +11,8 @@ from sysid.logs.log import Log
 from sysid.pages.report import KIND, SCHEMA, code_hashes, summaries
 from sysid.replay.models import describe_parameters, get_parameters
 from sysid.search import starts
-
-if TYPE_CHECKING:
-    from sysid.search.fitting import Fit
-    from sysid.search.settings import FitConfig
+from sysid.search.fitting import Fit
+from sysid.search.settings import FitConfig
 
 
 def make_report(

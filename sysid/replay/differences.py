@@ -16,8 +16,12 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from sysid.errors.pose_objective import Replays
 from sysid.errors.space import STEP, Space
-from sysid.replay.records import Simulated
+from sysid.logs.log import Trial
+from sysid.replay.courses import CourseReplay, make_courses
+from sysid.replay.models import Parameters, set_parameters
+from sysid.replay.records import Measured, Plant, Simulated
 
 
 class TracedReplay(Protocol):
@@ -93,3 +97,18 @@ class DifferenceReplay:
 
         at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
         return at, jax.tree.map(slope, found)
+
+
+def make_replay(
+    plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...]
+) -> tuple[Replays, Measured]:
+    """Replay of trials with the space's parameters, the others as in `params`, and what was measured."""
+    def put(values: jax.Array) -> Any:
+        return set_parameters(params, space.names, values)
+
+    if not isinstance(params, Parameters):
+        courses, measured = make_courses(plant, trials, put, params)
+    else:
+        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
+        measured = courses.measured
+    return DifferenceReplay(courses, space), measured

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.errors.pose_objective import Objective, Replays
 from sysid.logs.log import Log
 from sysid.logs.metrics import score
-from sysid.replay.models import make_replay
+from sysid.replay.differences import make_replay
 from sysid.replay.records import Simulated
 from sysid.replay.rollout import predictions
 from sysid.search import least_squares, starts, tpe

@@ -19,16 +19,9 @@ from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
 from sysid.logs.log import Log, Prediction, Trial
-from sysid.replay.models import (
-    Model,
-    get_parameters,
-    load_model,
-    make_replay,
-    measured_effects,
-    model_space,
-    set_parameters,
-    with_effects,
-)
+from sysid.replay.differences import make_replay
+from sysid.replay.model_files import load_model
+from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.search import least_squares, slopes, starts, tpe

@@ -7,39 +7,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.close_loop import (
-    Arguments,
-    LoopConfig,
-    close_loop,
-    drives_of,
-    expected_steps,
-    main,
-    manifest,
-    refit_poses,
-    vehicle_after,
-    vehicle_before,
-)
+from sysid.close_loop import Arguments, main
 from sysid.errors.features import CHANNELS, make_features
 from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
+from sysid.follow_up.tables import Table
+from sysid.follow_up.trust import beside_still_base, warnings
+from sysid.follow_up.unnamed import vehicle_of, with_start_angles
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
 from sysid.logs.synthetic import write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
-from sysid.missing.next_manoeuvre import refitter_of
 from sysid.missing.refit import without_each
-from sysid.missing.tables import Table
-from sysid.missing.unnamed import vehicle_of, with_start_angles
-from sysid.pages.loop_report import effects, make_report, replay, write_run
+from sysid.pages.loop_report import effects, make_report, manifest, replay, write_run
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
 from sysid.replay.rollout import vehicle_plant
-from sysid.verdict.falsifiers import Falsifier, course_of, put_to_test
-from sysid.verdict.null_refits import NullRefits, checked
+from sysid.verdict.falsification import course_of, put_to_test
+from sysid.verdict.falsifiers import Falsifier
+from sysid.verdict.found import NullRefits
+from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.trust import beside_still_base, warnings
+from sysid.verdict.pipeline import close_loop, expected_steps
+from sysid.verdict.result import LoopConfig
+from sysid.verdict.vehicles import drives_of, refit_poses, refitter_of, vehicle_after, vehicle_before
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS
 from whill_mjx.logs.manoeuvres import Scenario
@@ -113,9 +106,10 @@ def test_a_fit_may_close_the_loop_with_the_same_references(folder, tmp_path, mon
     monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {"prior": None, "dataset": {"notes": []}})
     monkeypatch.setattr("sysid.fit.parameter_table", lambda _: "")
     monkeypatch.setattr("sysid.fit.table", lambda _: "")
-    monkeypatch.setattr("sysid.close_loop.run", lambda *given: asked.append(given))
+    monkeypatch.setattr("sysid.verdict.pipeline.watched", lambda *given: given)
+    monkeypatch.setattr("sysid.pages.loop_report.write_result", lambda *given: asked.append(given))
     fit_main(FitArguments(dataset=folder / "sloping", out=tmp_path, close_loop=True, reference=(folder / "plain",)))
-    [(log, references, out, config)] = asked
+    [(out, (log, references, config))] = asked
     assert (log.name, [one.name for one in references], out) == ("sloping", ["plain"], tmp_path / "close_loop")
     assert config.seed == 0
 
@@ -284,7 +278,7 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
 
 def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr("sysid.close_loop.close_loop", lambda *given: asked.append(given) or sloping)
+    monkeypatch.setattr("sysid.verdict.pipeline.close_loop", lambda *given: asked.append(given) or sloping)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
     [(log, references, config, vehicle, _)] = asked
     assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)

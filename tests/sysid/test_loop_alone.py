@@ -12,8 +12,8 @@ import pytest
 from sysid.errors.features import BIN, bin_width, make_features
 from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
-from sysid.missing.evidence import manoeuvre_groups
-from sysid.missing.refit import Refit
+from sysid.missing.joint_fit import Refit
+from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict.alone import UNTOLD, judged, simplest, stands_alone
 from sysid.verdict.found import Candidate, Thresholds

@@ -22,7 +22,8 @@ from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.mjcf_file import load_robot, resolve, write_mjcf
-from sysid.replay.models import function_model, load_model, make_parameters, model_space, set_parameters
+from sysid.replay.model_files import load_model
+from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import command_table

@@ -11,7 +11,7 @@ from cart import cart
 
 from sysid import searches
 from sysid.search import least_squares
-from sysid.search.comparison import Judge, Recorder, arrivals, trace
+from sysid.search.comparison import METHODS, Judge, Recorder, arrivals, trace
 from sysid.search.fitting import make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
