@@ -27,7 +27,7 @@ import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
 from benchmarks.physics_rolls import BASE, compiled_roll
-from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.effects import EFFECTS
 from whill_mjx.logs.manoeuvres import command_table
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import drive, place
@@ -35,7 +35,7 @@ from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset
-from whill_mjx.vehicle.types import VehicleState, parameters_of
+from whill_mjx.vehicle.types import VehicleState
 
 CLAIM = "batched vehicle physics: free chassis, parameters different everywhere"
 DRIVES = ("pid_drive", "forward_slip", "rolling_contact", "unnamed")  # of the other base model, or not one effect
@@ -43,13 +43,6 @@ DT = VehicleConfig().physics_dt
 SLIPPERY = 0.1
 """Friction of a floor on which the chair's wheels break away whenever it starts or stops."""
 PARTS = ("timestep", "kernels", "speed", "roofline", "effects", "peers_step", "peers")
-
-
-def usual(name: str) -> Any:
-    """An effect three quarters up its usual values: not neutral."""
-    values = {field: about.high for field, about in parameters_of(EFFECTS[name]).items() if about.neutral == np.inf}
-    values |= {field: low + 0.75 * (high - low) for field, (low, high) in EFFECTS[name].typical.items()}
-    return make_effect(name, **values)
 
 
 def measure(

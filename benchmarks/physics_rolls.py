@@ -6,14 +6,15 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import numpy as np
 
-from benchmarks.physics import usual
+from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.model import VehicleModel, build_model
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.vehicle.types import VehicleParams, VehicleState
+from whill_mjx.vehicle.types import VehicleParams, VehicleState, parameters_of
 
 BASE = "whill_cr_physical"
 LOADED = ("acceleration_limit", "actuator_lag", "dry_friction", "slope", "odometry_scale")
@@ -61,3 +62,10 @@ def compiled_roll(vehicle: str, count: int, periods: int, dynamics: str) -> tupl
 
     arguments = params, states, commands
     return model, roll.lower(*arguments).compile(), arguments
+
+
+def usual(name: str) -> Any:
+    """An effect three quarters up its usual values: not neutral."""
+    values = {field: about.high for field, about in parameters_of(EFFECTS[name]).items() if about.neutral == np.inf}
+    values |= {field: low + 0.75 * (high - low) for field, (low, high) in EFFECTS[name].typical.items()}
+    return make_effect(name, **values)
