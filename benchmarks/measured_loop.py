@@ -33,7 +33,7 @@ from sysid.logs.metrics import ideal_replay, score
 from sysid.pages.loop_report import effects, replay
 from sysid.replay.models import with_effects
 from sysid.verdict.late_pose import NAME, PARAMETER
-from sysid.verdict.pipeline import close_loop
+from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, refit_poses
 from whill_mjx.vehicle.parameters import set_values
@@ -122,7 +122,7 @@ def one_loop(
     done = kept(settings, name)
     if done is not None:
         return done
-    result = close_loop(log, config=config, progress=lambda _, text: print(f"  {name}: {text}", flush=True), **given)
+    result = find_missing(log, config=config, progress=lambda _, text: print(f"  {name}: {text}", flush=True), **given)
     found = verdict_of(result)
     if not scored:
         return keep(settings, name, found)

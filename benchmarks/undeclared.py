@@ -30,7 +30,7 @@ from benchmarks.undeclared_reference import Driven, prepared, reference_days, re
 from sysid.logs.log import load_log
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.rollout import vehicle_plant
-from sysid.verdict.pipeline import close_loop, prepare
+from sysid.verdict.pipeline import find_missing, prepare
 from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 
@@ -126,7 +126,7 @@ def shared(settings: Benchmark) -> None:
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
-        result = replace(close_loop(log, (), config, reference=ready), references=tuple(references))
+        result = replace(find_missing(log, (), config, reference=ready), references=tuple(references))
         report = make_report(result)
         write_run(settings.work / "shared" / name, result, report)
         content["sets"][name] = {

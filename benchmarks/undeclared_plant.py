@@ -30,7 +30,7 @@ from sysid.logs.log import load_log
 from sysid.pages.loop_report import effects as named_effects
 from sysid.pages.loop_report import make_report, write_run
 from sysid.pages.report import write_report
-from sysid.verdict.pipeline import close_loop
+from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Prepared, Result
 
 RECORDED = RESULTS / "undeclared.json"
@@ -257,7 +257,7 @@ def judge(
         make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise, vehicle=driven.vehicle)
     began = time.perf_counter()
     config = replace(config, without=job.without)
-    result = close_loop(load_log(folder), (), config, reference=ready)
+    result = find_missing(load_log(folder), (), config, reference=ready)
     content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, **brief(result),
                "seconds": time.perf_counter() - began}
     if full and result.search.verdict == "named":

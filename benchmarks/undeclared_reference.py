@@ -88,7 +88,7 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 
 
 def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Prepared:
-    """A set ready for `close_loop`; its days are driven, and fitted, where that was not done before."""
+    """A set ready for `find_missing`; its days are driven, and fitted, where that was not done before."""
     days = reference_days(work, driven, number)
     path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
     if path.exists():

@@ -226,8 +226,8 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
+    from sysid import fit_dataset
     from sysid.command_line import progress_bar
-    from sysid.fit import fit_dataset
     from sysid.search.fitting import expected_steps
     from sysid.search.settings import FitConfig
 

@@ -111,15 +111,12 @@ def code_hashes() -> dict[str, str]:
     """SHA-256 over names and contents of the packages' sources, and the versions of what they run on."""
     from importlib.metadata import PackageNotFoundError, version
 
-    import sysid
-    import whill_mjx
-
     found = {}
-    for package in (whill_mjx, sysid):
-        root, digest = Path(str(package.__file__)).parent, hashlib.sha256()
+    for package in ("whill_mjx", "sysid"):
+        root, digest = Path(__file__).parents[2] / package, hashlib.sha256()
         for path in sorted(root.rglob("*.py")):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-        found[f"{package.__name__} sources SHA-256"] = digest.hexdigest()
+        found[f"{package} sources SHA-256"] = digest.hexdigest()
     for name in ("jax", "mujoco-mjx", "numpy", "optuna"):
         try:
             found[name] = version(name)

@@ -37,7 +37,7 @@ from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 
 
-def close_loop(
+def find_missing(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
     progress: Progress | None = None, reference: Reference | Prepared | None = None, start: Any = None,
 ) -> Result:
@@ -102,11 +102,11 @@ def close_loop(
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
-    """`close_loop` with a progress bar."""
+    """`find_missing` with a progress bar."""
     progress, close = command_line.progress_bar(
         expected_steps(config, len(references), vehicle is not None), "close the loop", "step")
     try:
-        return close_loop(log, references, config, vehicle, progress)
+        return find_missing(log, references, config, vehicle, progress)
     finally:
         close()
 
@@ -114,7 +114,7 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
 def prepare(
     reference: Reference, spec: VehicleSpec, config: LoopConfig | None = None, progress: Progress | None = None
 ) -> Prepared:
-    """A vehicle with the catalogue, ready for `close_loop` on one log after the other."""
+    """A vehicle with the catalogue, ready for `find_missing` on one log after the other."""
     config = config or LoopConfig()
     plant = _plant(spec, config)
     found = hypotheses(spec, reference.params)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import sysid.fit as fit_module
-from sysid.fit import fit_dataset
 from sysid.logs.log import load_log
 from sysid.logs.scenarios import Scenario
 from sysid.logs.synthetic import SensorNoise, write_dataset
+from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant
 from sysid.search.fitting import fit_log
