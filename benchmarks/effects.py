@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.dataset import write_text
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of
-from whill_mjx.kinematics import body_twist
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.types import VehicleParams, parameters_of
-from whill_mjx.vehicle import place, substep
+from whill_mjx.logs.dataset import write_text
+from whill_mjx.vehicle.dynamics import place, substep
+from whill_mjx.vehicle.kinematics import body_twist
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import VehicleParams, parameters_of
 
 DOCS = Path(__file__).parent.parent / "docs"
 INTRODUCTION = """# Effects

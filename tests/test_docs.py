@@ -120,6 +120,13 @@ def test_names_that_a_page_imports_exist(page):
                 f"{page.name}: from {module} import {name.strip()}")
 
 
+@pytest.mark.parametrize("package", ["whill_mjx", "sysid", "dreamer"])
+def test_every_public_name_is_on_the_page_of_public_names(package):
+    text = (ROOT / "docs" / "api.md").read_text().partition(f"## `{package}`")[2].partition("\n## ")[0]
+    missing = [name for name in importlib.import_module(package).__all__ if f"`{name}`" not in text]
+    assert not missing, f"docs/api.md lacks {', '.join(missing)} of {package}."
+
+
 def test_every_page_of_docs_is_linked_from_readme():
     text = (ROOT / "README.md").read_text()
     missing = [page.name for page in sorted((ROOT / "docs").glob("*.md")) if f"docs/{page.name}" not in text]
