@@ -226,10 +226,9 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
-    from sysid import fit_dataset
+    from sysid import FitConfig, fit_dataset
     from sysid.command_line import progress_bar
     from sysid.search.fitting import expected_steps
-    from sysid.search.settings import FitConfig
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
