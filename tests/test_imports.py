@@ -1,8 +1,12 @@
-"""Imports point one way: sysid -> whill_mjx; dreamer and bridge stand alone; two doors and their parts look upwards."""
+"""Imports point one way: sysid -> whill_mjx; dreamer and bridge stand alone; two doors and their parts look upwards.
+
+All of them may import `bridge.policy`, the one reader of policy files.
+"""
 
 from __future__ import annotations
 
 import ast
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +19,9 @@ DOORS = {
     "bridge/simulate.py": {"whill_mjx"},  # the simulator behind the topics
 }
 PARTS = {f"whill_mjx/{name}.py": {"dreamer"} for name in ("training", "inside", "prediction")}  # of the first
+
+READER = "bridge.policy"
+"""The one reader of policy files, which all packages may import."""
 
 pytestmark = pytest.mark.quick
 
@@ -37,8 +44,20 @@ def test_imports_point_one_way(path):
     relative = path.relative_to(ROOT)
     own = relative.parts[0]
     allowed = {own} | ALLOWED[own] | (DOORS | PARTS).get(relative.as_posix(), set())
-    outside = {name.split(".")[0] for name in imported(path)} & {*PACKAGES, "benchmarks", "tests"}
+    names = {name for name in imported(path) if name != READER}
+    outside = {name.split(".")[0] for name in names} & {*PACKAGES, "benchmarks", "tests"}
     assert outside <= allowed
+
+
+def test_the_reader_of_policy_files_needs_only_numpy_and_onnxruntime():
+    own = sorted((ROOT / "bridge" / "policy").glob("*.py"))
+    names = {name for path in own for name in imported(path) if name != READER and not name.startswith(f"{READER}.")}
+    assert {name.split(".")[0] for name in names} - sys.stdlib_module_names == {"numpy", "onnxruntime"}
+
+
+def test_only_the_face_of_the_reader_is_imported_by_others():
+    outside = {name for path in modules() if path.parent.name != "policy" for name in imported(path)}
+    assert not [name for name in outside if name.startswith(f"{READER}.")]
 
 
 def test_nothing_imports_the_doors():

@@ -1,0 +1,129 @@
+"""Builds a network and runs one step of it in a process of its own, within limits of time and memory.
+
+A damaged network can loop for ever, ask for all memory or end the process that runs it, and no library call can be
+stopped from outside in every case. A process can. What passes here is then built again by the reader.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+import numpy as np
+
+from bridge.policy.contract import Tensor
+from bridge.policy.parts import EXPORT_AGAIN, MIB, PolicyFileError
+
+TRIAL_SECONDS = 0.5
+"""Processor time in which a small network must be built and make one step: five control periods at 10 Hz."""
+BUILD_RATE = 100e6
+"""Bytes of a network for which one more second is given; a slow computer reads 200 MB/s of them."""
+WALL_SECONDS = 60.0
+"""Longest time of the whole trial, for a computer so busy that the processor time does not pass."""
+ROOM = 256 * MIB
+"""Memory for a step of a small network [bytes], beyond that of the runtime itself."""
+NETWORK_COPIES = 4
+"""Copies of a network's parameters that building it makes at most."""
+ROOM_PER_PIXEL = 256
+"""Memory per byte of the observation: three activations of 64 float32 channels at full resolution take 256 times it."""
+PROGRAM = "from bridge.policy.trial import main; main()"
+
+
+class Trial:
+    """A process that waits for a network. It starts while the reader still checks hashes."""
+
+    def __init__(self) -> None:
+        path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
+        try:
+            self._folder = tempfile.TemporaryDirectory()  # empty: a network that names files beside itself finds none
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", PROGRAM], cwd=self._folder.name, env={**os.environ, "PYTHONPATH": path},
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        except OSError as error:
+            raise PolicyFileError(f"the trial step of a policy cannot be run: {error}. It needs a process of its own "
+                                  "and a folder for temporary files. Free memory, processes or disk space.") from error
+
+    def __enter__(self) -> "Trial":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+        self._folder.cleanup()
+
+    def run(self, name: str, network: bytes, inputs: list[Tensor], outputs: list[Tensor]) -> None:
+        """Build the network and run one step on zeros.
+
+        Args:
+            name: the file, for messages.
+            network: serialised ONNX model.
+            inputs: its inputs, all zero in this step.
+            outputs: the outputs to compute.
+
+        Raises:
+            PolicyFileError: the runtime refuses it, or it needs too much time or memory, or ends the process.
+        """
+        seconds = TRIAL_SECONDS + len(network) / BUILD_RATE
+        zeros = [(tensor.name, tensor.shape, tensor.dtype) for tensor in inputs]
+        observed = sum(int(np.prod(shape)) for _, shape, _ in zeros)
+        request = {"seconds": seconds, "memory": ROOM + NETWORK_COPIES * len(network) + ROOM_PER_PIXEL * observed,
+                   "inputs": zeros, "outputs": [tensor.name for tensor in outputs]}
+        try:
+            answer, errors = self._process.communicate(json.dumps(request).encode() + b"\n" + network, WALL_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            answer = errors = b""
+        code = self._process.poll()
+        if answer == b"ok":
+            return
+        if code is None or -code == getattr(signal, "SIGPROF", None):
+            raise PolicyFileError(f"{name}: a first step is not done after {seconds:.1f} s of processor time. A step "
+                                  f"must be much shorter than a control period. {EXPORT_AGAIN}.")
+        said = (answer or errors[-500:]).decode("utf-8", "replace").strip()
+        problem = said or f"the process of its trial step ended with code {code}"
+        raise PolicyFileError(f"{name}: onnxruntime refuses it: {problem}. It must hold standard operators that this "
+                              f"runtime knows, and a step must fit in {request['memory']} bytes. {EXPORT_AGAIN}, or "
+                              "install a newer onnxruntime.")
+
+
+def main() -> None:
+    """Answer one trial: the request as a line of JSON and the network come in, "ok" or the problem goes out."""
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(4)
+    request = json.loads(sys.stdin.buffer.readline())
+    network = sys.stdin.buffer.read()
+    _limit(request)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.enable_cpu_mem_arena = False  # it grows by powers of two, beyond what is needed
+    # Without optimisation nothing is computed while it is built, so the step shows all of the cost.
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    try:
+        session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
+        feed = {name: np.zeros(shape, dtype) for name, shape, dtype in request["inputs"]}
+        session.run(request["outputs"], feed)
+        answer = "ok"
+    except Exception as error:  # onnxruntime's own exception types all derive from Exception directly
+        answer = f"{type(error).__name__} of version {onnxruntime.__version__}: {str(error)[:500]}"
+    sys.stdout.write(answer)
+
+
+def _limit(request: dict[str, Any]) -> None:
+    """Let the system end this process where it takes more time than requested, and refuse it more memory."""
+    try:
+        import resource
+    except ImportError:
+        return  # not on Windows: there only the wall clock limits the trial
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_PROF, request["seconds"])
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        with open("/proc/self/statm") as statm:
+            used = int(statm.read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + request["memory"],) * 2)
+    except (OSError, ValueError):
+        pass  # no such limit on this system
