@@ -26,7 +26,7 @@ from whill_mjx.drivers import planner_driver, random_driver
 from whill_mjx.evaluation import Course, episode_keys
 from whill_mjx.final import evaluate_drivers, write_report
 from whill_mjx.inside import Evaluate, Stopper, keep_best, mean_figures, read_best, say
-from whill_mjx.policy_file import RUN_FILE
+from whill_mjx.policy_file import RUN_FILE, camera_contract
 from whill_mjx.ppo_run import train_ppo
 from whill_mjx.prediction import write_prediction
 from whill_mjx.rollouts import rollout
@@ -361,19 +361,17 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
     """Write a policy file."""
-    from whill_mjx.vehicle_file import load_vehicle
-
     task = preset.task
-    spec, _, _ = load_vehicle(vehicle)
+    course = make_course(preset, vehicle)
     contract = PolicyContract(
         action_low=(task.v_min, -task.omega_max),
         action_high=(task.v_max, task.omega_max),
         task=options.task,
         rate_hz=10.0,
         action_repeat=task.action_repeat,
-        camera=dataclasses.asdict(spec.camera),
+        camera=camera_contract(course.env.model, course.params),
     )
-    step, carry = policy_of(options, preset, result, make_course(preset, vehicle))
+    step, carry = policy_of(options, preset, result, course)
     try:
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
