@@ -59,12 +59,12 @@ def read_policy(path: str | Path, kinds: tuple[str, ...] = (KIND,)) -> CheckedPo
         hashes = parse_hashes(name, table)
         if isinstance(contract, Contract):
             _check_vehicle(parts, hashes, contract)
-        with Trial() as trial:  # starts while hashes are computed
-            kept = {part: parts.checked(part, want, keep=part in ("policy.onnx", "vehicle.toml"))
-                    for part, want in hashes.items() if part not in OPTIONAL or parts.has(part)}
-            if kept.get("weights.npz", ZIP_STARTS[0]) not in ZIP_STARTS:
-                raise PolicyFileError(f"{parts.name('weights.npz')}: is not a numpy archive (begins with "
-                                      f"{kept['weights.npz']!r}). It must hold plain arrays. {EXPORT_AGAIN}.")
+        kept = {part: parts.checked(part, want, keep=part in ("policy.onnx", "vehicle.toml"))
+                for part, want in hashes.items() if part not in OPTIONAL}
+        with Trial() as trial:  # its process starts while the large archive is read
+            _check_archive(parts, hashes)
+            import onnxruntime  # noqa: F401  (meanwhile: `make_session` needs it)
+
             trial.run(parts.name("policy.onnx"), kept["policy.onnx"], *contract.tensors())
     return CheckedPolicy(str(path), contract, hashes, kept["policy.onnx"], kept.get("vehicle.toml"))
 
@@ -150,6 +150,16 @@ class Policy:
         if not all(np.isfinite(value).all() for value in self._carry if value.dtype.kind == "f"):
             return np.full(2, np.nan)
         return self._low + self._span * (np.asarray(action, np.float64) + 1) / 2
+
+
+def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:
+    """Raise where the archive of the weights is there, and is another than the exported one or no archive at all."""
+    for part in OPTIONAL:
+        if part in hashes and parts.has(part):
+            start = parts.checked(part, hashes[part])
+            if start not in ZIP_STARTS:
+                raise PolicyFileError(f"{parts.name(part)}: is not a numpy archive (begins with {start!r}). It must hold "
+                                      f"plain arrays. {EXPORT_AGAIN}.")
 
 
 def _check_vehicle(parts: Parts, hashes: Mapping[str, str], contract: Contract) -> None:
