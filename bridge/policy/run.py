@@ -158,8 +158,8 @@ def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:
         if part in hashes and parts.has(part):
             start = parts.checked(part, hashes[part])
             if start not in ZIP_STARTS:
-                raise PolicyFileError(f"{parts.name(part)}: is not a numpy archive (begins with {start!r}). It must hold "
-                                      f"plain arrays. {EXPORT_AGAIN}.")
+                raise PolicyFileError(f"{parts.name(part)}: is not a numpy archive (begins with {start!r}). It must "
+                                      f"hold plain arrays. {EXPORT_AGAIN}.")
 
 
 def _check_vehicle(parts: Parts, hashes: Mapping[str, str], contract: Contract) -> None:
