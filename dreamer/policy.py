@@ -17,7 +17,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ from dreamer.types import Params
 
 KIND = "dreamer-policy"
 """A policy as its parameters, which JAX runs."""
+WIDTHS = ("deter", "hidden", "units", "stoch", "classes", "blocks", "depth", "kernel", "patch", "patch_units", "bins")
+"""Settings that are sizes of arrays, so at least 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,17 +180,22 @@ def _load_parameters(parts: Parts, name: str, table: dict[str, Any]) -> Policy:
 def _parse_config(fields: Fields) -> DreamerConfig:
     """Settings of an agent; those that a file of an earlier version lacks have their defaults."""
     known = {field.name: field.default for field in dataclasses.fields(DreamerConfig)}
+    types = get_type_hints(DreamerConfig)
     numbers: dict[str, Any] = {}
     for key in fields.table:
         if key not in known:
             raise PolicyFileError(f"{fields.name}: {key!r} is no setting of this version. The settings are those of "
                                   "dreamer.config.DreamerConfig. Use a newer version of this program, or remove it.")
-        default = known[key]
+        default, choices = known[key], get_args(types[key]) if get_origin(types[key]) is Literal else ()
         value = fields.rule(key, functools.partial(_is_like, default), f"must be of the kind of {default!r}")
+        if choices and value not in choices:
+            fields.rule(key, lambda value: False, f"must be one of {list(choices)}")
+        if key in WIDTHS or key == "mults":
+            fields.rule(key, lambda value: min(np.ravel(value), default=0) >= 1, "must be at least 1")
         numbers[key] = tuple(value) if isinstance(value, list) else value
     try:
         return DreamerConfig(**numbers)
-    except (ValueError, ArithmeticError, LookupError) as error:
+    except ValueError as error:
         raise PolicyFileError(f"{fields.name}: {error} {EXPORT_AGAIN}.") from error
 
 
@@ -198,7 +205,7 @@ def _is_like(default: Any, value: Any) -> bool:
         like = default[0] if default else ""
         return isinstance(value, list) and len(value) <= 64 and all(_is_like(like, item) for item in value)
     if isinstance(default, int) and not isinstance(default, bool):
-        return _is_whole(value) and 0 <= value <= 10**12
+        return _is_whole(value) and 0 <= value <= 1e12
     if isinstance(default, float):
         return isinstance(value, int | float) and not isinstance(value, bool)
     return isinstance(value, type(default))
