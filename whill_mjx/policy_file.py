@@ -27,6 +27,7 @@ from whill_mjx.vehicle import nominal_world, place
 RUNTIMES = ("jax", "onnxruntime")
 RUN_FILE = "run.json"
 """In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
+OTHER_RUNTIME = "Evaluate with the runtime 'onnxruntime' instead."
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,8 @@ def load_policy(path: str | Path, runtime: str = "jax") -> PolicyFile:
     contract = checked.contract
     assert isinstance(contract, Contract)
     carry = {entry.name: jax.ShapeDtypeStruct(entry.shape, np.dtype(entry.dtype)) for entry in contract.carry}
-    run = _jax_network(checked) if runtime == "jax" else _host_network(checked, carry)
+    session = make_session(checked)
+    run = _jax_network(checked) if runtime == "jax" else _host_network(session, contract, carry)
 
     def step(state: dict[str, jax.Array], image: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         action, *values = run(image, *(state[name] for name in carry))
@@ -130,23 +132,27 @@ def _vehicle_file(path: Path, checked: CheckedPolicy) -> tuple[Path | None, temp
 
 
 def _jax_network(checked: CheckedPolicy) -> Callable:
+    """The network as a JAX function, after a step on shapes alone."""
     file, contract = f"{checked.path}/policy.onnx", checked.contract
-    make_session(checked)  # its checks of the tensors
+    names = list(contract.inputs), list(contract.outputs)
+    inputs, outputs = contract.tensors()
     try:
         network = Network(checked.network, file)
-    except Exception as error:  # of an operator that is not known, or of a model that only onnxruntime accepts
-        raise PolicyFileError(str(error) if isinstance(error, ValueError) else
-                              f"{file}: cannot be read as ONNX ({error}). Evaluate with the runtime 'onnxruntime' "
-                              "instead.") from error
-    if (network.inputs, network.outputs) != (list(contract.inputs), list(contract.outputs)):
-        raise PolicyFileError(f"{file}: tensors {network.inputs} -> {network.outputs}, but policy.json lists "
-                              f"{list(contract.inputs)} -> {list(contract.outputs)}. The order must be the same. "
+        shapes = [jax.ShapeDtypeStruct(tensor.shape, np.dtype(tensor.dtype)) for tensor in inputs]
+        results = jax.eval_shape(network, *shapes) if (network.inputs, network.outputs) == names else ()
+    except Exception as error:  # an operator that is not known, or a model that only onnxruntime accepts
+        cause = str(error)[:300].removeprefix(f"{file}: ").removesuffix(f" {OTHER_RUNTIME}")
+        raise PolicyFileError(f"{file}: {cause} {OTHER_RUNTIME}") from error
+    found, wanted = [result.shape for result in results], [tensor.shape for tensor in outputs]
+    if found != wanted:
+        raise PolicyFileError(f"{file}: tensors {network.inputs} -> {network.outputs} of shapes {found}, but "
+                              f"policy.json says {names[0]} -> {names[1]} of {wanted}. Order and shapes must agree. "
                               f"{EXPORT_AGAIN}.")
     return network
 
 
-def _host_network(checked: CheckedPolicy, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
-    session, contract = make_session(checked), checked.contract
+def _host_network(session: Any, contract: Contract, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
+    """The network in onnxruntime, called from JAX."""
     shapes = (jax.ShapeDtypeStruct((2,), jnp.float32), *carry.values())
 
     def on_host(*values: Any) -> tuple[np.ndarray, ...]:

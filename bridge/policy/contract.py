@@ -168,7 +168,7 @@ def parse_agent(name: str, table: Mapping[str, Any]) -> AgentContract:
     fields.child("onnx").rule("inputs", lambda value: set(value) == wanted, f"must be {show(sorted(wanted))}")
     return AgentContract(
         observation=observation, discrete=kind == "discrete", size=size, carry=carry, inputs=inputs, outputs=outputs,
-        task=fields.rule("task", lambda value: isinstance(value, str), "must be text"),
+        task=fields.rule("task", lambda value: isinstance(value, str), "must be text") if "task" in table else "",
     )
 
 

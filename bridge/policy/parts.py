@@ -208,9 +208,10 @@ class _ShortReads(io.BufferedIOBase):
 def _open_regular(path: Path) -> Iterator[IO[bytes]]:
     """Open a regular file for reading; a pipe or a device would block or never end."""
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise PolicyFileError(f"{path}: is not a regular file. Parts of a policy are plain files. {COPY_AGAIN}.")
     with os.fdopen(descriptor, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise PolicyFileError(f"{path}: is not a regular file. Parts of a policy are plain files. {COPY_AGAIN}.")
         yield stream
 
 

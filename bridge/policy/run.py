@@ -121,10 +121,7 @@ class Policy:
         contract = checked.contract
         assert isinstance(contract, Contract)
         policy = cls(contract, make_session(checked), str(path))
-        trial = policy.step(np.zeros((contract.height, contract.width, 3), np.uint8))
-        if not np.isfinite(trial).all():
-            raise PolicyFileError(f"{path}/policy.onnx: a black image gives the command {trial}; commands must be "
-                                  f"finite. {EXPORT_AGAIN} from a run whose parameters are finite.")
+        policy.step(np.zeros((contract.height, contract.width, 3), np.uint8))  # the first step takes longest
         policy.reset()
         return policy
 

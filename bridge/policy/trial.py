@@ -29,6 +29,7 @@ NETWORK_COPIES = 4
 """Copies of a network's parameters that building it makes at most."""
 ROOM_PER_PIXEL = 256
 """Memory per byte of the observation: three activations of 64 float32 channels at full resolution take 256 times it."""
+OK, NOT_FINITE = b"ok", b"not finite"
 PROGRAM = "from bridge.policy.trial import main; main()"
 
 
@@ -55,7 +56,7 @@ class Trial:
         self._folder.cleanup()
 
     def run(self, name: str, network: bytes, inputs: list[Tensor], outputs: list[Tensor]) -> None:
-        """Build the network and run one step on zeros.
+        """Build the network and run one step on zeros, such as a black image.
 
         Args:
             name: the file, for messages.
@@ -64,7 +65,8 @@ class Trial:
             outputs: the outputs to compute.
 
         Raises:
-            PolicyFileError: the runtime refuses it, or it needs too much time or memory, or ends the process.
+            PolicyFileError: the runtime refuses it, it needs too much time or memory, it ends the process, or what it
+                gives is not finite.
         """
         seconds = TRIAL_SECONDS + len(network) / BUILD_RATE
         zeros = [(tensor.name, tensor.shape, tensor.dtype) for tensor in inputs]
@@ -77,8 +79,11 @@ class Trial:
             self._process.kill()
             answer = errors = b""
         code = self._process.poll()
-        if answer == b"ok":
+        if answer == OK:
             return
+        if answer.startswith(NOT_FINITE):
+            raise PolicyFileError(f"{name}: {answer.decode('utf-8', 'replace')} after a step on zeros; actions and "
+                                  f"states must be finite. {EXPORT_AGAIN} from a run whose parameters are finite.")
         if code is None or -code == getattr(signal, "SIGPROF", None):
             raise PolicyFileError(f"{name}: a first step is not done after {seconds:.1f} s of processor time. A step "
                                   f"must be much shorter than a control period. {EXPORT_AGAIN}.")
@@ -90,7 +95,7 @@ class Trial:
 
 
 def main() -> None:
-    """Answer one trial: the request as a line of JSON and the network come in, "ok" or the problem goes out."""
+    """Answer one trial: the request as a line of JSON and the network come in, the answer goes out."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(4)
@@ -107,9 +112,10 @@ def main() -> None:
             options.graph_optimization_level = level
             session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
             feed = {name: np.zeros(shape, dtype) for name, shape, dtype in request["inputs"]}
-            session.run(request["outputs"], feed)
+            results = session.run(request["outputs"], feed)
             del session
-        answer = "ok"
+        bad = [name for name, value in zip(request["outputs"], results, strict=True) if not np.isfinite(value).all()]
+        answer = f"{NOT_FINITE.decode()}: {', '.join(bad)}" if bad else OK.decode()
     except Exception as error:  # onnxruntime's own exception types all derive from Exception directly
         answer = f"{type(error).__name__} of version {onnxruntime.__version__}: {str(error)[:500]}"
     sys.stdout.write(answer)

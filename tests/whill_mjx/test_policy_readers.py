@@ -68,6 +68,18 @@ def test_every_reader_refuses_the_same_fault_and_names_file_and_remedy(folder, f
 
 
 @pytest.mark.quick
+def test_every_reader_refuses_a_network_whose_state_is_not_finite(folder, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(marker_seeker.np, "linspace", lambda *_: np.full(64, np.nan))
+        data = marker_seeker.build_onnx()
+    (folder / "policy.onnx").write_bytes(data)
+    edit(folder, lambda table: table["files"].update({"policy.onnx": hashlib.sha256(data).hexdigest()}))
+    for load in READERS:
+        with pytest.raises(PolicyFileError, match="policy.onnx: not finite: action .*must be finite"):
+            load(folder)
+
+
+@pytest.mark.quick
 def test_every_reader_takes_a_zip_and_the_evaluation_finds_the_vehicle_in_it(folder, tmp_path):
     vehicle = b"schema = 1\n"
     (folder / "vehicle.toml").write_bytes(vehicle)
