@@ -4,7 +4,9 @@ A damaged network can loop for ever, ask for all memory or end the process that 
 stopped from outside in every case. A process can. What passes here is then built again by the reader.
 """
 
+import dataclasses
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.policy.contract import Tensor
+from bridge.policy.contract import DTYPES, Tensor
 from bridge.policy.parts import EXPORT_AGAIN, MIB, PolicyFileError
 
 TRIAL_SECONDS = 0.5
@@ -29,7 +31,7 @@ NETWORK_COPIES = 4
 """Copies of a network's parameters that building it makes at most."""
 ROOM_PER_PIXEL = 256
 """Memory per byte of the observation: three activations of 64 float32 channels at full resolution take 256 times it."""
-OK, NOT_FINITE = b"ok", b"not finite"
+OK, BAD, LATE = "ok", "bad: ", "late"
 PROGRAM = "from bridge.policy.trial import main; main()"
 
 
@@ -69,26 +71,25 @@ class Trial:
                 gives is not finite.
         """
         seconds = TRIAL_SECONDS + len(network) / BUILD_RATE
-        zeros = [(tensor.name, tensor.shape, tensor.dtype) for tensor in inputs]
-        observed = sum(int(np.prod(shape)) for _, shape, _ in zeros)
+        observed = sum(math.prod(tensor.shape) for tensor in inputs)
         request = {"seconds": seconds, "memory": ROOM + NETWORK_COPIES * len(network) + ROOM_PER_PIXEL * observed,
-                   "inputs": zeros, "outputs": [tensor.name for tensor in outputs]}
+                   "inputs": [dataclasses.astuple(tensor) for tensor in inputs],
+                   "outputs": [dataclasses.astuple(tensor) for tensor in outputs]}
         try:
-            answer, errors = self._process.communicate(json.dumps(request).encode() + b"\n" + network, WALL_SECONDS)
+            given = json.dumps(request).encode() + b"\n" + network
+            answer, errors = (text.decode("utf-8", "replace") for text in self._process.communicate(given, WALL_SECONDS))
         except subprocess.TimeoutExpired:
             self._process.kill()
-            answer = errors = b""
-        code = self._process.poll()
+            answer, errors = LATE, ""
+        code = self._process.poll() or 0
         if answer == OK:
             return
-        if answer.startswith(NOT_FINITE):
-            raise PolicyFileError(f"{name}: {answer.decode('utf-8', 'replace')} after a step on zeros; actions and "
-                                  f"states must be finite. {EXPORT_AGAIN} from a run whose parameters are finite.")
-        if code is None or -code == getattr(signal, "SIGPROF", None):
+        if answer.startswith(BAD):
+            raise PolicyFileError(f"{name}: {answer.removeprefix(BAD)}. {EXPORT_AGAIN}.")
+        if answer == LATE or code == -getattr(signal, "SIGPROF", 0):
             raise PolicyFileError(f"{name}: a first step is not done after {seconds:.1f} s of processor time. A step "
                                   f"must be much shorter than a control period. {EXPORT_AGAIN}.")
-        said = (answer or errors[-500:]).decode("utf-8", "replace").strip()
-        problem = said or f"the process of its trial step ended with code {code}"
+        problem = (answer or errors[-500:]).strip() or f"the process of its trial step ended with code {code}"
         raise PolicyFileError(f"{name}: onnxruntime refuses it: {problem}. It must hold standard operators that this "
                               f"runtime knows, and a step must fit in {request['memory']} bytes. {EXPORT_AGAIN}, or "
                               "install a newer onnxruntime.")
@@ -106,19 +107,45 @@ def main() -> None:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.enable_cpu_mem_arena = False  # it grows by powers of two, beyond what is needed
     levels = onnxruntime.GraphOptimizationLevel
+    inputs, outputs = ([Tensor(name, tuple(shape), dtype) for name, shape, dtype in request[key]]
+                       for key in ("inputs", "outputs"))
     try:
         # First as it stands: then nothing is computed while it is built. Then as the reader builds it.
         for level in (levels.ORT_DISABLE_ALL, levels.ORT_ENABLE_ALL):
             options.graph_optimization_level = level
             session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
-            feed = {name: np.zeros(shape, dtype) for name, shape, dtype in request["inputs"]}
-            results = session.run(request["outputs"], feed)
+            _compare("inputs", inputs, _declared(session.get_inputs()))
+            _compare("outputs", outputs, _declared(session.get_outputs()))
+            results = session.run([tensor.name for tensor in outputs],
+                                  {tensor.name: np.zeros(tensor.shape, tensor.dtype) for tensor in inputs})
+            _compare("outputs of a step on zeros", outputs, [
+                Tensor(tensor.name, np.shape(value), str(np.asarray(value).dtype))
+                for tensor, value in zip(outputs, results, strict=True)])
+            bad = [tensor.name for tensor, value in zip(outputs, results, strict=True) if not np.isfinite(value).all()]
+            if bad:
+                raise _Refused(f"a step on zeros gives {', '.join(bad)} that is not finite, but actions and states "
+                               "must be finite, and so must the parameters of the training")
             del session
-        bad = [name for name, value in zip(request["outputs"], results, strict=True) if not np.isfinite(value).all()]
-        answer = f"{NOT_FINITE.decode()}: {', '.join(bad)}" if bad else OK.decode()
+        answer = OK
+    except _Refused as error:
+        answer = BAD + str(error)
     except Exception as error:  # onnxruntime's own exception types all derive from Exception directly
         answer = f"{type(error).__name__} of version {onnxruntime.__version__}: {str(error)[:500]}"
-    sys.stdout.write(answer)
+    sys.stdout.buffer.write(answer.encode("utf-8", "replace"))
+
+
+class _Refused(Exception):
+    """The network contradicts policy.json: what it has, and the rule."""
+
+
+def _declared(tensors: list[Any]) -> list[Tensor]:
+    return [Tensor(tensor.name, tuple(tensor.shape), DTYPES.get(tensor.type, tensor.type)) for tensor in tensors]
+
+
+def _compare(kind: str, wanted: list[Tensor], found: list[Tensor]) -> None:
+    want, got = ({tensor.name: (tensor.shape, tensor.dtype) for tensor in tensors} for tensors in (wanted, found))
+    if want != got:
+        raise _Refused(f"{kind} {str(got)[:1000]}, but policy.json says {str(want)[:1000]}: both must agree")
 
 
 def _limit(request: dict[str, Any]) -> None:

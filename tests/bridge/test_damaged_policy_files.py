@@ -173,7 +173,7 @@ def test_a_pipe_and_a_device_in_the_place_of_a_part_are_refused(files, tmp_path)
     assert "policy.json: is not a regular file" in refusal(folder)
 
 
-def network(nodes, initializers, state=(), subgraph=None):
+def network(nodes, initializers):
     """A network with the tensors of the small policy, whose action comes from `nodes`."""
     from onnx import TensorProto, helper
 
@@ -233,6 +233,14 @@ def test_a_network_that_never_ends_is_refused(files, tmp_path):
 def test_a_network_that_asks_for_all_memory_is_refused(files, tmp_path, sides):
     broken = damage.with_hashes({**files, "policy.onnx": large_tensor(*sides)})
     assert "policy.onnx: onnxruntime refuses it" in refusal(damage.write(tmp_path / "p", broken))
+
+
+def test_a_network_whose_action_has_another_shape_than_it_says_is_refused(files, tmp_path):
+    from onnx import helper
+
+    longer = helper.make_node("Concat", ["carry_last", "carry_count"], ["action"], axis=0)
+    broken = damage.with_hashes({**files, "policy.onnx": network([longer], [])})
+    assert "policy.onnx" in refusal(damage.write(tmp_path / "p", broken))
 
 
 def test_a_network_that_reads_other_files_is_refused(files, tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from bridge.policy import PolicyFileError
 from dreamer import agent, spaces
-from dreamer.export import export_agent
 from dreamer.policy import Policy, save
 
 CONFIG = tiny_config()
@@ -22,10 +21,33 @@ SHAPE = {"camera": (16, 16, 3), "speed": (2,)}
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    path = tmp_path_factory.mktemp("policies")
-    params = [agent.init_params(CONFIG, shape, 3, jax.random.PRNGKey(0)) for shape in (SHAPE, (2,))]
-    return {"parameters": save(path / "parameters", CONFIG, params[0], SHAPE, 3),
-            "onnx": export_agent(path / "onnx", CONFIG, params[1], (2,), 3, check_steps=2)}
+    path, rng = tmp_path_factory.mktemp("policies"), np.random.default_rng(0)
+    shapes = jax.eval_shape(lambda: agent.init_params(CONFIG, SHAPE, 3, jax.random.PRNGKey(0)))
+    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), shapes)
+    return {"parameters": save(path / "parameters", CONFIG, params, SHAPE, 3), "onnx": write_agent(path / "onnx")}
+
+
+def write_agent(folder):
+    """An agent as `export_agent` writes it, but made by hand: its action is the tanh of what it sees and counts."""
+    from onnx import TensorProto, helper
+
+    def value(name, size):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [size])
+
+    node = helper.make_node
+    graph = helper.make_graph(
+        [node("Concat", ["observation", "carry_count"], ["seen"], axis=0), node("Tanh", ["seen"], ["action"]),
+         node("Exp", ["carry_count"], ["next_count"])], "agent",
+        [value("observation", 2), value("carry_count", 1)], [value("action", 3), value("next_count", 1)])
+    table = {
+        "schema": 1, "kind": "dreamer-onnx-policy", "observation": [2], "action": {"kind": "box", "size": 3},
+        "task": "toy", "carry": [{"name": "count", "shape": [1], "dtype": "float32"}],
+        "onnx": {"opset": 18, "inputs": ["observation", "carry_count"], "outputs": ["action", "next_count"]},
+        "files": {"policy.onnx": ""},
+    }  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    files = {"policy.json": json.dumps(table).encode(), "policy.onnx": model.SerializeToString()}
+    return damage.write(folder, damage.with_hashes(files))
 
 
 @pytest.fixture(scope="module")
