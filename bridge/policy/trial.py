@@ -77,7 +77,8 @@ class Trial:
                    "outputs": [dataclasses.astuple(tensor) for tensor in outputs]}
         try:
             given = json.dumps(request).encode() + b"\n" + network
-            answer, errors = (text.decode("utf-8", "replace") for text in self._process.communicate(given, WALL_SECONDS))
+            said = self._process.communicate(given, WALL_SECONDS)
+            answer, errors = (text.decode("utf-8", "replace") for text in said)
         except subprocess.TimeoutExpired:
             self._process.kill()
             answer, errors = LATE, ""
