@@ -8,28 +8,27 @@ import pytest
 from conftest import UNICYCLE_SPACE, unicycle_plant
 
 import sysid.design as design_module
-from sysid.candidates import Candidate, Limits, as_trial, library, make_command, placement
-from sysid.design import (
+from sysid.design import DesignConfig, main
+from sysid.errors.space import Space
+from sysid.intervals.design import (
     INFLATION,
-    DesignConfig,
     best_splitting_manoeuvre,
     candidate_objective,
     identifiable_subspace,
     information,
-    main,
     prior_information,
     propose,
     rank,
     separation,
     splitting_scores,
 )
-from sysid.log import Command, read_csv
-from sysid.metrics import ideal_replay
-from sysid.rollout import Plant
-from sysid.space import Space
-from sysid.uncertainty import PRIOR_SD
-from whill_mjx.parameters import get_values
-from whill_mjx.specs import WHILL_CR
+from sysid.intervals.uncertainty import PRIOR_SD
+from sysid.logs.log import Command, read_csv
+from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, make_command, placement
+from sysid.logs.metrics import ideal_replay
+from sysid.replay.records import Plant
+from whill_mjx.vehicle.parameters import get_values
+from whill_mjx.vehicle.specs import WHILL_CR
 
 quick = pytest.mark.quick
 SMALL = Limits(v_min=-0.5, v_max=0.6, omega_max=0.8, room=(4.0, 3.0), margin=0.5, seconds=12.0)

@@ -14,11 +14,11 @@ from effects_in_hand import chair, motion_at, path, quick, run, yielding
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import place_of
-from whill_mjx.kinematics import body_twist
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.types import parameters_of
-from whill_mjx.vehicle import add_payload, drive, measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import add_payload, drive, measure, nominal_world, place
+from whill_mjx.vehicle.kinematics import body_twist
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import parameters_of
 
 DRIVES = {"pid_drive", "torque_drive"}  # no disturbances: without them nothing drives
 BASE = {"air_drag", "axle_pivot", "forward_slip", "lateral_damping", "odometry_lag", "rolling_contact",

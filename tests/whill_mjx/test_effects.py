@@ -24,10 +24,10 @@ from whill_mjx.effects import (
 )
 from whill_mjx.effects.base import PLACES, place_of
 from whill_mjx.effects.planar import spin_response
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.types import Drive, Odometry, parameters_of
-from whill_mjx.vehicle import measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import measure, nominal_world, place
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import Drive, Odometry, parameters_of
 
 pytestmark = pytest.mark.quick
 

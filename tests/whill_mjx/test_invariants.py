@@ -13,16 +13,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.config import VehicleConfig
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import place_of
-from whill_mjx.ground import footing
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.model import build_model
-from whill_mjx.parameters import describe, get_values, set_values
-from whill_mjx.presets import preset
-from whill_mjx.types import parameters_of
-from whill_mjx.vehicle import GRAVITY, SMOOTH_LOAD, _substep, forces, mass_distribution, place, substeps, suspension
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import (
+    GRAVITY,
+    SMOOTH_LOAD,
+    _substep,
+    forces,
+    mass_distribution,
+    place,
+    substeps,
+    suspension,
+)
+from whill_mjx.vehicle.ground import footing
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import parameters_of
 
 QUICK_TO_COMPILE = {"xla_llvm_disable_expensive_passes": True, "xla_backend_optimization_level": 1}
 STEPPED = {"command_quantisation", "encoder_resolution", "gyro_range", "state_rate", "command_expiry"}

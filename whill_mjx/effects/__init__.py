@@ -55,7 +55,7 @@ from whill_mjx.effects.wheel_inertia import WheelInertia
 from whill_mjx.effects.wheel_radius_difference import WheelRadiusDifference
 from whill_mjx.effects.wind import Wind
 from whill_mjx.effects.yaw_scrub import YawScrub
-from whill_mjx.types import parameters_of
+from whill_mjx.vehicle.types import parameters_of
 
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect

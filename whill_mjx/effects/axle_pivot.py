@@ -8,7 +8,7 @@ import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import World, parameter
+from whill_mjx.vehicle.types import World, parameter
 
 
 @struct.dataclass

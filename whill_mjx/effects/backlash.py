@@ -10,7 +10,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.smooth import scale_drive
-from whill_mjx.types import Drive, Motion, parameter
+from whill_mjx.vehicle.types import Drive, Motion, parameter
 
 
 @struct.dataclass

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.types import Motion, Wrench
+from whill_mjx.vehicle.types import Motion, Wrench
 
 GRAVITY = 9.81  # [m/s^2], turns the load of a contact into the mass that it carries
 PLACES = ("command", "actuation", "force", "world", "sensing", "outside")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench, yaw_rate
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 REST_SPEED = 0.05  # [m/s], fades the kick at rest
 TIE_BREAK = 0.03  # [rad], lets an exactly straight reversal start the swivel, counter-clockwise

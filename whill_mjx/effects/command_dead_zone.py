@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, parameter
+from whill_mjx.vehicle.types import Motion, parameter
 
 EDGE = 0.2  # half width of the smooth edge, as a share of the dead zone
 TINY = 1e-12  # keeps the edge defined at a dead zone of 0

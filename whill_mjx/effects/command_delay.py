@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, parameter
+from whill_mjx.vehicle.types import Motion, parameter
 
 SLOTS = 8  # changes of the command that may be under way at once; older ones are taken as arrived
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, parameter
+from whill_mjx.vehicle.types import Motion, parameter
 
 MAKER = {"validity": 0.2, "resend": 0.1}
 """The chair's 200 ms, and a sender at the 10 Hz of the maker's Python driver."""

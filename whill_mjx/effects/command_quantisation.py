@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, parameter
+from whill_mjx.vehicle.types import Motion, parameter
 
 MAKER = {"linear": 0.004 / 3.6, "angular": 0.004 / 3.6 / 0.496, "v_min": -0.556, "v_max": 1.667, "omega_max": 1.68}
 """The chair's values: words of 0.004 km/h, -500 to 1500 forward and +-750 turning (wheel difference over the track)."""

@@ -8,7 +8,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench, driven_mean, side_forces
 from whill_mjx.effects.smooth import soft_sign
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 REST_SPEED = 0.02  # [m/s], smooths the change of sign at rest
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, Odometry, parameter
+from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 MAKER = {"angle": 0.001, "speed": 0.004 / 3.6}
 """The chair's state message: wheel angle in 0.001 rad, wheel speed in 0.004 km/h."""

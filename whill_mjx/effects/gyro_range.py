@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, Odometry, parameter
+from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 MAKER = {"limit": 2.1817, "step": 4.375e-3 * 0.017453293}
 """The chair's gyro (LSM6DS3): +-125 degrees/s in steps of 4.375 millidegrees/s."""

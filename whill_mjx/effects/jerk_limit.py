@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, parameter
+from whill_mjx.vehicle.types import Motion, parameter
 
 
 @struct.dataclass

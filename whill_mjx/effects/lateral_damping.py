@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import GRAVITY, Effect, contact_wrench, resting_mass
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 TOUCHING = 3.0  # a passive wheel loses its damping smoothly below a third of the load that it has at rest
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import jax
 from flax import struct
 
-from whill_mjx.control import PidMemory, pid, pid_memory
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.planar import look_ahead
-from whill_mjx.types import Drive, Motion, Wrench, parameter
+from whill_mjx.effects.wheel_pid import PidMemory, pid, pid_memory
+from whill_mjx.vehicle.types import Drive, Motion, Wrench, parameter
 
 
 @struct.dataclass

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import driven_mean, per_axle, yaw_rate
-from whill_mjx.types import Motion
+from whill_mjx.vehicle.types import Motion
 
 
 @struct.dataclass

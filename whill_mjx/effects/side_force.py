@@ -8,7 +8,7 @@ import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 
 @struct.dataclass

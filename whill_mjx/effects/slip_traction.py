@@ -10,7 +10,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench, per_axle, per_side, to_axles, to_contacts
 from whill_mjx.effects.planar import held, look_ahead
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 ROUNDS = 2  # of the implicit step
 NEWTON = 2  # steps towards how fast a wheel slides beyond its creep

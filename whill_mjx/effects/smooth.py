@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.types import Drive, Yielding
+from whill_mjx.vehicle.types import Drive, Yielding
 
 
 def soft_limit(value: jax.Array, limit: jax.Array) -> jax.Array:

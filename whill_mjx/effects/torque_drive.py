@@ -11,7 +11,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.planar import by_mode, spin_response
-from whill_mjx.types import Drive, Motion, Yielding, parameter
+from whill_mjx.vehicle.types import Drive, Motion, Yielding, parameter
 
 TINY = 1e-6  # [N m] or [rad/s], keeps shares defined where torque or target does not change
 

@@ -7,7 +7,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean
 from whill_mjx.effects.smooth import limit_drive
-from whill_mjx.types import Drive, Motion, parameter
+from whill_mjx.vehicle.types import Drive, Motion, parameter
 
 TINY = 1e-3  # [N], keeps the limit defined where a wheel has lifted
 

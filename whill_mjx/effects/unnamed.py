@@ -10,7 +10,7 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean, yaw_rate
 from whill_mjx.effects.smooth import soft_sign
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 KNOTS = 12
 ACROSS = 4

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import GRAVITY, Effect, resting_mass, yaw_rate
-from whill_mjx.types import Motion, Wrench, parameter
+from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 REST_RATE = 0.05  # [rad/s], smooths the change of sign at rest
 
