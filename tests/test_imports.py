@@ -1,4 +1,4 @@
-"""Imports point one way, without circles; packages meet at their doors."""
+"""Imports point one way, without circles; packages meet at their doors, and all may import `bridge.policy`."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ DOORS = {
 }
 ROOMS = {"whill_mjx/learning": {"dreamer"}}  # belongs to the first
 
+READER = "bridge.policy"
+"""The one reader of policy files, which all packages may import."""
+
 pytestmark = pytest.mark.quick
 
 
@@ -44,8 +47,20 @@ def test_imports_point_one_way(path):
     own = relative.parts[0]
     looking_up = DOORS.get(relative.as_posix(), set()) | ROOMS.get(relative.parent.as_posix(), set())
     allowed = {own} | ALLOWED[own] | looking_up
-    outside = {name.split(".")[0] for name in imported(path)} & {*PACKAGES, "benchmarks", "tests"}
+    names = {name for name in imported(path) if name != READER}
+    outside = {name.split(".")[0] for name in names} & {*PACKAGES, "benchmarks", "tests"}
     assert outside <= allowed
+
+
+def test_the_reader_of_policy_files_needs_only_numpy_and_onnxruntime():
+    own = sorted((ROOT / "bridge" / "policy").glob("*.py"))
+    names = {name for path in own for name in imported(path) if name != READER and not name.startswith(f"{READER}.")}
+    assert {name.split(".")[0] for name in names} - sys.stdlib_module_names == {"numpy", "onnxruntime"}
+
+
+def test_only_the_face_of_the_reader_is_imported_by_others():
+    outside = {name for path in modules() if path.parent.name != "policy" for name in imported(path)}
+    assert not [name for name in outside if name.startswith(f"{READER}.")]
 
 
 def test_nothing_imports_the_doors():
