@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from whill_mjx.effects import EFFECTS, Effect, make_effect
-from whill_mjx.effects.base import PLACES, place_of
+from whill_mjx.effects import EFFECTS, Effect, make_effects
+from whill_mjx.effects.base import place_of
 from whill_mjx.effects.card import Axis, Falsifier, Scale
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -129,9 +129,7 @@ def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> Vehi
     """The vehicle with every effect of the hypotheses at its neutral values, which do not change its motion."""
     have = {effect.name for effect in params.effects}
     added = {axis.parameter.partition(".")[0] for one in found for axis in one.axes} - have - {"body"}
-    effects = [make_effect(name) for name in added]
-    order = sorted(effects, key=lambda effect: (PLACES.index(place_of(effect)), list(EFFECTS).index(effect.name)))
-    return VehicleParams(params.body, (*params.effects, *order))
+    return VehicleParams(params.body, (*params.effects, *make_effects(added)))
 
 
 def base_values(params: VehicleParams) -> dict[str, float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.effects.base import Effect, place_of
+from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Card
 from whill_mjx.vehicle.types import parameters_of
 
@@ -144,6 +144,13 @@ def make_effect(name: str, **values: float) -> Effect:
             raise ValueError(f"effect {name!r} has no parameter {field!r} (known: {', '.join(known)}). Correct it.")
     effect = EFFECTS[name](**values)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), effect)
+
+
+def make_effects(names: Iterable[str]) -> tuple[Effect, ...]:
+    """The neutral effects of these names, each once, in the order of a vehicle: by place, then as in `EFFECTS`."""
+    order = list(EFFECTS)
+    effects = [make_effect(name) for name in dict.fromkeys(names)]
+    return tuple(sorted(effects, key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name))))
 
 
 def card_of(name: str) -> Card:
