@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 import math
 import os
 from dataclasses import replace
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.effects import EFFECTS, equation, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Alike, Axis, Scale
 from whill_mjx.logs.dataset import write_text
@@ -153,8 +152,6 @@ def alike_row(name: str, one: Alike) -> str:
 
 def row(kind: type[Effect]) -> str:
     """One line of a table: name, first paragraph of the docstring, parameters and source."""
-    equation = " ".join(inspect.getdoc(kind).split("\n\n")[0].split())  # type: ignore[union-attr]
-    equation = equation.partition(" Source:")[0]
     texts = []
     for name, about in parameters_of(kind).items():
         low, high = kind.typical.get(name, (about.neutral, about.neutral))
@@ -163,7 +160,7 @@ def row(kind: type[Effect]) -> str:
             f"`{name}` [{about.unit}] {about.description}: {usual}; search {about.low:g} to {about.high:g}; "
             f"neutral {about.neutral:g}"
         )
-    cells = [f"`{kind.name}`", equation, "<br>".join(texts), kind.source]
+    cells = [f"`{kind.name}`", equation(kind), "<br>".join(texts), kind.source]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

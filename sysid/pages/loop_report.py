@@ -67,7 +67,7 @@ from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, si
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
-from whill_mjx.effects import EFFECTS
+from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.types import parameters_of
 
@@ -242,8 +242,8 @@ def unit_of(parameter: str) -> str:
 
 
 def equation_of(one: Hypothesis) -> str:
-    """The first line of the effect's description, which is its equation."""
-    return (EFFECTS[one.effect].__doc__ or "").strip().splitlines()[0] if one.effect in EFFECTS else ""
+    """The equation of the effect."""
+    return equation(EFFECTS[one.effect]) if one.effect in EFFECTS else ""
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 from effects_in_hand import chair, motion_at, path, quick, run, yielding
 
 import whill_mjx
-from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.effects import EFFECTS, equation, make_effect, make_effects
 from whill_mjx.effects.base import place_of
 from whill_mjx.effects.card import Scale
 from whill_mjx.vehicle.dynamics import add_payload, drive, measure, nominal_world, place
@@ -111,6 +111,19 @@ def test_every_effect_is_on_the_page_of_effects_with_its_parameters(name):
     assert len(rows) == 1, remedy
     for field, about in parameters_of(EFFECTS[name]).items():
         assert f"`{field}` [{about.unit}]" in rows[0], remedy
+
+
+@quick
+def test_the_equation_of_an_effect_is_the_whole_first_paragraph_of_its_docstring_without_the_source():
+    assert equation(EFFECTS["clock_offset"]).endswith("the pose moved back along its arc.")
+    assert equation(EFFECTS["air_drag"]) == "F = -1/2 rho C_d A |v_air| v_air along the chassis x axis."
+    assert all(equation(kind) for kind in EFFECTS.values())
+
+
+@quick
+def test_effects_of_several_names_come_in_the_order_of_a_vehicle():
+    names = [effect.name for effect in make_effects(["wind", "yaw_scrub", "command_delay", "slope", "wind"])]
+    assert names == ["command_delay", "wind", "yaw_scrub", "slope"]
 
 
 @quick

@@ -153,6 +153,11 @@ def make_effects(names: Iterable[str]) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name))))
 
 
+def equation(kind: type[Effect]) -> str:
+    """The equation of an effect in one line: the first paragraph of its docstring, without the source."""
+    return " ".join((kind.__doc__ or "").split("\n\n")[0].split()).partition(" Source:")[0]
+
+
 def card_of(name: str) -> Card:
     """The card of an effect; a blank one for a name that is no effect."""
     return EFFECTS[name].card if name in EFFECTS else Card()

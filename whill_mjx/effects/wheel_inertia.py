@@ -16,7 +16,7 @@ class WheelInertia(Effect):
     """J = ratio * J_nominal of each driven wheel, its tyre, its motor and its gears together, about its axle.
 
     A rotor behind a gear counts with the square of its ratio, which can make J several times that of the wheel alone.
-    While the wheels roll J hardly shows, because the chair's mass is much larger. A skidding wheel has nothing but J.
+    While the wheels roll J hardly shows, because the chair's mass is much larger. Only J holds back a skidding wheel.
 
     The angular momentum of a wheel that slows down tips the chassis forward, and the loads shift. With a direct drive
     or a hub motor all of J does so (`reaction` 1). A rotor behind a gear has little angular momentum for its part of J.
