@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+GRAVITY = 9.81
+"""Standard gravity [m/s^2]."""
+
 
 @dataclass(frozen=True)
 class CameraMount:

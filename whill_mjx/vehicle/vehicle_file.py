@@ -144,7 +144,8 @@ def _read_spec(table: dict[str, Any]) -> VehicleSpec:
 def _read_effect(path: Path, table: dict[str, Any]) -> Any:
     name = table["name"]
     if name not in EFFECTS:
-        raise ValueError(f"{path}: unknown effect {name!r} (known: {', '.join(sorted(EFFECTS))}).")
+        raise ValueError(f"{path}: unknown effect {name!r} (known: {', '.join(sorted(EFFECTS))}). Install or "
+                         "register the package that defines it, or remove the effect.")
     return _read_parameters(path, name, EFFECTS[name], table["parameters"])
 
 
