@@ -30,6 +30,7 @@ from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.logs.log import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.verdict.result import Result
@@ -140,11 +141,11 @@ class Bench:
     def columns(self, table: Table, trials: Sequence[int]) -> np.ndarray:
         """(b, n, 2 KNOTS) change of the white features by each knot, per N and N m."""
         drives = self.part(trials)
-        sets = [self.values(self.u, table, row) for row in np.diag(self.sizes)]
+        own = Quotients.forward(np.zeros(2 * KNOTS), self.sizes)
+        sets = [self.values(self.u, table, row) for row in own.above]
         seen = drives.simulate(np.stack([self.values(self.u), *sets]))
         full = np.zeros((len(trials), *self.drives.mask.shape[1:], 2 * KNOTS))
-        for k in range(2 * KNOTS):
-            full[:, : seen.shape[2], :, k] = (seen[k + 1] - seen[0]) / self.sizes[k]
+        full[:, : seen.shape[2]] = own.slopes(seen[1:], seen[0])
         whole = replace(self.drives, weight=self.drives.mask[list(trials)])
         return self.white(whole, full)
 

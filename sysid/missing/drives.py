@@ -15,6 +15,7 @@ from sysid.errors.noise import roughness
 from sysid.logs.log import Trial
 from sysid.missing.catalogue import ROUND
 from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.vehicle.parameters import get_values, set_values
@@ -138,9 +139,9 @@ class Drives:
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
         """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
-        points, spans = quotients(u, sizes)
-        at, *seen = self.simulate(np.stack([sets(point) for point in (u, *points)]))
-        return at, np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
+        pairs = Quotients.central(u, sizes)
+        seen = self.simulate(np.stack([sets(point) for point in (u, *pairs.points)]))
+        return seen[0], np.asarray(pairs.slopes(*np.split(seen[1:], 2)))
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
@@ -156,20 +157,6 @@ def began_at(trial: Trial) -> float:
     that its name counts. nan where the name counts none."""
     number = re.fullmatch(r".*_(\d{1,2})", trial.name)
     return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
-
-
-def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
-    """Points (2 P of (P,)), above and below u in each of its P coordinates in turn, and how far each pair is apart."""
-    points, spans = [], []
-    for p in range(len(u)):
-        pair = []
-        for sign in (1, -1):
-            point = u.copy()
-            point[p] = np.clip(point[p] + sign * sizes[p], 0.0, 1.0)
-            pair.append(point)
-        points += pair
-        spans.append(float(pair[0][p] - pair[1][p]))
-    return points, spans
 
 
 def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],

@@ -16,6 +16,7 @@ from sysid.logs.metrics import replicate_noise
 from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 
@@ -35,23 +36,14 @@ class PoseReplay:
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replays (N, B, ...) and their derivatives (N, B, ..., P) by central differences."""
-        sets = []
-        for row in values:
-            sets.append(row)
-            for p, step in enumerate(self.steps):
-                for sign in (1, -1):
-                    moved = row.copy()
-                    moved[p] += sign * step
-                    sets.append(moved)
-        each = 1 + 2 * len(self.steps)
-        seen = self.simulate(np.stack(sets))
+        count, size = values.shape
+        pairs = Quotients.central(values, self.steps, -np.inf, np.inf)
+        seen = self.simulate(np.concatenate([values, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)]))
 
         def slope(leaf: np.ndarray) -> np.ndarray:
-            pairs = leaf.reshape(len(values), each, *leaf.shape[1:])[:, 1:]
-            spans = 2 * self.steps.reshape(1, -1, *(1,) * (leaf.ndim - 1))
-            return np.moveaxis((pairs[:, ::2] - pairs[:, 1::2]) / spans, 1, -1)
+            return np.asarray(pairs.slopes(*leaf[count:].reshape(2, count, size, *leaf.shape[1:])))
 
-        return jax.tree.map(lambda leaf: leaf[::each], seen), jax.tree.map(slope, seen)
+        return jax.tree.map(lambda leaf: leaf[:count], seen), jax.tree.map(slope, seen)
 
     def _set(self, values: np.ndarray) -> np.ndarray:
         return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))

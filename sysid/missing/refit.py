@@ -9,10 +9,11 @@ import numpy as np
 
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, difference_sizes
-from sysid.missing.drives import Drives, quotients
+from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit, Start
 from sysid.replay.cores import on_all_cores
+from sysid.replay.quotients import Quotients
 
 TRIES = ((1.0, 1.0), (1.0, 0.3), (30.0, 1.0))
 """Factors on the damping and shares of the step that are tried in one iteration."""
@@ -28,6 +29,11 @@ WHITENED = 16
 """Parameter sets whose features are made white in one call."""
 STEP_Q = 0.08
 """Difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small."""
+
+
+def own_sizes(q: np.ndarray) -> np.ndarray:
+    """(k,) steps of difference quotients of coordinates q (k,)."""
+    return np.asarray(STEP_Q * np.maximum(np.abs(q), 1.0))
 
 
 class Refitter:
@@ -89,17 +95,18 @@ class Refitter:
         white = yield self.values_at(found, u, q)[None]
         residual, cost = self._left(white[0], u)
         for iteration in range(iterations + 1):
-            sets, steps = self._differences(found, u, q)
-            points, spans = quotients(u, difference_sizes(self.reference.spread)) if stale else ([], [])
-            sets += [self.values_at(found, point, q) for point in points]
+            own = Quotients.forward(q, own_sizes(q))
+            sets = [self.values_at(found, u, point) for point in own.above]
+            if stale:
+                pairs = Quotients.central(u, difference_sizes(self.reference.spread))
+                sets += [self.values_at(found, point, q) for point in pairs.points]
             columns = np.zeros((*residual.shape, 0))
             if sets:
                 white = yield np.stack(sets)
                 at = self.target - residual
-                columns = np.stack([(white[i] - at) / steps[i] for i in range(len(q))], axis=-1) if len(q) else columns
+                columns = own.slopes(white[: len(q)], at)
                 if stale:
-                    pairs = white[len(q) :]
-                    slopes = np.stack([(pairs[2 * p] - pairs[2 * p + 1]) / span for p, span in enumerate(spans)], -1)
+                    slopes = pairs.slopes(*np.split(white[len(q) :], 2))
                     fresh, stale = True, False
             jacobian = np.concatenate([slopes, columns], axis=-1)
             if iteration == iterations:
@@ -164,18 +171,6 @@ class Refitter:
             values = with_values(values, self.names, one.values(part, base))
             start += len(one.axes)
         return values
-
-    def _differences(self, hypotheses: Sequence[Hypothesis], u: np.ndarray,
-                     q: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
-        sets: list[np.ndarray] = []
-        steps: list[float] = []
-        for i in range(len(q)):
-            step = STEP_Q * max(abs(q[i]), 1.0)
-            moved = q.copy()
-            moved[i] += step
-            sets.append(self.values_at(hypotheses, u, moved))
-            steps.append(step)
-        return sets, steps
 
     def _within(self, hypotheses: Sequence[Hypothesis], q: np.ndarray) -> np.ndarray:
         axes = [axis for one in hypotheses for axis in one.axes]

@@ -21,6 +21,7 @@ from sysid.errors.space import STEP, Space
 from sysid.logs.log import Trial
 from sysid.replay.courses import CourseReplay, make_courses
 from sysid.replay.models import Parameters, set_parameters
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Plant, Simulated
 
 
@@ -82,18 +83,13 @@ class DifferenceReplay:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
         u = self.space.to_unit(values)
         count, size = u.shape
-        ends = [np.clip(u[:, None, :] + sign * self.step * np.eye(size), 0.0, 1.0) for sign in (1, -1)]  # (N, P, P)
-        up, down = (self.space.to_values(end) for end in ends)
-        rows = np.concatenate([values, up.reshape(-1, size), down.reshape(-1, size)])
+        pairs = Quotients.central(u, self.step).mapped(self.space.to_values)
+        rows = np.concatenate([values, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)])
         found = self.replay.simulate(rows)
-        width = np.einsum("npp->np", up - down)  # of each difference, in the parameter's unit
 
         def slope(leaf: np.ndarray) -> np.ndarray:
             leaf = np.asarray(leaf, float)
-            high, low = (leaf[count + k * count * size :][: count * size].reshape(count, size, *leaf.shape[1:])
-                         for k in (0, 1))
-            difference = (high - low) / width.reshape(count, size, *(1,) * (leaf.ndim - 1))
-            return np.moveaxis(difference, 1, -1)
+            return np.asarray(pairs.slopes(*leaf[count:].reshape(2, count, size, *leaf.shape[1:])))
 
         at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
         return at, jax.tree.map(slope, found)
