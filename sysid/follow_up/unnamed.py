@@ -33,6 +33,7 @@ from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try, costing
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import fitted_before, refit_poses
 from whill_mjx.effects import make_effect
@@ -52,7 +53,7 @@ LEAST_GAIN = 25.0
 """Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
 COMPACT = 0.75
 """Share of the table's held-back gain that few terms must reach to stand for it."""
-STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried
+CHOICES = tuple(Try(1.0, share) for share in (1.0, 0.5, 0.2))
 ROUNDS = 3  # Gauss-Newton steps
 
 
@@ -268,20 +269,21 @@ def _replayed(
         penalty = np.zeros((size + basis.shape[1], size + basis.shape[1]))
         penalty[:size, :size] = precision
     columns = best.columns @ basis
-    u, wrench, now = bench.u.copy(), np.zeros(basis.shape[1]), result.search.base.residual
-    cost = before = float(np.square(now).sum())
+    design, now = np.concatenate([result.search.base.jacobian, columns], axis=-1), result.search.base.residual
+    start, free = np.concatenate([bench.u, np.zeros(basis.shape[1])]), np.full(basis.shape[1], np.inf)
+    box = BoxStep(np.concatenate([np.zeros(size), -free]), np.concatenate([np.ones(size), free]), np.inf, ridge=1e-9)
+    solver = GaussNewton(box, CHOICES, Patience(1e-3), (start, penalty), damping=0.0, least=0.0, most=0.0)
+    state = costing(solver.init(start[None]), np.square(now).sum()[None])
+    before = float(state.cost[0])
     for _ in range(ROUNDS):
-        here = multiplied(now, result.search.base.jacobian, columns, groups)
-        at = np.concatenate([u - bench.u, wrench])
-        pulled = replace(here, moments=here.moments - penalty @ at / len(here.moments))
-        step = pulled.solve(penalty)
-        tries = [(np.clip(u + share * step[:size], 0.0, 1.0), wrench + share * step[size:]) for share in STEPS]
-        left = bench.residual([(one, basis @ each) for one, each in tries], table, best.phases)
+        steps = solver.tries(state, *solver.normal(-now, design[None], state.u))
+        left = bench.residual([(one[:size], basis @ one[size:]) for one in steps.points[0]], table, best.phases)
         costs = np.square(left).sum((1, 2))
-        index = int(np.nanargmin(costs))
-        if not costs[index] < cost * (1 - 1e-3):
+        after = solver.step(state, steps, costs[None])
+        if solver.done(after).all():
             break
-        (u, wrench), now, cost = tries[index], left[index], float(costs[index])
+        state, now = after, left[np.nanargmin(costs)]
+    u, wrench, cost = state.u[0, :size], state.u[0, size:], float(state.cost[0])
     coefficients = tuple(wrench[part] for part in parts) if chosen else ()
     more = 0.0
     if table.quantity in WHEELS:
