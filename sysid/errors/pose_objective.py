@@ -227,17 +227,6 @@ class Objective:
         pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))
         return Noise(pose, odometry, "residuals")
 
-    def channel_residuals(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Whitened residual (B, M) of each channel at one point u (P,), nan where not measured."""
-        residual = self.residuals(u[None])[0]
-        pose_size = self.measured.pose[0].size
-        pose = residual[:, :pose_size].reshape(self.measured.pose.shape)
-        odometry_size = self.measured.odometry[0].size
-        odometry = residual[:, pose_size : pose_size + odometry_size].reshape(self.measured.odometry.shape)
-        columns = [*np.where(self._masks[0] > 0, pose, np.nan).transpose(2, 0, 1),
-                   *np.where(self._masks[1] > 0, odometry, np.nan).transpose(2, 0, 1)]
-        return dict(zip(self.noise.as_dict(), columns, strict=True))
-
     def bad(self, simulated: Simulated) -> Any:
         """(N, B) replays that diverged."""
         xp = namespace(simulated.pose)

@@ -271,12 +271,14 @@ def _replayed(
     columns = best.columns @ basis
     design, now = np.concatenate([result.search.base.jacobian, columns], axis=-1), result.search.base.residual
     start, free = np.concatenate([bench.u, np.zeros(basis.shape[1])]), np.full(basis.shape[1], np.inf)
-    box = BoxStep(np.concatenate([np.zeros(size), -free]), np.concatenate([np.ones(size), free]), np.inf, ridge=1e-9)
-    solver = GaussNewton(box, CHOICES, Patience(1e-3), (start, penalty), damping=0.0, least=0.0, most=0.0)
+    low, high = np.concatenate([np.zeros(size), -free]), np.concatenate([np.ones(size), free])
+    solver = GaussNewton(BoxStep(-np.inf, np.inf, np.inf, ridge=1e-9), CHOICES, Patience(1e-3), (start, penalty),
+                         damping=0.0, least=0.0, most=0.0)
     state = costing(solver.init(start[None]), np.square(now).sum()[None])
     before = float(state.cost[0])
     for _ in range(ROUNDS):
         steps = solver.tries(state, *solver.normal(-now, design[None], state.u))
+        steps = steps._replace(points=np.clip(steps.points, low, high))
         left = bench.residual([(one[:size], basis @ one[size:]) for one in steps.points[0]], table, best.phases)
         costs = np.square(left).sum((1, 2))
         after = solver.step(state, steps, costs[None])

@@ -186,7 +186,7 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
 
 def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
-    held_out: bool = False, group: str = "",
+    held_out: bool = False,
 ) -> Trial:
     """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
     the odometry is counted from there.
@@ -211,7 +211,7 @@ def make_trial(
         yaw0 = odometry.yaw[rest].mean()
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
-    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out, group)
+    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
 
 
 def manoeuvre_of(trial_name: str) -> str:

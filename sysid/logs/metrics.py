@@ -38,11 +38,6 @@ def rmse(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Angle in (-pi, pi]: a difference of headings, whatever full turns either side counted."""
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-
 def score(trial: Trial, prediction: Prediction) -> dict[str, Errors]:
     """Errors per channel ("ground_truth", "odometry") of those that were measured."""
     scores = {}

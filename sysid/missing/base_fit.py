@@ -37,7 +37,7 @@ class BaseFit:
         Args:
             prior: mean (P,) and precision (P, P) of the unit coordinates.
         """
-        solver = GaussNewton(BoxStep(), CHOICES, PATIENCE, prior)
+        solver = GaussNewton(BoxStep(passes=1), CHOICES, PATIENCE, prior)
         state, measured = solver.init(start[None]), float((self.drives.mask > 0).sum())
         for _ in range(iterations):
             at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)

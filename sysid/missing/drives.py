@@ -139,9 +139,9 @@ class Drives:
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
         """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
-        pairs = Quotients.central(u, sizes)
-        seen = self.simulate(np.stack([sets(point) for point in (u, *pairs.points)]))
-        return seen[0], np.asarray(pairs.slopes(*np.split(seen[1:], 2)))
+        pairs = Quotients.central(u[None], sizes)
+        at, slopes = pairs.along(u[None], lambda points: self.simulate(np.stack([sets(point) for point in points])))
+        return at[0], slopes[0]
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, estimate_noise
@@ -36,14 +35,7 @@ class PoseReplay:
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replays (N, B, ...) and their derivatives (N, B, ..., P) by central differences."""
-        count, size = values.shape
-        pairs = Quotients.central(values, self.steps, -np.inf, np.inf)
-        seen = self.simulate(np.concatenate([values, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)]))
-
-        def slope(leaf: np.ndarray) -> np.ndarray:
-            return np.asarray(pairs.slopes(*leaf[count:].reshape(2, count, size, *leaf.shape[1:])))
-
-        return jax.tree.map(lambda leaf: leaf[:count], seen), jax.tree.map(slope, seen)
+        return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
 
     def _set(self, values: np.ndarray) -> np.ndarray:
         return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))

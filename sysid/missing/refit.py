@@ -137,7 +137,7 @@ class Refitter:
 
         noise = 0.5 * float((self.drives.mask > 0).sum())
         return GaussNewton(
-            BoxStep(low, high, reach, adapt=True, floor=0.0, ridge=1e-9), CHOICES,
+            BoxStep(low, high, reach, passes=4, adapt=True, floor=0.0, ridge=1e-9), CHOICES,
             Patience(TOLERANCE, times=2, noise=noise, least=1.0, failures=True),
             (np.concatenate([self.reference.u, np.zeros(len(axes))]), precision),
             damping=1e-3, least=1e-6, most=np.inf, stiffer=1e3)

@@ -48,7 +48,6 @@ class DifferenceReplay:
 
     replay: TracedReplay
     space: Space
-    step: float = STEP
 
     @cached_property
     def compiled(self) -> dict[Any, Any]:
@@ -81,18 +80,8 @@ class DifferenceReplay:
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
-        u = self.space.to_unit(values)
-        count, size = u.shape
-        pairs = Quotients.central(u, self.step).mapped(self.space.to_values)
-        rows = np.concatenate([values, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)])
-        found = self.replay.simulate(rows)
-
-        def slope(leaf: np.ndarray) -> np.ndarray:
-            leaf = np.asarray(leaf, float)
-            return np.asarray(pairs.slopes(*leaf[count:].reshape(2, count, size, *leaf.shape[1:])))
-
-        at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
-        return at, jax.tree.map(slope, found)
+        pairs = Quotients.central(self.space.to_unit(values), STEP).mapped(self.space.to_values)
+        return pairs.along(values, self.replay.simulate)
 
 
 def make_replay(

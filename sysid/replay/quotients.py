@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from sysid.replay.arrays import namespace
@@ -37,6 +38,17 @@ class Quotients:
     def mapped(self, coordinates: Callable[[Any], Any]) -> Quotients:
         """The same points in other coordinates, by which the slopes then are."""
         return Quotients(coordinates(self.above), coordinates(self.below))
+
+    def along(self, at: np.ndarray, simulate: Callable[[np.ndarray], Any]) -> tuple[Any, Any]:
+        """What `simulate` gives at points (N, P), and its derivatives (N, ..., P) about them, by one call of it."""
+        count, size = at.shape
+        found = simulate(np.concatenate([at, self.above.reshape(-1, size), self.below.reshape(-1, size)]))
+
+        def slope(leaf: Any) -> np.ndarray:
+            above, below = np.asarray(leaf, float)[count:].reshape(2, count, size, *leaf.shape[1:])
+            return np.asarray(self.slopes(above, below))
+
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found), jax.tree.map(slope, found)
 
     @property
     def points(self) -> Any:

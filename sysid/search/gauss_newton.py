@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-PASSES = 4
-"""Solutions of a step at most, each with more parameters held where they were cut."""
 AT_WALL = 1e-6
 
 
@@ -40,6 +38,8 @@ class BoxStep:
     """(P,) or (N, P): False for parameters that keep their value."""
     move: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.add
     """Where a step (N, P) from u (N, P) leads (`Space.moved`)."""
+    passes: int = 3
+    """Solutions at most, each with more parameters held: cutting one at its wall may lead another to its own."""
     adapt: bool = False
     """Hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall."""
     floor: float = 1e-6
@@ -67,7 +67,7 @@ class BoxStep:
         matrix = hessian + added[..., None] * np.eye(size)
         least, largest = (np.maximum(low - u, -reach), np.minimum(high - u, reach)) if self.adapt else (-reach, reach)
         end, held, left = u.copy(), np.zeros_like(u), np.arange(count)
-        for _ in range(PASSES):
+        for _ in range(self.passes):
             going = moving[left]
             known = np.where(going, 0.0, held[left])
             right = -(gradient[left] + np.einsum("npq,nq->np", matrix[left], known))

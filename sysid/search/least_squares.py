@@ -24,6 +24,9 @@ DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 """The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
+DELAYS, NEAR = 16, (0.005, 0.0003)
+"""Points over the range of a delay; six more on both sides are so far apart [s], for each: a step of the controller's
+clock, and what a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it."""
 PLATEAU = 0.02  # share of the cost within which they lie on the same ground
 FOLLOWING = 3  # tries at most without a new Jacobian
 PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
@@ -217,18 +220,12 @@ class _Tangent:
 
 
 def profile_delays(
-    objective: Residuals, space: Space, u: np.ndarray, points: int = 16, near: tuple[float, ...] = (0.005, 0.0003),
-    robust: bool = False,
+    objective: Residuals, space: Space, u: np.ndarray, robust: bool = False
 ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
     A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
     by one damped Gauss-Newton step, which tells whether another valley is as deep.
-
-    Args:
-        points: of an even grid over the whole range.
-        near: six more on both sides of u are this far apart [s], for each: a step of the controller's clock, and what
-            a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it.
 
     Returns:
         Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
@@ -240,9 +237,9 @@ def profile_delays(
     tangent = _Tangent.at(objective, u, robust)
     for index in delays:
         values = space.to_values(u)
-        around = np.tile(values, (13 * len(near), 1))
-        around[:, index] += np.outer(near, np.arange(-6, 7)).ravel()
-        grid = np.concatenate([np.linspace(0.0, 1.0, points), space.to_unit(around)[:, index]])
+        around = np.tile(values, (13 * len(NEAR), 1))
+        around[:, index] += np.outer(NEAR, np.arange(-6, 7)).ravel()
+        grid = np.concatenate([np.linspace(0.0, 1.0, DELAYS), space.to_unit(around)[:, index]])
         grid = np.unique(grid.round(9))
         at = np.tile(u, (len(grid), 1))
         at[:, index] = grid
