@@ -71,7 +71,7 @@ def main(config: DesignConfig) -> list[Path]:
     for number, plan in enumerate(chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
         command = plan.candidate.command
-        write_csv(path, COMMAND_HEADER, np.column_stack([command.t, command.v, command.omega]))
+        write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
     print(text(chosen, plans, space, before, config.criterion))
     paths.append(write_page(config.out.with_suffix(".html"), chosen, plans, space, before, limits, config))

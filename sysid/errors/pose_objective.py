@@ -20,7 +20,7 @@ import numpy as np
 from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.errors.prior import Prior
 from sysid.errors.robust import huber_weight
-from sysid.errors.space import Space
+from sysid.errors.space import Residuals, Space
 from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
 from sysid.replay.arrays import added, namespace
@@ -61,24 +61,14 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates")
 
 
-class Told(Protocol):
+class Told(Residuals, Protocol):
     """`Objective`, or `sysid.errors.bin_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
-
-    @property
-    def space(self) -> Space: ...
 
     @property
     def trials(self) -> tuple[Trial, ...]: ...
 
     @property
     def prior(self) -> Prior | None: ...
-
-    @property
-    def counted(self) -> int: ...
-
-    def residuals(self, u: np.ndarray) -> np.ndarray: ...
-
-    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
     def renewed(self, u: np.ndarray) -> Any: ...
 

@@ -33,7 +33,7 @@ from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try, costing
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import fitted_before, refit_poses
 from whill_mjx.effects import make_effect
@@ -274,7 +274,7 @@ def _replayed(
     low, high = np.concatenate([np.zeros(size), -free]), np.concatenate([np.ones(size), free])
     solver = GaussNewton(BoxStep(-np.inf, np.inf, np.inf, ridge=1e-9), CHOICES, Patience(1e-3), (start, penalty),
                          damping=0.0, least=0.0, most=0.0)
-    state = costing(solver.init(start[None]), np.square(now).sum()[None])
+    state = solver.init(start[None])._replace(cost=np.square(now).sum()[None])
     before = float(state.cost[0])
     for _ in range(ROUNDS):
         steps = solver.tries(state, *solver.normal(-now, design[None], state.u))

@@ -45,6 +45,11 @@ class Command:
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
+    @property
+    def table(self) -> np.ndarray:
+        """(T, 3) of t, v and omega."""
+        return np.column_stack([self.t, self.v, self.omega])
+
 
 @dataclass(frozen=True)
 class OdometryStream:
@@ -57,6 +62,13 @@ class OdometryStream:
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 5) of x, y, yaw, v and omega; nan where not logged."""
+        absent = np.full(len(self.t), np.nan)
+        pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
+        return np.stack([*pose, self.v, self.omega], axis=-1)
+
 
 @dataclass(frozen=True)
 class PoseStream:
@@ -66,6 +78,11 @@ class PoseStream:
     x: np.ndarray  # (T,) m
     y: np.ndarray
     yaw: np.ndarray  # (T,) rad, unwrapped
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 3) of x, y and yaw."""
+        return np.stack([self.x, self.y, self.yaw], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -177,12 +177,7 @@ def _relative(trial: Trial, channel: str) -> tuple[np.ndarray, np.ndarray] | Non
         if trial.ground_truth is None:
             return None
         return trial.ground_truth.t, relative_pose(trial.ground_truth, trial.start)
-    odometry = trial.odometry
-    if odometry is None:
-        return None
-    absent = np.full(len(odometry.t), np.nan)
-    columns = [absent if values is None else values for values in (odometry.x, odometry.y, odometry.yaw)]
-    return odometry.t, np.stack([*columns, odometry.v, odometry.omega], axis=-1)
+    return None if trial.odometry is None else (trial.odometry.t, trial.odometry.values)
 
 
 def _arc(v: np.ndarray, omega: np.ndarray, yaw: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

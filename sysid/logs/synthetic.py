@@ -53,11 +53,7 @@ def write_dataset(
     for i, trial in enumerate(trials):
         assert trial.ground_truth is not None
         count = len(trial.ground_truth.t)
-        write_trial(folder / "trials" / trial.name, trial.ground_truth.t, _columns(trial.command),
+        write_trial(folder / "trials" / trial.name, trial.ground_truth.t, trial.command.table,
                     simulated.pose[i, :count], simulated.odometry[i, :count], noise, random)
     write_fields(folder, spec, [trial.name for trial in trials if trial.manoeuvre in held_out])
     return folder
-
-
-def _columns(command: Command) -> np.ndarray:
-    return np.column_stack([command.t, command.v, command.omega])

@@ -9,7 +9,7 @@ import numpy as np
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
 from sysid.missing.drives import Drives
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try, costing
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.search.result import Progress
 
 CHOICES = tuple(Try(factor) for factor in (0.1, 1.0, 10.0, 100.0))
@@ -43,7 +43,7 @@ class BaseFit:
             at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)
             residual = self._white(at[None])
             jacobian = self.whitener.apply(slopes, self.drives.mask).reshape(1, -1, len(start))
-            state = costing(state, solver.cost(residual, state.u))
+            state = state._replace(cost=solver.cost(residual, state.u))
             tried = solver.tries(state, *solver.normal(residual, jacobian, state.u))
             points = tried.points[0]
             white = self._white(self.drives.simulate(self.space.to_values(points)))

@@ -128,17 +128,13 @@ class Drives:
         odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
         return Simulated(pose, odometry, paths[of_trial, -1, 8])  # type: ignore[arg-type]
 
-    def differences(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-        """(B, K, 5, P) derivative by unit coordinates u (P,), by central differences of the given sizes.
-
-        Skidding wheels make the motion rough in its parameters: over the size of a day's change the mean slope counts.
-        `sets` turns unit coordinates (P,) into values of all replayed parameters.
-        """
-        return self.linearised(sets, u, sizes)[1]
-
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
+        """Features (B, K, 5) at unit coordinates u (P,), and their derivatives (B, K, 5, P) by differences of the given
+        sizes: skidding wheels make motion rough, and over the size of a day's change the mean slope counts.
+
+        `sets` turns unit coordinates (P,) into values of all replayed parameters.
+        """
         pairs = Quotients.central(u[None], sizes)
         at, slopes = pairs.along(u[None], lambda points: self.simulate(np.stack([sets(point) for point in points])))
         return at[0], slopes[0]

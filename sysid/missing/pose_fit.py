@@ -31,14 +31,13 @@ class PoseReplay:
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replays with values (N, P) of the free parameters."""
-        return self.drives.replay(np.stack([self._set(row) for row in values]))
+        return self.drives.replay(np.stack([
+            with_values(self.held, self.drives.names, dict(zip(self.free, row, strict=True)))
+            for row in values.tolist()]))
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replays (N, B, ...) and their derivatives (N, B, ..., P) by central differences."""
         return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
-
-    def _set(self, values: np.ndarray) -> np.ndarray:
-        return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))
 
 
 POOLED = 1.0

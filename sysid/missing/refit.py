@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Generator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit, Start
 from sysid.replay.cores import on_all_cores
 from sysid.replay.quotients import Quotients
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try, costing
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 
 CHOICES = (Try(1.0, easing=0.2), Try(1.0, 0.3, easing=0.2), Try(30.0, easing=6.0))
 TOLERANCE = 2e-3
@@ -99,7 +98,7 @@ class Refitter:
         jacobian = self.white_slopes if start.slopes is None else start.slopes
         fresh, stale = start.slopes is not None or bool(np.allclose(start.u, self.reference.u)), False
         residual = self.target - (yield self._sets(found, state.u))[0]
-        state = costing(state, solver.cost(residual, state.u))
+        state = state._replace(cost=solver.cost(residual, state.u))
         for iteration in range(iterations + 1):
             slopes = None if stale else jacobian[..., :size]
             jacobian = yield from self._derivatives(found, state.u[0], residual, slopes)
@@ -113,7 +112,7 @@ class Refitter:
             gained, small = float(state.cost[0] - costs[best]), solver.patience.scale(state.cost)[0]
             state, residual = solver.step(state, tried, costs[None], fresh), left[best] if gained > 0 else residual
             if not fresh:  # a small gain by old derivatives says nothing
-                state = replace(state, calm=np.zeros(1, int))
+                state = state._replace(calm=np.zeros(1, int))
             if solver.done(state).all() or (state.calm[0] and state.damping[0] > STIFFEST):
                 break
             if gained > PROMISE * tried.promised[0, best] and gained >= small:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,28 +25,11 @@ from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Plant, Simulated
 
 
-class TracedReplay(Protocol):
-    """A replay that can be traced too: `sysid.replay.courses.CourseReplay`."""
-
-    @property
-    def drives(self) -> int: ...
-
-    @property
-    def states(self) -> int: ...
-
-    @property
-    def in_pieces(self) -> TracedReplay: ...
-
-    def simulate(self, values: np.ndarray) -> Simulated: ...
-
-    def traced(self, values: jax.Array) -> Simulated: ...
-
-
 @dataclass(frozen=True)
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: TracedReplay
+    replay: CourseReplay
     space: Space
 
     @cached_property

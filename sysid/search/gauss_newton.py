@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,8 +119,7 @@ class Patience:
         return np.asarray(self.tolerance * np.maximum(cost - self.noise, self.least))
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """S starts on their way."""
 
     u: np.ndarray  # (S, P)
@@ -131,17 +130,14 @@ class State:
 
     def of(self, index: np.ndarray) -> State:
         """Some of the starts."""
-        return State(self.u[index], self.cost[index], self.damping[index], self.calm[index], self.steps[index])
+        return State(*(values[index] for values in self))
 
     def put(self, index: np.ndarray, part: State) -> State:
         """With some of the starts moved on."""
-        def joined(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-            out = old.copy()
-            out[index] = new
-            return out
-
-        return State(joined(self.u, part.u), joined(self.cost, part.cost), joined(self.damping, part.damping),
-                     joined(self.calm, part.calm), joined(self.steps, part.steps))
+        whole = State(*(values.copy() for values in self))
+        for values, moved in zip(whole, part, strict=True):
+            values[index] = moved
+        return whole
 
 
 class Tried(NamedTuple):
@@ -179,9 +175,8 @@ class GaussNewton:
 
     def init(self, u: np.ndarray) -> State:
         """Starts u (S, P) whose cost is unknown."""
-        count = len(u)
-        return State(np.array(u, float), np.full(count, np.inf), np.full(count, self.damping), np.zeros(count, int),
-                     np.zeros(count, int))
+        count, none = len(u), np.zeros(len(u), int)
+        return State(np.array(u, float), np.full(count, np.inf), np.full(count, self.damping), none, none)
 
     def cost(self, residual: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Cost (N,) of residuals (N, ...) at u (N, P)."""
@@ -236,8 +231,3 @@ class GaussNewton:
     def done(self, state: State) -> np.ndarray:
         """(S,) starts that are at their minimum."""
         return np.asarray(state.calm >= self.patience.times)
-
-
-def costing(state: State, cost: np.ndarray) -> State:
-    """The same starts with their cost (S,) known."""
-    return replace(state, cost=np.asarray(cost, float))

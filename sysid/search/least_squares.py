@@ -3,20 +3,20 @@
 All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
 start, of which the best is taken; starts that have converged wait. A Jacobian takes two replays for each parameter, so
 a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
-steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates; a
-step that leaves the box is cut at its wall and the parameters at a wall whose gradient points outwards are held.
+steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Space, is_delay
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, costing, normal_sums
+from sysid.errors.space import Residuals, Space, is_delay
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
@@ -39,23 +39,6 @@ class Sums(Protocol):
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray: ...
 
     def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
-
-
-class Residuals(Protocol):
-    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
-
-    One whose `equations` are not None has them summed up there.
-    """
-
-    @property
-    def space(self) -> Space: ...
-
-    @property
-    def counted(self) -> int: ...
-
-    def residuals(self, u: np.ndarray) -> np.ndarray: ...
-
-    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def fit(
@@ -120,14 +103,14 @@ class _Descent:
         size = state.u.shape[1]
         if self.equations is not None:
             values, *slopes = self.equations.quadratic(state.u, self.robust)
-            state = costing(state, values / self.objective.counted)
+            state = state._replace(cost=values / self.objective.counted)
             tried = self.solver.tries(state, *slopes)
             costs = self.equations.costs(tried.points.reshape(-1, size), self.robust) / self.objective.counted
             after = self.solver.step(state, tried, costs.reshape(tried.promised.shape))
             return after, state.cost, len(state.u) + len(costs)
         residual, jacobian = self.objective.jacobian(state.u)
         first = robust_cost(residual, self.robust) / self.objective.counted
-        state, spent = costing(state, first), len(state.u)
+        state, spent = state._replace(cost=first), len(state.u)
         linear = _Linear(np.arange(spent), residual, jacobian, np.ones(spent, bool))
         for _ in range(1 + FOLLOWING):
             if len(linear.starts):
@@ -157,14 +140,16 @@ class _Descent:
 
 def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Costs (E,) and points (E, P) with one parameter of u (P,) at an end of its range, where that is far away."""
-    points = []
-    for index, here in enumerate(u):
-        for end in (0.0, 1.0):
-            if abs(end - here) > APART:
-                points.append(u.copy())
-                points[-1][index] = end
-    starts = np.array(points).reshape(-1, len(u))
-    return costs_of(objective, starts, robust), starts
+    points, _ = _along_ranges(u, (0.0, 1.0))
+    return costs_of(objective, points, robust), points
+
+
+def _along_ranges(u: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (E, P) with one parameter of u (P,) at one of these values, where that is far away, and which (E,)."""
+    places = [(index, value) for index, here in enumerate(u) for value in values if abs(value - here) > APART]
+    points, held = np.tile(u, (len(places), 1)), np.array([index for index, _ in places], int)
+    points[np.arange(len(held)), held] = [value for _, value in places]
+    return points, held
 
 
 def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -176,15 +161,10 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
     The rest is in the order of its costs.
     """
     tangent = _Tangent.at(objective, u, robust)
-    points, held, side = [], [], []
-    for index, value in enumerate(u):
-        for other in np.linspace(0.0, 1.0, GRID):
-            if abs(other - value) > APART:
-                points.append(np.where(np.arange(len(u)) == index, other, u))
-                held.append(index)
-                side.append(2 * index + int(other > value))
-    costs, followed = tangent.followed(objective, np.array(points), np.array(held), robust)
-    sides, level = np.array(side), np.abs(costs - tangent.cost) <= PLATEAU * tangent.cost
+    points, held = _along_ranges(u, np.linspace(0.0, 1.0, GRID).tolist())
+    sides = 2 * held + (points > u).any(1)
+    costs, followed = tangent.followed(objective, points, held, robust)
+    level = np.abs(costs - tangent.cost) <= PLATEAU * tangent.cost
     behind = np.isin(sides, sides[level])
     order = np.lexsort((costs, ~behind))
     order = order[~level[order]]

@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.errors.robust import huber_weight, robust_cost
+from sysid.errors.space import Residuals
 from sysid.search.gauss_newton import BoxStep, normal_sums
-from sysid.search.least_squares import Residuals
 from sysid.search.result import FitResult, Progress
 
 ROTATIONS = 3

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from sysid.replay.quotients import Quotients
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try, costing
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 
 pytestmark = pytest.mark.quick
 WIDE = BoxStep(-np.inf, np.inf, np.inf, floor=0.0)
@@ -22,7 +22,7 @@ def solved(solver, start, residual, jacobian, rounds=60):
         if solver.done(state).all():
             break
         found = residual(state.u)
-        state = costing(state, solver.cost(found, state.u))
+        state = state._replace(cost=solver.cost(found, state.u))
         tried = solver.tries(state, *solver.normal(found, jacobian(state.u), state.u))
         points = tried.points.reshape(-1, start.shape[1])
         state = solver.step(state, tried, solver.cost(residual(points), points).reshape(tried.promised.shape))
@@ -45,7 +45,7 @@ def solver_in(box, **fields):
 def test_an_undamped_step_of_a_linear_problem_is_its_solution_and_brings_what_it_promised():
     solver = GaussNewton(WIDE, (Try(1.0),), Patience(1e-9), damping=0.0, least=0.0)
     start = np.zeros((1, 4))
-    state = costing(solver.init(start), solver.cost(linear(start), start))
+    state = solver.init(start)._replace(cost=solver.cost(linear(start), start))
     tried = solver.tries(state, *solver.normal(linear(start), slopes(start), start))
     after = solver.step(state, tried, solver.cost(linear(tried.points[0]), tried.points[0])[None])
     np.testing.assert_allclose(after.u[0], np.linalg.lstsq(DESIGN, DATA, rcond=None)[0], atol=1e-10)
@@ -104,7 +104,7 @@ def test_starts_side_by_side_come_to_where_each_comes_alone():
 
 def test_a_step_that_gains_nothing_moves_nothing_and_is_damped_more_until_the_start_is_done():
     solver = GaussNewton(BoxStep(), CHOICES, Patience(1e-3), most=1.0)
-    state = costing(solver.init(np.full((1, 2), 0.5)), np.ones(1))
+    state = solver.init(np.full((1, 2), 0.5))._replace(cost=np.ones(1))
     tried = solver.tries(state, np.ones((1, 2)), np.eye(2)[None])
     worse = np.array([[2.0, np.nan, 3.0]])
     seen = [state]

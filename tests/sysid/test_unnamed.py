@@ -55,7 +55,7 @@ def bench():
         search=SimpleNamespace(base=base, verdict="unexplained", excess=(0.0, 0.0)),
         evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
     made = Bench(result)
-    slopes = made.drives.differences(made.values, made.u, np.full(2, 0.02))
+    slopes = made.drives.linearised(made.values, made.u, np.full(2, 0.02))[1]
     base.jacobian = made.white(made.drives, slopes)
     return made
 
