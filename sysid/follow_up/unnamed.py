@@ -30,6 +30,7 @@ from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.logs.log import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.models import with_effects
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
@@ -325,9 +326,11 @@ def as_report(found: Unnamed) -> dict[str, Any]:
 
 
 def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
-    """The base model with the effect `unnamed`, at these values."""
+    """The base model with the effect `unnamed`, and with what a refit to poses added, at these values."""
     params = result.reference.params
     full = VehicleParams(params.body, (*params.effects, make_effect("unnamed")))
+    more = dict.fromkeys(name.partition(".")[0] for name in parameters if name not in describe(full))
+    full = with_effects(full, tuple(more))
     return set_values(full, list(parameters), jnp.asarray(list(parameters.values()), jnp.result_type(float)))
 
 
