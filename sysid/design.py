@@ -71,7 +71,7 @@ def main(config: DesignConfig) -> list[Path]:
     for number, plan in enumerate(chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
         command = plan.candidate.command
-        write_csv(path, COMMAND_HEADER, np.column_stack([command.t, command.v, command.omega]))
+        write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
     print(text(chosen, plans, space, before, config.criterion))
     paths.append(write_page(config.out.with_suffix(".html"), chosen, plans, space, before, limits, config))
@@ -82,17 +82,16 @@ def main(config: DesignConfig) -> list[Path]:
 
 def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, float]], Noise]:
     """Spec, parameters, known intervals and noise of a built-in vehicle, a vehicle file, or the folder of a fit."""
-    from whill_mjx.drive import find_vehicle
-    from whill_mjx.vehicle.vehicle_file import load_intervals
+    from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
     if not Path(name).is_dir():
-        spec, params = find_vehicle(name)
+        spec, params, _ = load_vehicle(name)
         return spec, params, load_intervals(name) if name.endswith(".toml") else {}, DEFAULT
     from sysid.pages.report import read_report
 
     report = read_report(Path(name))
     file = str(Path(name) / "vehicle.toml")
-    spec, params = find_vehicle(file)
+    spec, params, _ = load_vehicle(file)
     scale = report["noise"]["scale"]
     noise = Noise(np.array([scale[f"ground_truth.{key}"] for key in ("x", "y", "yaw")]),
                   np.array([scale[f"odometry.{key}"] for key in ("x", "y", "yaw", "v", "omega")]), "fit")

@@ -40,7 +40,6 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.model import build_model
-from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams, VehicleState, parameters_of
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -85,7 +84,7 @@ def main(options: DriveOptions) -> Path:
     names = tuple(MANOEUVRES) if options.manoeuvre == ("all",) else options.manoeuvre
     commands = [command_table(name, options.scenario) for name in names]
     _check(options, names)
-    spec, params = find_vehicle(options.vehicle)
+    spec, params, _ = load_vehicle(options.vehicle)
     params = with_effects(params, options.effects)
     random = np.random.default_rng(options.seed)
     trials = [
@@ -113,14 +112,6 @@ def main(options: DriveOptions) -> Path:
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return options.out
-
-
-def find_vehicle(name: str) -> tuple[VehicleSpec, VehicleParams]:
-    """Spec and parameters of a vehicle file (by its ending) or of a built-in vehicle."""
-    if name.endswith(".toml"):
-        spec, params, _ = load_vehicle(name)
-        return spec, params
-    return preset(name)
 
 
 def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:

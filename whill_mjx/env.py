@@ -15,10 +15,8 @@ from whill_mjx.tasks.tasks import BLUE, Task, goal_position, make_task, reward_t
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
-from whill_mjx.vehicle.presets import preset
-from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
-from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle_file
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import pinhole, render
@@ -26,6 +24,9 @@ from whill_mjx.world.scene import Scene, clearance, collides, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode."""
+
+DEFAULT_VEHICLE = "whill_cr_ramp"
+"""The paper's identified WHILL with its ramp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ def make_env(
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
-    spec, params = load_vehicle(vehicle)
+    spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
     default = task.randomised and getattr(task, "name", "") == "corridor"
     env = Env(
         build_model(spec),
@@ -114,16 +115,6 @@ def make_env(
         exploring_starts,
     )
     return env, params
-
-
-def load_vehicle(vehicle: str | Path | None) -> tuple[VehicleSpec, VehicleParams]:
-    """Spec and parameters of a vehicle file or a preset; None: the paper's identified WHILL with its ramp."""
-    if vehicle is None:
-        return preset("whill_cr_ramp")
-    if Path(vehicle).suffix == ".toml":
-        spec, params, _ = load_vehicle_file(vehicle)
-        return spec, params
-    return preset(str(vehicle))
 
 
 def reset(env: Env, params: VehicleParams, key: jax.Array) -> tuple[State, TimeStep]:

@@ -210,16 +210,11 @@ def choose_preset(options: TrainOptions) -> Preset:
 
 def prepare_vehicle(options: TrainOptions) -> Path:
     """RUN/vehicle.toml: a copy of the given file, a preset, or fitted to the log."""
-    from whill_mjx.vehicle.presets import preset
     from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
     target = options.out / "vehicle.toml"
     if options.vehicle is not None:
-        if options.vehicle.suffix == ".toml":
-            spec, params, provenance = load_vehicle(options.vehicle)  # a bad file is refused before anything is written
-        else:
-            spec, params = preset(str(options.vehicle))
-            provenance = {"preset": str(options.vehicle)}
+        spec, params, provenance = load_vehicle(options.vehicle)  # a bad file is refused before anything is written
         return save_vehicle(target, spec, params, provenance=provenance)
     if target.exists():
         load_vehicle(target)

@@ -26,9 +26,10 @@ from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit
 from sysid.missing.joint_fit import Start as FitStart
-from sysid.missing.refit import STEP_Q, Refitter
+from sysid.missing.refit import Refitter, own_sizes
 from sysid.missing.signatures import base_columns
 from sysid.pages.loop_page import command_of
+from sysid.replay.quotients import Quotients
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
 from whill_mjx.effects import EFFECTS, card_of
@@ -264,10 +265,9 @@ def _white(result: Result, drives: Drives, series: np.ndarray) -> np.ndarray:
 
 def _own_columns(result: Result, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
     """(D, n, k) derivative of the white features by a rival's own coordinates, by differences."""
-    steps = STEP_Q * np.maximum(np.abs(fit.q), 1.0)
-    sets = [_values(result, fit.hypotheses, fit.u, fit.q + row) for row in np.diag(steps)]
-    seen = drives.simulate(np.stack(sets))
-    return np.stack([(_white(result, drives, one) - at) / steps[i] for i, one in enumerate(seen)], axis=-1)
+    own = Quotients.forward(fit.q, own_sizes(fit.q))
+    seen = drives.simulate(np.stack([_values(result, fit.hypotheses, fit.u, q) for q in own.above]))
+    return np.asarray(own.slopes(np.stack([_white(result, drives, one) for one in seen]), at))
 
 
 def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -45,6 +45,11 @@ class Command:
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
+    @property
+    def table(self) -> np.ndarray:
+        """(T, 3) of t, v and omega."""
+        return np.column_stack([self.t, self.v, self.omega])
+
 
 @dataclass(frozen=True)
 class OdometryStream:
@@ -57,6 +62,13 @@ class OdometryStream:
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 5) of x, y, yaw, v and omega; nan where not logged."""
+        absent = np.full(len(self.t), np.nan)
+        pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
+        return np.stack([*pose, self.v, self.omega], axis=-1)
+
 
 @dataclass(frozen=True)
 class PoseStream:
@@ -66,6 +78,11 @@ class PoseStream:
     x: np.ndarray  # (T,) m
     y: np.ndarray
     yaw: np.ndarray  # (T,) rad, unwrapped
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 3) of x, y and yaw."""
+        return np.stack([self.x, self.y, self.yaw], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -186,7 +203,7 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
 
 def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
-    held_out: bool = False, group: str = "",
+    held_out: bool = False,
 ) -> Trial:
     """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
     the odometry is counted from there.
@@ -211,7 +228,7 @@ def make_trial(
         yaw0 = odometry.yaw[rest].mean()
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
-    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out, group)
+    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
 
 
 def manoeuvre_of(trial_name: str) -> str:

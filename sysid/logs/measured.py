@@ -101,13 +101,13 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
                 "pose_stamps": "receipt"})
 
 
-def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
+def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -> Log:
     """Load MRCLAM robots as consecutive windows in which the robot was told to move."""
     folder = Path(folder)
     trials: list[Trial] = []
     notes = []
     for robot in robots:
-        robot_trials, note = _mrclam_robot(folder, robot, window)
+        robot_trials, note = _mrclam_robot(folder, robot, MRCLAM_WINDOW)
         trials += robot_trials
         notes.append(note)
     return Log("mrclam", CREATE, tuple(trials), hash_files(folder), tuple(notes))

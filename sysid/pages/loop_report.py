@@ -116,7 +116,8 @@ def make_report(result: Result) -> dict[str, Any]:
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
                        for each in found.rounds],
-        "detectable": detectable(result, days), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "detectable": detectable(result, days),
+        "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
@@ -293,12 +294,6 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
                     "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
                     "unit": unit_of(axis.parameter), "power": power})
     return out
-
-
-def lives_in(result: Result) -> list[dict[str, Any]]:
-    """Where the unexplained residual lives (`sysid.missing.unexplained`)."""
-
-    return where_it_lives(result)
 
 
 def base_table(result: Result) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.pages.html import Section
 from sysid.pages.series import TrialSeries
+from whill_mjx.logs.dataset import write_text
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -68,7 +68,7 @@ def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    _write(path, json.dumps(plain(report), indent=1) + "\n")
+    write_text(path, json.dumps(plain(report), indent=1) + "\n")
 
 
 def read_report(run: Path) -> dict[str, Any]:
@@ -104,7 +104,8 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series = load(run) if (run / FILE).is_file() else replay(run, report)
     page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
                      [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
-    return _write(run / "report.html", page)
+    write_text(run / "report.html", page)
+    return run / "report.html"
 
 
 def code_hashes() -> dict[str, str]:
@@ -123,13 +124,6 @@ def code_hashes() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
-
-
-def _write(path: Path, text: str) -> Path:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
-    return path
 
 
 def table(report: dict[str, Any]) -> str:

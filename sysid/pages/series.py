@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import CHANNELS, ideal_replay
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")
@@ -63,7 +63,7 @@ def collect(
         for channel in CHANNELS:
             stream = getattr(trial, channel)
             if stream is not None:
-                channels[channel] = Channel(stream.t, {name: _table(getattr(source, channel))
+                channels[channel] = Channel(stream.t, {name: getattr(source, channel).values
                                                        for name, source in sources.items()})
         start = trial.start.x, trial.start.y, trial.start.yaw
         found.append(TrialSeries(trial.name, trial.held_out, start, channels))
@@ -131,11 +131,3 @@ def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
     before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
                      for k in (0, 1))
     return collect(trials, before, after)
-
-
-def _table(stream: PoseStream | OdometryStream) -> np.ndarray:
-    absent = np.full(len(stream.t), np.nan)
-    columns = [absent if one is None else one for one in (stream.x, stream.y, stream.yaw)]
-    if isinstance(stream, OdometryStream):
-        columns += [stream.v, stream.omega]
-    return np.column_stack(columns)

@@ -13,6 +13,8 @@ import jax
 import mujoco
 import numpy as np
 
+from whill_mjx.logs.dataset import write_text
+
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_GAIN = 1.0  # N m s/rad of the velocity servos that a model without actuators gets
 FIELDS = {  # KIND, FIELD -> array of the model, column, unit
@@ -201,9 +203,7 @@ def write_mjcf(robot: Robot, values: Mapping[Entry, float], path: Path) -> Path:
         for number in entry.ids:
             _put(spec, entry, number, _Overlaid(host, arrays))
     spec.compile()
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(spec.to_xml())
-    os.replace(temporary, path)
+    write_text(path, spec.to_xml())
     return path
 
 

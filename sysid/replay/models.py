@@ -7,7 +7,6 @@ that act on commands or on what the odometry reports may be put around either.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from sysid.logs.log import Trial
 from sysid.replay.records import Plant
 from whill_mjx.effects import EFFECTS, make_effects
 from whill_mjx.effects.base import apply_chain
+from whill_mjx.logs.dataset import write_text
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
@@ -281,10 +281,8 @@ def save_model(
                     **({"interval": [float(end) for end in intervals[name]]} if name in intervals else {})}
              for (name, about), value in zip(describe_parameters(params).items(), values, strict=True)}
     path = Path(folder) / "model.toml"
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(tomlkit.dumps({"schema": 1, "kind": "micromobility-model", "model": model.name,
-                                        "parameters": table, "provenance": dict(provenance)}))
-    os.replace(temporary, path)
+    write_text(path, tomlkit.dumps({"schema": 1, "kind": "micromobility-model", "model": model.name,
+                                    "parameters": table, "provenance": dict(provenance)}))
     if model.write is not None:
         model.write(Path(folder), params)
     return path

@@ -62,7 +62,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
             return jnp.stack([cos * a - sin * b, sin * a + cos * b])
 
         origin = start[:2] + rotate(state.qpos[0] - x, state.qpos[1] - y)
-        attitude = _quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
+        attitude = quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
         qpos = jnp.concatenate([origin, state.qpos[2:3], attitude, state.qpos[7:]])
         qvel = jnp.concatenate([rotate(state.qvel[0], state.qvel[1]), state.qvel[2:]])
         zero = jnp.zeros_like(turn)
@@ -76,7 +76,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
                  lambda params, state, commands: record(model, params, state, commands, observe), arithmetic=True)
 
 
-def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
+def quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Rotation b, then a (w, x, y, z)."""
     return jnp.stack([
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -93,8 +93,8 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     stride = max(round(record_dt / dt), 1)
     record = stride * dt
     records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
-    poses = [_pose_table(trial.ground_truth) for trial in trials]
-    odometries = [_odometry_table(trial.odometry) for trial in trials]
+    poses = [_table(trial.ground_truth, 3) for trial in trials]
+    odometries = [_table(trial.odometry, 5) for trial in trials]
     command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
     start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
     pose_t, pose, pose_mask = _pad(poses)
@@ -352,17 +352,7 @@ def _pad(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nd
     return time, values, mask
 
 
-def _pose_table(stream: PoseStream | None) -> tuple[np.ndarray, np.ndarray]:
-    if stream is None:
-        return np.zeros(0), np.zeros((0, 3))
-    return stream.t, np.stack([stream.x, stream.y, stream.yaw], axis=-1)
-
-
-def _odometry_table(stream: OdometryStream | None) -> tuple[np.ndarray, np.ndarray]:
-    if stream is None:
-        return np.zeros(0), np.zeros((0, 5))
-    absent = np.full(len(stream.t), np.nan)
-    pose = [absent if values is None else values for values in (stream.x, stream.y, stream.yaw)]
-    return stream.t, np.stack([*pose, stream.v, stream.omega], axis=-1)
+def _table(stream: PoseStream | OdometryStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    return (np.zeros(0), np.zeros((0, columns))) if stream is None else (stream.t, stream.values)
 
 

@@ -10,7 +10,7 @@ import pytest
 from sysid.logs.log import load_log, manoeuvre_of
 from sysid.logs.measured import load_any
 from sysid.logs.streams import trial_quality
-from sysid.logs.synthetic import write_csv, write_text
+from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia
 from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
 

@@ -71,6 +71,21 @@ def test_a_file_from_before_a_parameter_was_added_has_it_neutral(tmp_path):
         load_vehicle(path)
 
 
+def test_a_built_in_vehicle_is_loaded_by_its_name_and_named_as_its_origin():
+    spec, params, provenance = load_vehicle("whill_cr_ramp")
+    assert (spec, provenance) == (preset("whill_cr_ramp")[0], {"preset": "whill_cr_ramp"})
+    assert [effect.name for effect in params.effects] == [effect.name for effect in preset("whill_cr_ramp")[1].effects]
+
+
+def test_a_file_of_any_ending_is_read_as_a_vehicle_file(saved):
+    assert load_vehicle(saved.rename(saved.with_suffix("")))[2] == {"fit": "none"}
+
+
+def test_a_name_that_is_neither_lists_all_that_are_known():
+    with pytest.raises(ValueError, match="unknown vehicle 'whill'.*create, .*whill_cr, .*whill_cr_ramp.*vehicle file"):
+        load_vehicle("whill")
+
+
 def test_a_missing_file_tells_how_to_make_one(tmp_path):
     with pytest.raises(FileNotFoundError, match="sysid.fit"):
         load_vehicle(tmp_path / "none.toml")

@@ -25,7 +25,7 @@ from whill_mjx.effects.state_rate import StateRate
 from whill_mjx.effects.torque_drive import TorqueDrive
 from whill_mjx.effects.yaw_scrub import YawScrub
 from whill_mjx.vehicle.model import box_inertia
-from whill_mjx.vehicle.specs import VehicleSpec, find_spec
+from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 from whill_mjx.vehicle.types import Body, VehicleParams
 
 
@@ -45,7 +45,10 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     if name in whill:
         spec = find_spec("whill_cr")
         return spec, whill[name](spec)
-    spec = find_spec(name)
+    if name not in SPECS:
+        known = ", ".join(sorted({*whill, *SPECS}))
+        raise ValueError(f"unknown vehicle {name!r} (known: {known}). Use one of them or a vehicle file.")
+    spec = SPECS[name]
     return spec, preset_params(spec, "paper")
 
 

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects import EFFECTS
+from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
@@ -73,7 +74,20 @@ def save_vehicle(
     return path
 
 
-def load_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
+def load_vehicle(name_or_path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
+    """Spec, parameters and provenance of a built-in vehicle or a vehicle file.
+
+    Raises:
+        ValueError: neither a name (the error lists all of them) nor a valid file.
+        FileNotFoundError: as of `read_vehicle`.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".toml" or path.is_file():
+        return read_vehicle(path)
+    return *preset(str(name_or_path)), {"preset": str(name_or_path)}
+
+
+def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
     """Spec, parameters and provenance of a vehicle file.
 
     Raises:
