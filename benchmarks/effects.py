@@ -30,8 +30,8 @@ from whill_mjx.vehicle.types import VehicleParams, parameters_of
 DOCS = Path(__file__).parent.parent / "docs"
 INTRODUCTION = """# Effects
 
-This page is the reference of all physical effects. `python -m benchmarks.effects page` makes it from the docstrings in
-`whill_mjx/effects/`, which say more. [How to find which effect a vehicle has](close_loop.md).
+This page is the reference of all physical effects. `python -m benchmarks.effects page` makes it from the classes in
+`whill_mjx/effects/`, whose docstrings say more. [How to find which effect a vehicle has](close_loop.md).
 
 A vehicle is a spec, a mass distribution and a tuple of effects. Each effect acts at one place. At its neutral values it
 vanishes to the last bit (the two drives, `pid_drive` and `torque_drive`, then give no force).
@@ -67,8 +67,8 @@ The last one says whether an outside pose shows it without odometry.
 |---|---|---|---|---|
 """
 ALIKE = """## Which look alike
-Ordinary drives with odometry and outside pose can hardly separate these. Free one of each row in a fit, or add what the
-last column says.
+Odometry and outside pose of ordinary drives cannot separate these effects, or only barely. Free one of each row in a
+fit, or add what the last column says.
 
 | alike | why | what separates them |
 |---|---|---|
