@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from whill_mjx import fields
+
 
 @dataclass(frozen=True)
 class CameraMount:
@@ -55,14 +57,8 @@ class VehicleSpec:
     camera: CameraMount = CameraMount()
 
     def __post_init__(self) -> None:
-        for field in ("wheel_radius", "track", "wheelbase", "mass", "wheel_inertia"):
-            value = getattr(self, field)
-            if not value > 0:
-                raise ValueError(f"vehicle {self.name!r}: {field} is {value}; it must be positive (SI units).")
-        if self.drive not in ("differential", "skid"):
-            raise ValueError(f"vehicle {self.name!r}: drive is {self.drive!r}; use 'differential' or 'skid'.")
-        if self.driven_axle not in ("rear", "front"):
-            raise ValueError(f"vehicle {self.name!r}: driven_axle is {self.driven_axle!r}; use 'rear' or 'front'.")
+        fields.check_fields(f"vehicle {fields.shown(self.name)}", fields.SPEC, self)
+        fields.check_fields(f"camera of vehicle {fields.shown(self.name)}", fields.CAMERA, self.camera)
 
     @property
     def rear_x(self) -> float:
