@@ -29,6 +29,7 @@ CSV_BYTES = 60 * MB  # a day at 10 Hz, three hours at 100 Hz
 ARRAY_BYTES = 250 * MB  # of a .npz or .gz when unpacked
 MEMBERS = 20_000  # arrays of a .npz
 NPY_HEADER = 10_000  # bytes
+LONGEST_REASON = 160  # characters of what a library says
 
 
 def read_bytes(path: str | Path, limit: int, missing: str) -> bytes:
@@ -78,9 +79,9 @@ def read_toml(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError(f"{path}: not a TOML file (brackets are nested too deep). {hint}") from None
+        raise ValueError(f"{path}: not a TOML file: it is not valid TOML (brackets are nested too deep). {hint}") from None
     except ValueError as error:  # also an integer of too many digits, or a date that is none
-        raise ValueError(f"{path}: not a TOML file ({_first_line(error)}). {hint}") from None
+        raise ValueError(f"{path}: not a TOML file: it is not valid TOML ({_first_line(error)}). {hint}") from None
 
 
 def read_json(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
@@ -244,4 +245,4 @@ def read_gzip(path: str | Path, missing: str, hint: str) -> str:
 
 def _first_line(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
-    return shown(lines[0])[1:-1] if lines else type(error).__name__
+    return ascii(lines[0][:LONGEST_REASON])[1:-1] if lines else type(error).__name__
