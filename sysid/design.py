@@ -24,6 +24,7 @@ from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.log import Command
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
 from sysid.replay.rollout import Measured, Plant, Replay, Simulated, make_batch, vehicle_plant
+from whill_mjx.fields import Field, check_table
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -340,9 +341,12 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
     report = read_report(Path(name))
     file = str(Path(name) / "vehicle.toml")
     spec, params = find_vehicle(file)
-    scale = report["noise"]["scale"]
-    noise = Noise(np.array([scale[f"ground_truth.{key}"] for key in ("x", "y", "yaw")]),
-                  np.array([scale[f"odometry.{key}"] for key in ("x", "y", "yaw", "v", "omega")]), "fit")
+    outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
+        ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))
+    fields = [Field(key, "SI", 1e-12, 1e6, remedy="Fit the log again.") for key in (*outside, *own)]
+    found = report["noise"].get("scale")
+    scale = check_table(str(Path(name) / "report.json"), fields, found, "noise.scale", others=True)
+    noise = Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
     return spec, params, load_intervals(file), noise
 
 

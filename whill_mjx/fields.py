@@ -1,4 +1,4 @@
-"""The fields of all files that people write or that come from elsewhere: unit, kind and range, and the check of a value.
+"""The fields of all files that people write or that come from elsewhere: unit, kind, range, and the check of a value.
 
 One table per kind of file. A reader gets its file's content from `whill_mjx.reading` and puts every value through
 `check_table` or `check`; classes that are made in code too (`VehicleSpec`, `Task`, `Env`) call `check_fields`. An error
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,7 +77,9 @@ def check(where: str, field: Field, value: Any, name: str | None = None) -> Any:
     return value
 
 
-def check_table(where: str, fields: Iterable[Field], table: Any, name: str = "", remedy: str = "") -> dict[str, Any]:
+def check_table(
+    where: str, fields: Iterable[Field], table: Any, name: str = "", remedy: str = "", others: bool = False
+) -> dict[str, Any]:
     """The checked values of a table by field name; fields that are not needed and not there are left out.
 
     Args:
@@ -86,21 +88,22 @@ def check_table(where: str, fields: Iterable[Field], table: Any, name: str = "",
         table: as it was read.
         name: of the table, where it is not the whole file.
         remedy: for a field of an unknown name.
+        others: pass over fields of an unknown name.
     """
     known = {field.name: field for field in fields}
     prefix = f"{name} has " if name else ""
     if not isinstance(table, dict):
         raise ValueError(f"{where}: {name or 'the content'} is {shown(table)}; it must be a table. Correct it.")
     for key in table:
-        if key not in known:
+        if key not in known and not others:
             raise ValueError(f"{where}: {prefix}unknown field {shown(key)} (known: {', '.join(sorted(known))}). "
                              f"{remedy or 'Correct its spelling or remove it.'}")
     for field in known.values():
         if field.needed and field.name not in table:
             unit = "" if field.unit == "-" else f" [{field.unit}]"
-            raise ValueError(f"{where}: {prefix}no entry {field.name!r}{unit}. Add it.")
+            raise ValueError(f"{where}: {prefix}no field {field.name!r}{unit}. Add it.")
     dot = f"{name}." if name else ""
-    return {key: check(where, known[key], value, dot + key) for key, value in table.items()}
+    return {key: check(where, known[key], value, dot + key) for key, value in table.items() if key in known}
 
 
 def check_fields(where: str, fields: Iterable[Field], holder: Any) -> None:
@@ -125,7 +128,7 @@ def shown(value: Any) -> str:
 
 
 def _check_number(where: str, field: Field, value: Any, name: str) -> float:
-    kind = numbers.Integral if field.kind == "whole" else numbers.Real
+    kind: Any = numbers.Integral if field.kind == "whole" else numbers.Real
     rule = f"lie within {field.low:g} to {field.high:g}" if field.high < math.inf else f"be at least {field.low:g}"
     if field.low > 0:
         rule = f"be positive, from {field.low:g} to {field.high:g}" if field.high < math.inf else "be positive"
@@ -278,10 +281,10 @@ COLUMNS = {field.name: field for field in (
 MAP = (
     Field("image", kind="text"),
     Field("resolution", "m", 1e-4, 100.0),
-    Field("origin", "m, m, rad", -1e6, 1e6, kind="numbers", count=3, remedy="Write [x, y, yaw]."),
+    Field("origin", "m, m, rad", -1e6, 1e6, kind="numbers", count=3, remedy="It must be [x, y, yaw]."),
     Field("occupied_thresh", "-", 0.0, 1.0),
     Field("free_thresh", "-", 0.0, 1.0),
-    Field("negate", kind="whole", choices=(0, 1)),
+    Field("negate", kind="whole", choices=(0, 1), remedy="Write a finite number, 0 or 1."),
     Field("mode", kind="text", choices=("trinary", "scale"), needed=False, remedy="Save it as trinary."),
 )
 """YAML file of a map, as map_server reads it."""

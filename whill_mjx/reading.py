@@ -31,6 +31,16 @@ MEMBERS = 20_000  # arrays of a .npz
 NPY_HEADER = 10_000  # bytes
 LONGEST_REASON = 160  # characters of what a library says
 
+BROKEN_ARCHIVE: tuple[type[Exception], ...] = (
+    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What `zipfile` lets out about a damaged archive."""
+try:
+    import lzma
+except ImportError:  # a Python that was built without it
+    pass
+else:
+    BROKEN_ARCHIVE += (lzma.LZMAError,)
+
 
 def read_bytes(path: str | Path, limit: int, missing: str) -> bytes:
     """Content of a file of at most `limit` bytes.
@@ -79,7 +89,7 @@ def read_toml(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError(f"{path}: not a TOML file: it is not valid TOML (brackets are nested too deep). {hint}") from None
+        raise ValueError(f"{path}: not a TOML file: it is not valid TOML (nested too deep). {hint}") from None
     except ValueError as error:  # also an integer of too many digits, or a date that is none
         raise ValueError(f"{path}: not a TOML file: it is not valid TOML ({_first_line(error)}). {hint}") from None
 
@@ -90,7 +100,7 @@ def read_json(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
     try:
         content = json.loads(text)
     except RecursionError:
-        raise ValueError(f"{path}: not valid JSON (brackets are nested too deep). {hint}") from None
+        raise ValueError(f"{path}: not valid JSON (nested too deep). {hint}") from None
     except ValueError as error:
         raise ValueError(f"{path}: not valid JSON ({_first_line(error)}). {hint}") from None
     if not isinstance(content, dict):
@@ -143,8 +153,9 @@ def _find_columns(path: str | Path, header: list[str], fields: Sequence[Field], 
     for field in fields:
         if header.count(field.name) != 1:
             count = "no column" if field.name not in header else "more than one column"
-            raise ValueError(f"{path}: {count} {field.name!r} (found {shown(header)}). It needs "
-                             f"{', '.join(one.name for one in fields)} in SI units, separated by commas. {see}".rstrip())
+            names = ", ".join(one.name for one in fields)
+            raise ValueError(f"{path}: {count} {field.name!r} (found {shown(header)}). It needs {names} in SI units, "
+                             f"separated by commas. {see}".rstrip())
     return [header.index(field.name) for field in fields]
 
 
@@ -194,18 +205,9 @@ def read_arrays(path: str | Path, missing: str, hint: str) -> dict[str, np.ndarr
                 found[one.filename.removesuffix(".npy")] = _array(one.filename, content)
     except MemoryError:
         raise ValueError(f"{path}: cannot be read as .npz (more memory than there is). {hint}") from None
-    except (ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
-            *_lzma_errors()) as error:
+    except BROKEN_ARCHIVE as error:
         raise ValueError(f"{path}: cannot be read as .npz ({_first_line(error)}). {hint}") from None
     return found
-
-
-def _lzma_errors() -> tuple[type[Exception], ...]:
-    try:
-        import lzma
-    except ImportError:  # a Python that was built without it
-        return ()
-    return (lzma.LZMAError,)
 
 
 def _array(name: str, content: bytes) -> np.ndarray:

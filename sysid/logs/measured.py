@@ -23,7 +23,7 @@ from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Tria
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.streams import without_held
 from whill_mjx.fields import shown
-from whill_mjx.reading import read_arrays, read_gzip
+from whill_mjx.reading import LONGEST_REASON, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
@@ -158,8 +158,8 @@ def _drive_windows(path: Path, run: str, chained: bool
     gyro = GYRO_SIGN.get(run, 1.0) * block("imu_yaw")
     for name in DRIVE_COLUMNS:
         if not (np.abs(block(name)) < LARGEST).all():
-            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT}, and leave out incomplete "
-                             "windows.")
+            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
+                             "incomplete windows.")
     length = DRIVE_STEP_ROWS if chained else 1
     t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
     trials, missed = [], []
@@ -229,7 +229,7 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
         try:
             values = np.array([float(row[name] or "nan") for row in rows])
         except ValueError as error:
-            raise ValueError(f"{path}: {name}: {error}. {CONVERT}.") from None
+            raise ValueError(f"{path}: {name}: {shown(str(error))}. {CONVERT}.") from None
         if (np.abs(values) >= LARGEST).any():
             raise ValueError(f"{path}: {name} is {LARGEST:g} or more. {CONVERT}.")
         return values
@@ -340,7 +340,7 @@ def _read_gz(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
             warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused below
             table = np.loadtxt(io.StringIO(text), ndmin=2)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}. {ORIGINAL}") from None
+        raise ValueError(f"{path}: {str(error)[:LONGEST_REASON]}. {ORIGINAL}") from None
     if table.shape[1] != columns or not len(table):
         raise ValueError(f"{path}: {table.shape} values; {columns} columns are needed. {ORIGINAL}")
     if not np.isfinite(table).all() or (np.abs(table[:, 1:]) >= LARGEST).any() or np.ptp(table[:, 0]) > LARGEST:

@@ -52,6 +52,9 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     }  # fmt: skip
     if name in whill:
         spec = find_spec("whill_cr")
+        if name == "whill_cr_documented":
+            limits: Any = {key: command_quantisation.MAKER[key] for key in ("v_min", "v_max", "omega_max")}
+            spec = replace(spec, **limits)
         return spec, whill[name](spec)
     spec = find_spec(name)
     return spec, preset_params(spec, "paper")

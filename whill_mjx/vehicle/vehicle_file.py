@@ -131,8 +131,8 @@ def _read(path: Path) -> dict[str, Any]:
     content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
                         "Vehicle files are written by sysid.fit.")
     if content.get("kind") == KIND and content.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: schema is {fields.shown(content.get('schema'))}; this version reads schema {SCHEMA}. "
-                         "Fit the vehicle again.")
+        raise ValueError(f"{path}: schema is {fields.shown(content.get('schema'))}; this version reads schema {SCHEMA}."
+                         " Fit the vehicle again.")
     if content.get("kind") != KIND:
         raise ValueError(f"{path}: kind is {fields.shown(content.get('kind'))}, not {KIND!r}. Give a vehicle file.")
     return fields.check_table(str(path), fields.VEHICLE, content, remedy=NEWER)
@@ -155,7 +155,8 @@ def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[
         checked = fields.check_table(str(path), fields.EFFECT, table, f"effects[{index}]", NEWER)
         if checked["name"] not in EFFECTS:
             raise ValueError(f"{path}: unknown effect {fields.shown(checked['name'])} (known: "
-                             f"{', '.join(sorted(EFFECTS))}). Correct its name, or use a newer version of this program.")
+                             f"{', '.join(sorted(EFFECTS))}). Correct its name or use a newer version of this program."
+                             )
         found.append((checked["name"], checked["parameters"]))
     return found
 
