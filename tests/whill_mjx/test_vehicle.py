@@ -360,7 +360,7 @@ def test_a_vehicle_cuts_commands_to_its_limits(command):
 
 
 def test_commands_within_the_limits_and_their_derivatives_are_left_as_they_are():
-    model, params, _ = compiled_period("whill_cr_physical")
+    model, params, _ = compiled_period("whill_cr_paper")  # no delay
     state = place(model, params, 0.0, 0.0, 0.0)
 
     def speed(model, command):
