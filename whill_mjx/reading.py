@@ -10,11 +10,12 @@ import csv
 import io
 import json
 import math
+import re
 import tomllib
 import zipfile
 import zlib
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,14 @@ from whill_mjx.fields import Field, check, shown
 
 MB = 1_000_000
 TOML_BYTES = MB // 2  # a vehicle file has 5 kB
-JSON_BYTES = 50 * MB  # a report of a long log has 1 MB
+JSON_BYTES = 20 * MB  # a report of a long log has 1 MB
 CSV_BYTES = 60 * MB  # a day at 10 Hz, three hours at 100 Hz
-ARRAY_BYTES = 250 * MB  # of a .npz or .gz when unpacked
+ARRAY_BYTES = 100 * MB  # of a .npz or .gz when unpacked
 MEMBERS = 20_000  # arrays of a .npz
 NPY_HEADER = 10_000  # bytes
+LONGEST_LINE = 100_000  # characters of a CSV
+LONG_KEY = re.compile(r"""(?:[\w\-"' \t]*+\.){100}""")
+"""A key of a hundred parts, for which the parser takes the square of their number."""
 LONGEST_REASON = 160  # characters of what a library says
 
 BROKEN_ARCHIVE: tuple[type[Exception], ...] = (
@@ -86,6 +90,9 @@ def decoded(path: str | Path, data: bytes) -> str:
 def read_toml(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
     """Content of a TOML file; `hint` ends the error about one that is none."""
     text = read_text(path, TOML_BYTES, missing)
+    if long := LONG_KEY.search(text):
+        line = text.count("\n", 0, long.start()) + 1
+        raise ValueError(f"{path}, line {line}: not a TOML file: a key of a hundred parts. {hint}")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -116,37 +123,66 @@ def read_csv(path: str | Path, fields: Sequence[Field], missing: str, see: str =
         missing: as of `read_bytes`.
         see: ends the error about a missing column.
     """
-    reader = csv.reader(io.StringIO(read_text(path, CSV_BYTES, missing), newline=""))
-    header: list[str] = []
-    columns: list[int] = []
-    values, lines = array("d"), array("q")
+    text = read_text(path, CSV_BYTES, missing)
+    plain = text.isascii() and "_" not in text  # what Python takes for part of a number, and no other program does
+    rows = csv_rows(path, text)
     try:
-        for row in reader:
-            if not row or (len(row) == 1 and not row[0].strip()):
-                continue
-            if not header:
-                header = [name.strip() for name in row]
-                columns = _find_columns(path, header, fields, see)
-                continue
-            lines.append(reader.line_num)
-            if len(row) != len(header):
-                raise ValueError(_wrong_length(path, reader.line_num, row, header, fields))
-            values.extend(_numbers(path, reader.line_num, [row[column] for column in columns], fields))
-    except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: is no CSV ({error}). Save the table again.") from None
-    if not header:
-        _find_columns(path, header, fields, see)
+        _, header = next(rows)
+    except StopIteration:
+        header = []
+    header = [name.strip() for name in header]
+    columns = _find_columns(path, header, fields, see)
+    values, lines = array("d"), array("q")
+    for line, row in rows:
+        if len(row) != len(header):
+            raise ValueError(_wrong_length(path, line, row, header, fields))
+        cells = [row[column] for column in columns]
+        try:
+            values.extend([float(cell) for cell in cells] if plain else _numbers(path, line, cells, fields))
+        except ValueError:
+            _numbers(path, line, cells, fields)  # says what is wrong
+            raise
+        lines.append(line)
     if len(lines) < 2:
         raise ValueError(f"{path}: {len(lines)} rows of data; at least 2 are needed. Delete the empty file or record "
                          "it again.")
-    table = np.array(values).reshape(len(lines), len(fields))
+    table = np.frombuffer(values).reshape(len(lines), len(fields))
     found = {field.name: table[:, column].copy() for column, field in enumerate(fields)}
     for field in fields:
-        outside = (found[field.name] < field.low) | (found[field.name] > field.high)
+        outside = ~((found[field.name] >= field.low) & (found[field.name] <= field.high))
         if outside.any():
             row_number = int(np.flatnonzero(outside)[0])
-            check(f"{path}, line {lines[row_number]}", field, float(found[field.name][row_number]))
+            value, where = float(found[field.name][row_number]), f"{path}, line {lines[row_number]}"
+            if not math.isfinite(value):
+                raise ValueError(f"{where}: {field.name} is {value}; it must be finite. Leave a missing sample's row "
+                                 "out.")
+            check(where, field, value)
     return {**found, "line": np.array(lines)}
+
+
+def csv_rows(path: str | Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of the rows of a CSV text; blank lines are left out, and no row spans lines."""
+    reader = csv.reader(_lines(path, text))
+    try:
+        for row in reader:
+            if row and (len(row) > 1 or row[0].strip()):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: is no CSV ({error}). Save the table again.") from None
+
+
+def _lines(path: str | Path, text: str) -> Iterator[str]:
+    start, number = 0, 1
+    while start < len(text):
+        end = text.find("\n", start) + 1 or len(text)
+        line = text[start:end]
+        if len(line) > LONGEST_LINE:
+            raise ValueError(f"{path}, line {number}: has {len(line)} characters; at most {LONGEST_LINE} are read. "
+                             "Save the table again.")
+        if '"' in line and line.count('"') % 2:
+            raise ValueError(f"{path}, line {number}: a quote is not closed. Save the table again, without quotes.")
+        yield line
+        start, number = end, number + 1
 
 
 def _find_columns(path: str | Path, header: list[str], fields: Sequence[Field], see: str) -> list[int]:
@@ -222,7 +258,7 @@ def _array(name: str, content: bytes) -> np.ndarray:
     except Exception as error:  # numpy parses the header as Python text, and lets much of its parser's errors out
         raise ValueError(f"array {shown(name)} has a damaged header ({_first_line(error)})") from None
     size = math.prod(shape)
-    rest = content[file.tell() :]
+    rest = memoryview(content)[file.tell() :]
     if dtype.hasobject or dtype.kind not in "biufU" or not dtype.itemsize or min(shape, default=0) < 0:
         raise ValueError(f"array {shown(name)} holds {shown(str(dtype))}, which is neither numbers nor text")
     if size * dtype.itemsize != len(rest):

@@ -10,9 +10,9 @@ both systems repeat the last value between updates.
 
 from __future__ import annotations
 
-import csv
 import io
 import warnings
+from array import array
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,16 @@ from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Tria
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.streams import without_held
 from whill_mjx.fields import shown
-from whill_mjx.reading import LONGEST_REASON, read_arrays, read_gzip
+from whill_mjx.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
 DRIVE_ROWS = 40  # samples of one window (2 s)
 DRIVE_COLUMNS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
 MAX_NANOSECONDS = 86_400 * 10**9
+CONTINUOUS_COLUMNS = (
+    *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
+    "cmd_vel_omega")
 LARGEST = 1e6  # m, rad or rad/s that a measured value stays below
 CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
@@ -221,22 +224,17 @@ def _chain(
 
 def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
     """Windows of the continuous log during its calibration phases (elsewhere a joystick drove and was not logged)."""
-    rows = _read_rows(path)
+    columns, times, states = _read_rows(path)
 
     def column(name: str) -> np.ndarray:
-        if name not in rows[0]:
-            raise ValueError(f"{path}: no column {name!r} (found {shown(sorted(rows[0]))}). {CONVERT}.")
-        try:
-            values = np.array([float(row[name] or "nan") for row in rows])
-        except ValueError as error:
-            raise ValueError(f"{path}: {name}: {shown(str(error))}. {CONVERT}.") from None
+        values = np.array(columns[name])
         if (np.abs(values) >= LARGEST).any():
             raise ValueError(f"{path}: {name} is {LARGEST:g} or more. {CONVERT}.")
         return values
 
     spec = drive_spec(run)
-    t = _nanoseconds(path, [row.get("ros_time", "") for row in rows])
-    calibrating = np.array([row.get("calib_state") == "calib" for row in rows])
+    t = _nanoseconds(path, times)
+    calibrating = np.array(states)
     qx, qy, qz, qw = (column(f"icp_quat_{axis}") for axis in "xyzw")
     yaw = np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
     x, y = column("icp_pos_x"), column("icp_pos_y")
@@ -262,20 +260,35 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
     return trials, f"{run}: {len(trials)} windows of {window:g} s during calibration phases"
 
 
-def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a continuous log, without the first, which is filler."""
-    reader = csv.DictReader(io.StringIO(read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}.")),
-                            restkey="", restval="")
-    try:
-        rows = list(reader)[1:]
-    except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: is no CSV ({error}). {CONVERT}.") from None
-    if len(rows) < 2:
-        raise ValueError(f"{path}: {len(rows)} rows of data; at least 2 are needed. {CONVERT}.")
-    longer = next((row for row in rows if "" in row), None)
-    if longer is not None:
-        raise ValueError(f"{path}: a row has more cells than the header, from {shown(longer[''])} on. {CONVERT}.")
-    return rows
+def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
+    """Numbers by column (nan where there is none), times and whether calibrating, of a continuous log.
+
+    Its first row is filler and left out.
+    """
+    rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
+    header = next(rows, (0, []))[1]
+    for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):
+        if name not in header:
+            raise ValueError(f"{path}: no column {name!r} (found {shown(sorted(header))}). {CONVERT}.")
+    index = {name: header.index(name) for name in header}
+    columns: dict[str, array] = {name: array("d") for name in CONTINUOUS_COLUMNS}
+    times, states = [], []
+    for number, (line, row) in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"{path}, line {line}: has {len(row)} cells, the header {len(header)}. {CONVERT}.")
+        if number == 0:
+            continue
+        for name, values in columns.items():
+            try:
+                values.append(float(row[index[name]] or "nan"))
+            except ValueError:
+                raise ValueError(f"{path}, line {line}: {name} is {shown(row[index[name]])}; it must be a number. "
+                                 f"{CONVERT}.") from None
+        times.append(row[index["ros_time"]])
+        states.append(row[index["calib_state"]] == "calib")
+    if len(times) < 2:
+        raise ValueError(f"{path}: {len(times)} rows of data; at least 2 are needed. {CONVERT}.")
+    return columns, times, states
 
 
 def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
