@@ -28,32 +28,34 @@ from whill_mjx.vehicle.types import VehicleParams, parameters_of
 DOCS = Path(__file__).parent.parent / "docs"
 INTRODUCTION = """# Effects
 
-Written by `python -m benchmarks.effects page` from `whill_mjx/effects/`; the docstrings there say more.
+This page is the reference of all physical effects. `python -m benchmarks.effects page` makes it from the docstrings in
+`whill_mjx/effects/`, which say more. [How to find which effect a vehicle has](close_loop.md).
 
-A vehicle is a spec, a mass distribution and a tuple of effects. Each acts at one place and vanishes to the last bit at
-its neutral values (the two drives, `pid_drive` and `torque_drive`, then give no force). In the tables: unit of each
-parameter; usual values on a real vehicle; the range that a fit may search; the neutral value. A source "estimate" is an
-engineering range without a published number behind it.
+A vehicle is a spec, a mass distribution and a tuple of effects. Each effect acts at one place. At its neutral values it
+vanishes to the last bit (the two drives, `pid_drive` and `torque_drive`, then give no force).
+
+Each table lists the parameters with their unit, the usual values on a real vehicle, the range that a fit may search,
+and the neutral value. A source "estimate" is an engineering range without a published number behind it.
 
     python -m whill_mjx.drive --manoeuvre figure_eight --effects yaw_scrub:torque=6 slope:along_x=0.02 --out DATASET
 
 ![What each effect changes in one drive of the chair](images/effects.png)
 
-The figure has the chair's physical base model on the drive of the first panel; every other panel is the difference that
-one effect makes, at the end of its usual values that is further from neutral: in the speed or the yaw rate of the body,
-or, for effects of sensing, in what is reported. Scales differ.
+The first panel shows the drive of the chair's physical base model. Every other panel is the difference that one effect
+makes, at the end of its usual values that is further from neutral. The difference is in the speed or yaw rate of the
+body, or in what is reported for effects of sensing. Scales differ.
 """
 HEADINGS = {
-    "command": "Command: what the vehicle makes of (v, omega)",
+    "command": "Command: before the controller sees (v, omega)",
     "actuation": "Actuation: from wheel-speed targets to force or torque",
     "force": "Force: wrenches on the chassis and torques on the wheels",
     "world": "World: true geometry, ground, gravity, load",
     "sensing": "Sensing: what is reported",
-    "outside": "Outside: what a pose measured from outside makes of the motion",
+    "outside": "Outside: how a pose is measured from outside",
 }
 CLOSING = """## Which look alike
-From odometry and outside pose of ordinary drives these are hard or impossible to tell apart; a fit frees one of each
-row, or needs what the last column says.
+Odometry and outside pose of ordinary drives cannot separate these effects, or only barely. A fit frees one of each row,
+or needs what the last column says.
 
 | alike | why | what separates them |
 |---|---|---|
@@ -71,12 +73,12 @@ row, or needs what the last column says.
 
 ## Left out
 - What the chair does when a command lapses (brake, ramp) is not documented; `command_expiry` takes a command of zero.
-- A wheel touches the ground at one point: surfaces are smooth and longer than a wheel, no kerb or step can be climbed.
-- The cap of `traction_limit` knows nothing of cornering, and its wheels never break away; `slip_traction` of the
-  physical base model does both.
-- `payload_shift` leaves out products of inertia: a load that is both ahead of and above the centre of mass couples roll
-  and yaw, here it does not.
-- Fits read no gyro: `gyro_bias` and `gyro_range` show in the simulated gyro alone, and in `imu.csv` of a drive.
+- A wheel touches the ground at one point. Surfaces are smooth and longer than a wheel; no kerb or step can be climbed.
+- The cap of `traction_limit` ignores cornering, and its wheels never break away. `slip_traction` of the physical base
+  model has both.
+- `payload_shift` leaves out products of inertia. A real load that is both ahead of and above the centre of mass couples
+  roll and yaw.
+- Fits read no gyro. `gyro_bias` and `gyro_range` show only in the simulated gyro, and in `imu.csv` of a drive.
 """
 CHANNELS = {
     "body v": ("m/s", 0.01), "body omega": ("rad/s", 0.02), "odometry v": ("m/s", 0.01),

@@ -24,12 +24,13 @@ from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
 from sysid.errors.space import NUISANCE, Space, make_space, searched
-from sysid.fit import FitConfig, choose, fit_log, fitted_plant, make_problem
 from sysid.intervals.independence import Evidence
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
 from sysid.logs.log import Log, load_log
 from sysid.logs.synthetic import write_dataset
 from sysid.replay.models import with_effects
+from sysid.search.fitting import choose, fit_log, fitted_plant, make_problem
+from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec

@@ -9,13 +9,14 @@ import numpy as np
 
 from benchmarks.fit_scores import evaluate, gains, show, show_parameters
 from benchmarks.harness import figure, record
-from sysid.fit import FitConfig, fit_log
 from sysid.logs.log import Log, Trial
 from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
 
 if TYPE_CHECKING:
-    from benchmarks.fit import Benchmark
+    from benchmarks.fit_settings import Benchmark
 
 CLAIM = "A fitted vehicle predicts real robots better than an ideal one"
 DRIVE_TRAIN = {"asphalt": ("warthog_asphalt_a:0-0.667",), "sand": ("warthog_sand_1",)}

@@ -34,12 +34,12 @@ from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import estimate_noise
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, fit_log, make_problem
-from sysid.logs.log import Log, Trial, load_log
-from sysid.logs.metrics import command_in_force
+from sysid.logs.log import Log, Trial, command_in_force, load_log
 from sysid.search import least_squares, starts
+from sysid.search.comparison import Judge, Recorder
+from sysid.search.fitting import fit_log, make_problem
+from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
 from sysid.search.valleys import gradient_search
-from sysid.searches import Judge, Recorder
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 

@@ -18,12 +18,15 @@ from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import HUGE, Objective
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, choose, fitted_plant
 from sysid.logs.log import Log, load_log
 from sysid.search import least_squares, starts, tpe
+from sysid.search.comparison import Judge, arrivals, trace
+from sysid.search.fitting import Problem, choose, fitted_plant
+from sysid.search.result import Trace
+from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
 from sysid.search.studies import BATCH
 from sysid.search.valleys import from_all, gradient_search
-from sysid.searches import Judge, Trace, arrivals, trace, write
+from sysid.searches import write
 
 STARTS = 32
 SAME = 0.01

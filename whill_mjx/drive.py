@@ -258,7 +258,8 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
         raise ValueError(f"--out {options.out}: exists already; a drive never replaces another. Choose another folder.")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     chosen = tyro.cli(DriveOptions)
@@ -268,3 +269,7 @@ if __name__ == "__main__":
         sys.exit(f"whill_mjx.drive: {error}")
     count = len(list((folder / "trials").iterdir()))
     print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
+
+
+if __name__ == "__main__":
+    cli()

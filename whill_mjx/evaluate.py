@@ -292,8 +292,13 @@ def _named(text: str) -> tuple[str, str]:
     return name, value
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     try:
         main(tyro.cli(EvaluateOptions, description=__doc__))
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    cli()

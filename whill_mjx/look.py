@@ -216,8 +216,13 @@ def main(options: Look) -> None:
     print(f"{options.out}: {options.scene}")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     # `--task` is the option's former name.
     main(tyro.cli(Look, args=["--scene" if word == "--task" else word for word in sys.argv[1:]]))
+
+
+if __name__ == "__main__":
+    cli()

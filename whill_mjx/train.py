@@ -226,8 +226,9 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
+    from sysid import FitConfig, fit_dataset
     from sysid.command_line import progress_bar
-    from sysid.fit import FitConfig, expected_steps, fit_dataset
+    from sysid.search.fitting import expected_steps
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
@@ -382,7 +383,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         return None
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     try:
@@ -391,3 +393,7 @@ if __name__ == "__main__":
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("stopped; give the same command again to go on from the last checkpoint.")
+
+
+if __name__ == "__main__":
+    cli()

@@ -20,12 +20,11 @@ from sysid.errors.noise import ORDER, Whitener, first_scales, fit_roughness, fit
 from sysid.errors.normal_equations import NormalEquations, make_equations
 from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior
 from sysid.errors.prior import Prior
-from sysid.errors.space import Space
+from sysid.errors.space import STEP, Space
 from sysid.logs.log import Trial
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import on_processor
-from sysid.replay.differences import STEP
-from sysid.replay.rollout import Simulated
+from sysid.replay.records import Simulated
 from sysid.search import least_squares
 
 LONG = 8

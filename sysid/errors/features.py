@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.logs.log import Trial
 from sysid.replay.arrays import namespace
-from sysid.replay.rollout import Measured, Simulated
+from sysid.replay.records import Measured, Simulated
 
 BIN = 0.25  # s
 CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.yaw")

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.errors.space import Space
+from sysid.errors.robust import huber_weight, robust_cost
+from sysid.errors.space import STEP, Space
 from sysid.replay.cores import on_processor
-from sysid.replay.differences import STEP
-from sysid.replay.rollout import Simulated
-from sysid.search.least_squares import huber_weight, robust_cost
+from sysid.replay.records import Simulated
 
 DRIVES = 32768
 """Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,

@@ -19,12 +19,12 @@ import numpy as np
 
 from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.errors.prior import Prior
+from sysid.errors.robust import huber_weight
 from sysid.errors.space import Space
 from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
 from sysid.replay.arrays import added, namespace
-from sysid.replay.rollout import Measured, Simulated
-from sysid.search.least_squares import huber_weight
+from sysid.replay.records import Measured, Simulated
 
 DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
 """x, y [m], yaw [rad] and x, y, yaw, v [m/s], omega [rad/s]; only their ratio matters until they are re-estimated."""

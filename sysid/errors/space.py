@@ -14,6 +14,9 @@ import numpy as np
 from sysid.replay.arrays import namespace
 from whill_mjx.vehicle.specs import VehicleSpec
 
+STEP = 0.01
+"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+
 LOG_SPAN = 10.0
 # Parameters that no driving log tells, or that only act through another one; they keep their value unless named.
 FIXED = {

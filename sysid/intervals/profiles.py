@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.errors.pose_objective import Told
+from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space
 from sysid.intervals.uncertainty import Uncertainty
 from sysid.search import least_squares
@@ -78,7 +79,7 @@ def profile(
     check_names(space, names)
     sd = np.maximum(known.deviation, 1e-8)
     scale = _scale(objective, u, known, sd)
-    best = float(least_squares.robust_cost(objective.residuals(u[None]), robust)[0]) / objective.counted
+    best = float(robust_cost(objective.residuals(u[None]), robust)[0]) / objective.counted
     found = []
     for name in names:
         index = space.names.index(name)

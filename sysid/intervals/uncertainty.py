@@ -20,11 +20,11 @@ import numpy as np
 
 from sysid.errors.pose_objective import Told, without_prior
 from sysid.errors.prior import UNKNOWN
+from sysid.errors.robust import HUBER, huber_weight, robust_cost
 from sysid.errors.space import BENT, NUISANCE, TERMS, Space
 from sysid.intervals.independence import CONFIDENCE, Evidence, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
-from sysid.search.least_squares import HUBER, huber_weight, robust_cost
 from sysid.search.slopes import average_slopes, likely, likely_by
 
 PIECES = 8

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Log, Trial
+from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
-from sysid.logs.metrics import CHANNELS, command_in_force, ideal_replay, replicate_groups, replicate_noise
+from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.streams import speeds, standstill
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none

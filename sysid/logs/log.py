@@ -313,3 +313,16 @@ def _standard_errors(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[flo
         return 0.0, 0.0
     position = np.sqrt((x.var(ddof=1) + y.var(ddof=1)) / 2 / len(x))
     return float(position), float(np.sqrt(yaw.var(ddof=1) / len(x)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A simulated trial at the times of the measurements."""
+
+    ground_truth: PoseStream | None
+    odometry: OdometryStream | None
+
+
+def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
+    """Index of the command that holds at times t (T,); -1 before the first."""
+    return np.searchsorted(command.t, t + 1e-9, side="right") - 1

@@ -11,15 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A simulated trial at the times of the measurements."""
-
-    ground_truth: PoseStream | None
-    odometry: OdometryStream | None
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, command_in_force, manoeuvre_of
 
 
 @dataclass(frozen=True)
@@ -101,11 +93,6 @@ def integrate(command: Command, start: Start, t: np.ndarray) -> tuple[np.ndarray
     rest = np.maximum(t - times[k], 0.0)
     dx, dy = _arc(v[k], omega[k], yaw[k], rest)
     return x[k] + dx, y[k] + dy, yaw[k] + omega[k] * rest
-
-
-def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
-    """Index of the command that holds at times t (T,); -1 before the first."""
-    return np.searchsorted(command.t, t + 1e-9, side="right") - 1
 
 
 def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:

@@ -11,7 +11,8 @@ import numpy as np
 
 from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.scenarios import SCENARIOS, Scenario, command_sequence
-from sysid.replay.rollout import Plant, make_batch, simulate, vehicle_plant
+from sysid.replay.records import Plant
+from sysid.replay.rollout import make_batch, simulate, vehicle_plant
 from whill_mjx.logs.dataset import SensorNoise, write_csv, write_fields, write_text, write_trial
 from whill_mjx.vehicle.specs import VehicleSpec
 

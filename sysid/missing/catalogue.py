@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from sysid.missing.drives import ROUND
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, place_of
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
+
+ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
 
 GRAVITY = 9.81  # m/s^2
 LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)

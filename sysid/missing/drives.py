@@ -13,14 +13,15 @@ import numpy as np
 from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import roughness
 from sysid.logs.log import Trial
+from sysid.missing.catalogue import ROUND
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.rollout import ODOMETRY, POSE, Batch, Measured, PathReplay, Plant, Simulated, make_batch
+from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
+from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.types import parameters_of
 
 SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
 RECORD_DT = 0.025  # s between recorded states: bins of motion are ten times as long
-ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
 CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
 ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
 

@@ -13,10 +13,10 @@ from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.space import Space
 from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
+from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
-from sysid.missing.reference import difference_sizes
-from sysid.replay.rollout import Measured, Simulated
+from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 
 

@@ -4,26 +4,24 @@ does not reproduce, and the noise."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.noise import (
-    Whitener,
     first_scales,
     fit_roughness,
     fit_whitener,
     replicate_groups,
     roughness,
-    scatter,
 )
 from sysid.errors.space import Space, make_space
 from sysid.logs.log import Log, Trial
 from sysid.missing.base_fit import fit_base
-from sysid.missing.drives import Drives, make_drives
-from sysid.replay.rollout import Plant
+from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
+from sysid.missing.drives import make_drives
+from sysid.replay.records import Plant
 from sysid.search.result import Progress
 from whill_mjx.vehicle.parameters import set_values
 
@@ -33,104 +31,6 @@ ASSUMED_DAYS = 4.0
 """How many days of reference drives that assumption counts as."""
 LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
 WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
-EVEN = 0.97  # least correlation of two commands for their drives to be compared bin by bin
-
-
-@dataclass(frozen=True)
-class Leftover:
-    """What the base model leaves of one reference drive after that day's own fit."""
-
-    trial: Trial
-    day: int
-    series: np.ndarray  # (K, C)
-    mask: np.ndarray  # (K, C) weights
-
-
-@dataclass(frozen=True)
-class Reference:
-    """What is known of a vehicle before the drives in question."""
-
-    params: Any
-    """Fitted `VehicleParams`."""
-    space: Space
-    u: np.ndarray  # (P,) fitted unit coordinates
-    spread: np.ndarray  # (P, P) covariance of a day's parameters around u
-    days: np.ndarray  # (D, P) each day's offset from u
-    whitener: Whitener
-    factors: np.ndarray  # (4, C) noise of rough bins beside smooth ones
-    leftovers: tuple[Leftover, ...]
-    width: float
-    """Of the bins [s]."""
-    known: bool
-    """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
-    remark: str
-
-    @property
-    def shared(self) -> float:
-        """Share of the white noise of a drive that its replicates on the same day have as well: what the model lacks
-        that day, and the error of what the other days expect. 0 where no day has replicates."""
-        if not self.known:
-            return 0.0
-        apart = []
-        for number in {one.day for one in self.leftovers}:
-            mine = [one for one in self.leftovers if one.day == number]
-            series = np.stack([one.series - self.expected_on_others(one) for one in mine])
-            white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
-            courses = np.zeros(len(mine), int)
-            for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
-                courses[group] = course
-            apart.append(scatter(white, courses))
-        told = [one for one in apart if np.isfinite(one)]
-        return float(np.clip(-np.mean(told), 0.0, 1.0)) if told else 0.0
-
-    def expected(self, trial: Trial, bins: int) -> np.ndarray:
-        """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
-        same = [one for one in self.leftovers if alike(one.trial, trial)]
-        return mean_by_day(same, bins) if self.known else np.zeros((bins, self.leftovers[0].series.shape[1]))
-
-    def expected_on_others(self, one: Leftover) -> np.ndarray:
-        """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
-        return expected_without(self.leftovers, one) if self.known else np.zeros_like(one.series)
-
-    def target_of(self, drives: Drives) -> np.ndarray:
-        """(B, K, C) measured features less what the model is known to leave of such drives."""
-        bins = drives.target.shape[1]
-        return drives.target - np.stack([self.expected(trial, bins) for trial in drives.trials])
-
-
-def alike(a: Trial, b: Trial) -> bool:
-    """Whether two trials have the same course of commands up to size, so that bins correspond."""
-    if a.manoeuvre != b.manoeuvre or len(a.command.t) != len(b.command.t):
-        return False
-    if not np.allclose(a.command.t, b.command.t, atol=0.02):
-        return False
-    for name in ("v", "omega"):
-        x, y = getattr(a.command, name), getattr(b.command, name)
-        if np.allclose(x, y, atol=1e-6):
-            continue
-        size = np.linalg.norm(x) * np.linalg.norm(y)
-        if size == 0 or x @ y < EVEN * size:
-            return False
-    return True
-
-
-def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
-    """(K, C) mean over days of the mean over a day's drives, shrunk towards 0 where few days were seen."""
-    channels = leftovers[0].series.shape[1] if leftovers else 5
-    days: dict[int, list[np.ndarray]] = {}
-    for one in leftovers:
-        days.setdefault(one.day, []).append(_fit_length(one.series * (one.mask > 0), bins))
-    if not days:
-        return np.zeros((bins, channels))
-    drives = sum(len(each) for each in days.values())
-    mean = np.mean([np.mean(each, axis=0) for each in days.values()], axis=0)
-    return mean * drives / (drives + 1.0)
-
-
-def _fit_length(series: np.ndarray, bins: int) -> np.ndarray:
-    out = np.zeros((bins, series.shape[1]))
-    out[: min(bins, len(series))] = series[:bins]
-    return out
 
 
 def make_reference(
@@ -190,12 +90,6 @@ def make_reference(
                      known, remark)
 
 
-def expected_without(leftovers: Sequence[Leftover], one: Leftover) -> np.ndarray:
-    """(K, C) mean leftover of the other days' drives of the same course."""
-    others = [other for other in leftovers if other.day != one.day and alike(other.trial, one.trial)]
-    return mean_by_day(others, len(one.series))
-
-
 def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[list[int]]:
     """Replicates within each day: another day's vehicle differs."""
     groups = []
@@ -203,11 +97,6 @@ def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[
         index = np.flatnonzero(day == number)
         groups += [[int(index[i]) for i in group] for group in replicate_groups(tuple(trials[i] for i in index))]
     return groups
-
-
-def difference_sizes(spread: np.ndarray) -> np.ndarray:
-    """(P,) steps of difference quotients, in unit coordinates: a day's standard deviation, within reason."""
-    return np.clip(np.sqrt(np.diag(spread)), 0.004, 0.05)
 
 
 def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:

@@ -9,16 +9,12 @@ How far a wheel is turned when a drive begins is not known: each drive may start
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sysid.errors.features import CHANNELS
-from sysid.logs.log import Trial
-from sysid.logs.metrics import command_in_force
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
+from sysid.logs.log import Trial, command_in_force
 
 TERMS = 8  # smooth functions of one quantity
 LAGS = 3  # bins over which the motion answers
@@ -29,15 +25,6 @@ ALIGNINGS = 20  # rounds of fitting one shape and each drive's start angle to it
 RIDGE = 3.0
 WHEELS = ("left wheel's angle", "right wheel's angle")
 REST = 0.02  # m/s and rad/s below which a vehicle rests
-
-
-def where_it_lives(result: Result) -> list[dict[str, Any]]:
-    """Quantities by the share of the systematic residual that they predict on other drives, best first."""
-    residual, excess = result.search.final.residual, result.search.excess[1]
-    beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
-    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
-    out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
-    return sorted(out, key=lambda one: -one["share"])
 
 
 def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float) -> dict[str, float]:

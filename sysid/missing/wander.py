@@ -8,17 +8,16 @@ how large that part is. Drives in question must show more.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import compress
+from dataclasses import replace
 
 import numpy as np
 
 from sysid.errors.noise import scatter
 from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import ASSUMED_DAYS, EXCESS, Reference, Wander, no_wander
 from sysid.missing.drives import Drives
-from sysid.missing.evidence import Columns, Evidence, column_layout, gather
-from sysid.missing.reference import Reference
-from sysid.missing.ridge import Solver
+from sysid.missing.evidence import Columns, Evidence, Solver, column_layout
+from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -26,82 +25,6 @@ from whill_mjx.vehicle.types import VehicleParams
 
 ASSUMED = 0.3
 """Standard deviation of a coordinate from day to day where reference days do not tell."""
-ASSUMED_DAYS = 4.0
-"""How many days the mean over all hypotheses counts as, beside what the days tell of one."""
-EXCESS = 0.06
-"""Standard deviation of a day's excess where reference days do not tell."""
-
-
-@dataclass(frozen=True)
-class Wander:
-    """Day-to-day covariance of the coordinates, in the order of `Evidence.columns`."""
-
-    covariance: tuple[np.ndarray, ...]  # (k, k) each
-    shapes: tuple[np.ndarray, ...]  # (D, k) each: root mean square 1 in units of that covariance
-    freedom: float
-    """Degrees of freedom that the covariances rest on."""
-    excess: float = EXCESS
-    """Standard deviation from day to day of the squared residual over the noise, less 1."""
-    usual: float = 0.0
-    """What smooth functions that know no physics gain on a reference day, per trial."""
-    usual_size: float = 0.0
-    """Root mean square of it over the days, for a new one; 0 where reference days do not tell."""
-    scatter: float = 0.0
-    """Excess of what a reference day's replicates do not share."""
-
-    def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
-        """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
-        return max(float(np.nan_to_num(scatter(residual, courses) - self.scatter)), 0.0)
-
-    def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
-        """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""
-        mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
-        return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
-
-    def draw_shares(self, draws: int, rng: np.random.Generator) -> np.ndarray:
-        """(N, D) of each reference day's apparent effects in simulated days, heavy-tailed as few days ask for."""
-        days = len(self.shapes[0])
-        share = rng.standard_normal((draws, days)) / np.sqrt(days)
-        return share * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(draws, 1)))
-
-    def away(self, column: int, share: np.ndarray) -> np.ndarray:
-        """(N, k) apparent coordinates of one of the evidence's columns on days with these shares (N, D)."""
-        return share @ self.shapes[column] * np.sqrt(np.diag(self.covariance[column]))
-
-    def of(self, kept: Sequence[bool]) -> Wander:
-        """Of some of the evidence's columns only."""
-        return replace(self, covariance=tuple(compress(self.covariance, kept)),
-                       shapes=tuple(compress(self.shapes, kept)))
-
-    def p_excess(self, excess: float) -> float:
-        """Probability of so much excess on a day with nothing in it."""
-        from scipy import stats
-
-        return float(stats.t.sf(excess / self.excess, self.freedom))
-
-    def excess_limit(self, alpha: float) -> float:
-        """Excess that a day with nothing in it has with probability alpha."""
-        from scipy import stats
-
-        return float(stats.t.isf(alpha, self.freedom)) * self.excess
-
-    def smooth_limit(self, alpha: float) -> float:
-        """What smooth functions gain per trial on a day with nothing in it with probability alpha; infinite where days
-        do not tell."""
-        from scipy import stats
-
-        return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")
-
-
-def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:
-    """Coordinates that wander by themselves with a given standard deviation."""
-    width = max((c.index[-1] for c in columns), default=0) + 1
-    shapes = []
-    for one in columns:
-        shape = np.zeros((width, len(one.index)))
-        shape[one.index, range(len(one.index))] = np.sqrt(width)
-        shapes.append(shape)
-    return Wander(tuple(size**2 * np.eye(len(c.index)) for c in columns), tuple(shapes), ASSUMED_DAYS)
 
 
 def estimate(

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.design import Criterion, Plan
 from sysid.errors.space import Space
+from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
 from sysid.pages.html import Cell, Section, charts, html_page, paragraph, table

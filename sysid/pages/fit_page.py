@@ -1,4 +1,4 @@
-"""The sections of a fit's `report.html`; `sysid.report.write_html` puts them on a page."""
+"""The sections of a fit's `report.html`; `sysid.pages.report.write_html` puts them on a page."""
 
 from __future__ import annotations
 

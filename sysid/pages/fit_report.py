@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
+from sysid.logs import odometry_frames
 from sysid.logs.log import Log
-from sysid.replay.models import describe_parameters, get_parameters
-from sysid.report import KIND, SCHEMA, code_hashes, summaries
+from sysid.logs.measured import load_any
+from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
+from sysid.pages.series import collect, save
+from sysid.replay.models import Model, describe_parameters, get_parameters, save_model
 from sysid.search import starts
+from sysid.search.fitting import Fit, fit_log, predict
+from sysid.search.result import Progress
+from sysid.search.settings import FitConfig
 from sysid.search.studies import without_secrets
-
-if TYPE_CHECKING:
-    from sysid.fit import Fit, FitConfig
 
 
 def make_report(
@@ -71,3 +75,51 @@ def provenance(report: dict[str, Any]) -> dict[str, Any]:
             "seed": report["settings"]["seed"], "cost": report["search"]["cost"],
             "scored_on": "held_out" if report["summary"]["held_out"] else "training", "rmse": errors,
             "not_identifiable": [one["name"] for one in report["parameters"] if not one["identifiable"]]}
+
+
+def fit_dataset(
+    path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
+    progress: Progress | None = None, source: dict[str, Any] | None = None, model: Model | None = None,
+) -> dict[str, Any]:
+    """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
+
+    Of another model than the simulator's vehicle, model.toml is written instead of vehicle.toml, and model.xml where
+    it came from an MJCF or URDF file.
+
+    Args:
+        path: dataset folder; only named in the report when `log` is given.
+        quick: overrides `config.quick` where true.
+        log: an already loaded log.
+        source: more to note in the report's `dataset`.
+        model: as of `fit_log`.
+
+    Returns:
+        The report.
+    """
+    from sysid.pages.plots import write_plots
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
+
+    config = config or FitConfig()
+    config = replace(config, quick=quick or config.quick)
+    log = load_any(path) if log is None else log
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    fit = fit_log(log, config, progress, model=model)
+    if fit.frame is not None:
+        log = replace(log, trials=odometry_frames.at_frames(log.trials, fit.frame),
+                      notes=(*log.notes, odometry_frames.note(fit.frame)))
+    trials = (*log.training, *log.held_out)
+    initial, fitted = predict(fit, trials)
+    rows = error_rows(trials, initial, fitted)
+    report = make_report(log, config, fit, rows, str(path), source)
+    write_report(out / "report.json", report)
+    write_plots(out, trials, initial, fitted, rows)
+    series = collect(trials, initial, fitted)
+    save(out, series)
+    write_html(out, series)
+    intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
+    if fit.model is None:
+        save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+    else:
+        save_model(out, fit.model, fit.params, intervals, provenance(report))
+    return report

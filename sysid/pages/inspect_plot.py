@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Log
-from sysid.logs.metrics import command_in_force
+from sysid.logs.log import Log, command_in_force
 from sysid.logs.streams import speeds
 
 COLOURS = {"command": "tab:gray", "odometry": "tab:blue", "ground_truth": "tab:red"}
@@ -16,7 +15,7 @@ LABELS = {"command": "command", "odometry": "odometry", "ground_truth": "outside
 
 
 def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
-    """Write the picture (PNG) of a log and what `sysid.inspect.inspect` found on it."""
+    """Write the picture (PNG) of a log and what `sysid.logs.inspection.inspect` found on it."""
     import matplotlib
 
     matplotlib.use("Agg")

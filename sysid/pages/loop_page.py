@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Start
+from sysid.logs.log import Command, Start
+from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.metrics import METRICS, UNITS, integrate
-from sysid.missing.next_manoeuvre import command_of, sentence
-from sysid.missing.unnamed import describe_unnamed
 from sysid.pages.html import Section, bullets, charts, html_page, paragraph, table
 from sysid.pages.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
@@ -233,3 +233,38 @@ def fixed(report: dict[str, Any]) -> str:
     return table(["setting", "value"],
                  [[key, str(value)] for part in ("settings", "thresholds") for key, value in manifest[part].items()],
                  f"{len(manifest['catalogue'])} hypotheses; SHA-256 {manifest['sha256']}")
+
+
+def sentence(proposal: dict[str, Any]) -> str:
+    """A proposal in words."""
+    parts = []
+    if proposal["name"] is not None:
+        parameters, start = proposal["parameters"], proposal["start"]
+        times = f"{proposal['replicates']} times" if proposal["replicates"] > 1 else "once"
+        parts.append(f"{proposal['name']} at up to {parameters['v']:.2g} m/s and {parameters['omega']:.2g} rad/s, "
+                     f"heading {math.degrees(start['heading']):.0f} degrees at the start, {times}, tells "
+                     f"{', '.join(proposal['splits'])} apart by {proposal['expected_separation']:.0f} standard "
+                     f"deviations a drive ({proposal['file']})")
+    for one in proposal["not_split"]:
+        parts.append(f"no drive tells {' from '.join(one['effects'])}; {one['sensor']} would")
+    return "; ".join(parts)
+
+
+def command_of(proposal: dict[str, Any]) -> Command:
+    """The commands of a proposal."""
+    parameters = proposal["parameters"]
+    return make_command(proposal["name"], parameters["v"], parameters["omega"], parameters["seconds"],
+                        parameters["dt"])
+
+
+def describe_unnamed(one: dict[str, Any]) -> str:
+    """The fitted wrench of a report in words."""
+    units, symbolic = one["units"], one["symbolic"]
+    way = "braking force and torque" if one["kind"] == "brake" else "force and torque"
+    text = (f"{way} over z = {one['quantity']} [{units['quantity']}]: predicts {one['gain']['held_back']:.0%} of the "
+            "excess on held-back manoeuvres")
+    if not one["kept"]:
+        return f"no wrench over one quantity explains it; the best, {text}"
+    sums = ("no compact term stands for the tables" if symbolic is None else
+            f"force {symbolic['force']} N, torque {symbolic['torque']} N m")
+    return f"kept as effect `unnamed`: {text}; {sums}"

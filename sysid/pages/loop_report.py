@@ -11,10 +11,10 @@
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
     by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
-                      (`sysid.verdict.changes`)
+                      (`sysid.follow_up.changes`)
     worse             those of these rows whose error surely grew
     missing           p-value of "nothing is missing", against reference days calibrated
-    (`sysid.verdict.calibrated`), and
+    (`sysid.follow_up.calibrated`), and
                       `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
                       noise, as a share of it, before and after; share of it explained; of simulated days that were
                       refitted (`--refit-nulls`, else null) count, calibrated p-value, false alarms and the upper 95 %
@@ -28,11 +28,11 @@
     detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
                       noticed on simulated days (`power`)
     lives_in          where the unexplained residual lives
-    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.missing.unnamed.as_report`);
+    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.follow_up.unnamed.as_report`);
     where
                       it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
     next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
-                      there is nothing to tell (keys: `sysid.missing.next_manoeuvre.next_manoeuvre`)
+                      there is nothing to tell (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
     manifest          everything fixed beforehand, and its SHA-256
 """
@@ -41,32 +41,36 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import METRICS, Prediction, own_floor
+from sysid.follow_up.calibrated import calibrated
+from sysid.follow_up.changes import by_manoeuvre, worse
+from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
+from sysid.follow_up.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
+from sysid.follow_up.trust import CONFIDENCE, beside_still_base, contradicted, intervals, warnings
+from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.logs.log import Prediction, Trial
+from sysid.logs.metrics import METRICS, own_floor
 from sysid.missing.catalogue import Hypothesis, base_values
-from sysid.missing.evidence import Evidence, at_fit
-from sysid.missing.next_manoeuvre import next_manoeuvre, sentence, write_next_command
-from sysid.missing.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
-from sysid.missing.ridge import Solver
-from sysid.missing.unnamed import as_report, describe_unnamed, find_unnamed, replay_unnamed, vehicle_of
+from sysid.missing.days import Reference
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.unexplained import held_back_gains
+from sysid.pages.loop_page import describe_unnamed, sentence
+from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
-from sysid.report import code_hashes, error_rows
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
-from sysid.verdict.calibrated import calibrated
-from sysid.verdict.changes import by_manoeuvre, worse
+from sysid.verdict.falsifiers import FALSIFIERS
 from sysid.verdict.falsifiers import as_report as predictions_of
-from sysid.verdict.trust import CONFIDENCE, beside_still_base, contradicted, intervals, warnings
+from sysid.verdict.result import LoopConfig, Result
+from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
 from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.types import parameters_of
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
 
 SCHEMA = 1
 KIND = "sysid-close-loop"
@@ -75,15 +79,13 @@ RESAMPLES = 2000
 
 def make_report(result: Result) -> dict[str, Any]:
     """The report; this is where the held-out trials are opened."""
-    from sysid.close_loop import manifest
-
     found = result.search
     settings = manifest(result.config, result.hypotheses, result.reference)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
     trials = (*result.log.training, *result.log.held_out)
     wrench = find_unnamed(result)
-    before = replay(result, result.before, trials)
-    after = replay(result, result.after, trials) if wrench is None or not wrench.kept else replay_unnamed(
+    before = replay(result, fitted_before(result), trials)
+    after = replay(result, fitted_after(result), trials) if wrench is None or not wrench.kept else replay_unnamed(
         result, wrench, trials)
     rows = error_rows(trials, before, after)
     moved = by_manoeuvre(trials, before, after)
@@ -124,7 +126,6 @@ def make_report(result: Result) -> dict[str, Any]:
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials by a vehicle."""
-    from sysid.close_loop import drives_of
 
     drives, values = drives_of(result, trials, vehicle)
     simulated = drives.replay(values[None])
@@ -297,7 +298,6 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
 
 def lives_in(result: Result) -> list[dict[str, Any]]:
     """Where the unexplained residual lives (`sysid.missing.unexplained`)."""
-    from sysid.missing.unexplained import where_it_lives
 
     return where_it_lives(result)
 
@@ -338,14 +338,14 @@ def summary(report: dict[str, Any]) -> str:
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
     from sysid.pages.loop_page import write_page
-    from sysid.report import write_report
+    from sysid.pages.report import write_report
     from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     unnamed = report["unnamed"]
     kept = unnamed is not None and unnamed["kept"]
-    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else result.after
+    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else fitted_after(result)
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all()}
@@ -357,3 +357,34 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     write_report(out / "report.json", report)
     write_page(out, report)
 
+
+def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:
+    """Everything that was fixed before the drives were looked at."""
+    space = reference.space
+    return {
+        "settings": {key: value for key, value in asdict(config).items() if key != "thresholds"},
+        "thresholds": asdict(config.thresholds),
+        "catalogue": [{"effect": one.effect, "variant": one.variant, "kind": one.kind,
+                       "axes": [asdict(axis) for axis in one.axes], "constants": dict(one.constants)}
+                      for one in found],
+        "falsifiers": {name: [asdict(one) for one in each] for name, each in FALSIFIERS.items()},
+        "bounds": {name: [float(space.low[i]), float(space.high[i])] for i, name in enumerate(space.names)},
+    }
+
+
+def where_it_lives(result: Result) -> list[dict[str, Any]]:
+    """Quantities by the share of the systematic residual that they predict on other drives, best first."""
+    residual, excess = result.search.final.residual, result.search.excess[1]
+    beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
+    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
+    out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
+    return sorted(out, key=lambda one: -one["share"])
+
+
+def write_result(out: Path, result: Result) -> dict[str, Any]:
+    """Open the held-out trials, write the folder `out`, print the verdict, and return the report."""
+    report = make_report(result)
+    write_run(out, result, report)
+    print(summary(report))
+    print(f"wrote report.json, report.html and vehicle.toml into {out}")
+    return report

@@ -5,16 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Trial
-from sysid.logs.metrics import Prediction, ideal_replay
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.metrics import ideal_replay
 from sysid.pages.series import TrialSeries
-
-if TYPE_CHECKING:
-    from sysid.searches import Trace
+from sysid.search.result import Trace
 
 MAX_PANELS = 12
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Trial
-from sysid.logs.metrics import CHANNELS, Prediction, ideal_replay
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.metrics import CHANNELS, ideal_replay
 from whill_mjx.reading import read_arrays
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")

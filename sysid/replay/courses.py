@@ -22,7 +22,8 @@ from sysid.logs.log import Trial
 from sysid.replay import pieces
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import cores, on_all_cores, on_processor
-from sysid.replay.rollout import Measured, Plant, Replay, Simulated, make_batch
+from sysid.replay.records import Measured, Plant, Simulated
+from sysid.replay.rollout import Replay, make_batch
 
 VECTOR, FEW, MANY = 8, 32, 128
 """Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so

@@ -11,24 +11,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from sysid.errors.space import Space
-from sysid.replay.courses import CourseReplay
-from sysid.replay.rollout import Simulated
+from sysid.errors.pose_objective import Replays
+from sysid.errors.space import STEP, Space
+from sysid.logs.log import Trial
+from sysid.replay.courses import CourseReplay, make_courses
+from sysid.replay.models import Parameters, set_parameters
+from sysid.replay.records import Measured, Plant, Simulated
 
-STEP = 0.01
-"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+
+class TracedReplay(Protocol):
+    """A replay that can be traced too: `sysid.replay.courses.CourseReplay`."""
+
+    @property
+    def drives(self) -> int: ...
+
+    @property
+    def states(self) -> int: ...
+
+    @property
+    def in_pieces(self) -> TracedReplay: ...
+
+    def simulate(self, values: np.ndarray) -> Simulated: ...
+
+    def traced(self, values: jax.Array) -> Simulated: ...
 
 
 @dataclass(frozen=True)
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: CourseReplay
+    replay: TracedReplay
     space: Space
     step: float = STEP
 
@@ -80,3 +97,18 @@ class DifferenceReplay:
 
         at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
         return at, jax.tree.map(slope, found)
+
+
+def make_replay(
+    plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...]
+) -> tuple[Replays, Measured]:
+    """Replay of trials with the space's parameters, the others as in `params`, and what was measured."""
+    def put(values: jax.Array) -> Any:
+        return set_parameters(params, space.names, values)
+
+    if not isinstance(params, Parameters):
+        courses, measured = make_courses(plant, trials, put, params)
+    else:
+        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
+        measured = courses.measured
+    return DifferenceReplay(courses, space), measured

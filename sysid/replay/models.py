@@ -7,7 +7,6 @@ that act on commands or on what the odometry reports may be put around either.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sysid.errors.pose_objective import Replays
 from sysid.errors.space import LOG_SPAN, Space
 from sysid.logs.log import Trial
-from sysid.replay.courses import CourseReplay, make_courses
-from sysid.replay.differences import DifferenceReplay
-from sysid.replay.rollout import Measured, Plant
+from sysid.replay.records import Plant
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import PLACES, apply_chain, place_of
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
@@ -34,7 +30,6 @@ from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
 
 AROUND = ("command", "sensing")
 """Places of effects that need to know nothing of what is inside a model."""
-SUFFIXES = (".xml", ".mjcf", ".urdf")
 Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 """Initial value, lowest, highest, and, where it has one, the unit."""
 
@@ -158,21 +153,6 @@ def model_space(params: Parameters, names: Sequence[str] | None = None) -> Space
     initial = np.clip(np.asarray(get_parameters(params, names), float), low, high)
     log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
     return Space(names, low, high, initial, log, tuple((name, "not selected") for name in about if name not in names))
-
-
-def make_replay(
-    plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...]
-) -> tuple[Replays, Measured]:
-    """Replay of trials with the space's parameters, the others as in `params`, and what was measured."""
-    def put(values: jax.Array) -> Any:
-        return set_parameters(params, space.names, values)
-
-    if not isinstance(params, Parameters):
-        courses, measured = make_courses(plant, trials, put, params)
-    else:
-        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
-        measured = courses.measured
-    return DifferenceReplay(courses, space), measured
 
 
 def make_parameters(bounds: Mapping[str, Bounds], **fields: bool) -> Parameters:
@@ -311,43 +291,6 @@ def save_model(
     if model.write is not None:
         model.write(Path(folder), params)
     return path
-
-
-def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:
-    """The model that `--model` names.
-
-    Args:
-        text: an MJCF or URDF file, or FILE.py, or FILE.py:NAME. NAME (by default `model`) is a `Model`, or a function
-            that makes one from the log's `VehicleSpec`.
-        wheels: of an MJCF or URDF file, joints or actuators of the driven wheels, left and right.
-        parameters: of such a file, dotted paths of what to fit.
-
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
-    """
-    file, _, attribute = text.rpartition(":") if ".py:" in text else (text, "", "model")
-    path = Path(file)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such model. Give an MJCF or URDF file, or a Python file that defines one.")
-    if path.suffix in SUFFIXES:
-        from sysid.replay.mjcf import mjcf_model
-
-        inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
-        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track)
-    if path.suffix != ".py":
-        raise ValueError(f"{path}: a model is {', '.join(SUFFIXES)} or .py. Rename the file or write an adapter.")
-    loader = importlib.util.spec_from_file_location(path.stem, path)
-    assert loader is not None and loader.loader is not None
-    module = importlib.util.module_from_spec(loader)
-    loader.loader.exec_module(module)
-    if not hasattr(module, attribute):
-        raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
-    found = getattr(module, attribute)
-    found = found if isinstance(found, Model) or not callable(found) else found(spec)
-    if not isinstance(found, Model):
-        raise ValueError(f"{path}: {attribute} is a {type(found).__name__}; it must be a sysid.replay.models.Model. "
-                         "Make it with function_model or mjcf_model.")
-    return found
 
 
 def _outside(params: Parameters) -> VehicleParams:

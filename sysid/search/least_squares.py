@@ -10,16 +10,13 @@ step that leaves the box is cut at its wall and the parameters at a wall whose g
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from sysid.errors.robust import huber_weight, robust_cost
 from sysid.errors.space import Space, is_delay
-from sysid.replay.arrays import namespace
 from sysid.search.result import FitResult, Progress
-
-if TYPE_CHECKING:
-    from sysid.errors.normal_equations import NormalEquations
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
@@ -32,7 +29,6 @@ PLATEAU = 0.02  # share of the cost within which they lie on the same ground
 FOLLOWING = 3  # tries at most without a new Jacobian
 PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
 GOES_ON = 10.0  # tolerances by which a step that is not the last lowers the cost
-HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
 
 
 @dataclass(frozen=True)
@@ -43,6 +39,14 @@ class _Points:
     residual: np.ndarray  # (G, B, K)
     jacobian: np.ndarray  # (G, B, K, P)
     exact: np.ndarray  # (G,) bool: the derivatives are of the very point
+
+
+class Sums(Protocol):
+    """Costs and normal equations that an accelerator sums up: `sysid.errors.normal_equations.NormalEquations`."""
+
+    def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray: ...
+
+    def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
 
 
 class Residuals(Protocol):
@@ -133,7 +137,7 @@ def fit(
         return _Points(at.starts[again], after[again], learnt, (at.exact & ~moves.any(-1))[again])
 
     def step_there(
-        equations: NormalEquations, going: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+        equations: Sums, going: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
     ) -> None:
         """Move these starts with sums that an accelerator makes."""
         points = candidates(going, gradient, hessian)
@@ -277,22 +281,6 @@ def costs_of(objective: Residuals, u: np.ndarray, robust: bool = False) -> np.nd
     equations = getattr(objective, "equations", None)
     sums = robust_cost(objective.residuals(u), robust) if equations is None else equations.costs(u, robust)
     return np.asarray(sums / objective.counted)
-
-
-def huber_weight(residual: Any) -> Any:
-    """Weight of the squares whose minimum is that of the Huber loss."""
-    xp = namespace(residual)
-    return xp.minimum(1.0, HUBER / xp.maximum(xp.abs(residual), 1e-12))
-
-
-def robust_cost(residual: Any, robust: Any) -> Any:
-    """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K). `robust` may be traced."""
-    xp = namespace(residual)
-    if robust is False:
-        return xp.square(residual).sum((-1, -2))
-    size = xp.abs(residual)
-    linear = (size > HUBER) & robust
-    return xp.where(linear, 2 * HUBER * size - HUBER**2, size**2).sum((-1, -2))
 
 
 def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:

@@ -34,3 +34,16 @@ class FitResult:
         """End points (S, P) and costs (S,) of a gradient search in the order of the given starts."""
         place = np.argsort(self.order)
         return self.starts[place], self.start_costs[place]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Best point so far of one search, whenever it got better, and at its end."""
+
+    method: str
+    seed: int
+    evaluations: np.ndarray  # (K,) parameter sets simulated until then
+    seconds: np.ndarray  # (K,)
+    cost: np.ndarray  # (K,) mean squared residual in noise scales
+    u: np.ndarray  # (K, P)
+    held_out: np.ndarray  # (K,) mean position RMSE on held-out trials [m]; nan without any

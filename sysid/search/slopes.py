@@ -15,7 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.search.least_squares import Residuals, damped_steps, normal_sums, robust_cost
+from sysid.errors.robust import robust_cost
+from sysid.search.least_squares import Residuals, damped_steps, normal_sums
 from sysid.search.result import FitResult, Progress
 
 ROTATIONS = 3

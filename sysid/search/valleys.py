@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from sysid.errors.pose_objective import Told
 from sysid.errors.space import Space
 from sysid.search import least_squares, slopes
 from sysid.search.result import FitResult, Progress
-
-if TYPE_CHECKING:
-    from sysid.fit import FitConfig
+from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from sysid.missing.refit import Refit
+from sysid.missing.joint_fit import Refit
 
 ALPHA = 0.05
 """Of the test whether manoeuvres differ on a size."""

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.missing.refit import Refit, Refitter, without_each
+from sysid.missing.joint_fit import Refit
+from sysid.missing.refit import Refitter, without_each
 
 USUAL = 0.5
 """Standard deviation of the sizes of such columns, as a share of the effect."""

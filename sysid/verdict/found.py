@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
-from sysid.missing.refit import Refit
-from sysid.verdict.pairs import PairScan
-from sysid.verdict.scan import Scan
+from sysid.missing.joint_fit import Refit
 
 LARGEST = 4  # members of a class
 
@@ -141,3 +140,89 @@ def explained_share(base: Refit, count: float, thresholds: Thresholds, fit: Refi
     """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
     before = excess_of(base, count)
     return float(np.clip((before - excess_of(fit, count)) / max(before, thresholds.excess), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Gains of H hypotheses, each at the level of its highest worth."""
+
+    gain: np.ndarray  # (H,)
+    worth: np.ndarray  # (H,)
+    q: tuple[np.ndarray, ...]  # (k,) per hypothesis
+    null: np.ndarray  # (N, H) worth on simulated nulls
+    p: np.ndarray  # (H,) p-value of each by itself
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return family(self.smallest, float(self.p.min()))
+
+    def p_of(self, h: int, worth: float) -> float:
+        """Family-wise p-value of hypothesis h if this is its worth."""
+        return family(self.smallest, float(tail(self.null[:, h], worth)))
+
+
+def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:
+    """P(null >= value), beyond the draws by an exponential tail through their upper tenth."""
+    from scipy import stats
+
+    value = np.asarray(value, float)
+    ordered = np.sort(null)
+    count = len(ordered)
+    empirical = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
+    top = ordered[int(0.9 * count) :]
+    start = top[0]
+    excess = np.maximum(top - start, 0.0)
+    scale = max(float(excess.mean()), 1e-9)
+    far = 0.1 * stats.expon.sf(value - start, scale=scale)
+    return np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical)
+
+
+def family(smallest: np.ndarray, p: float) -> float:
+    """p-value of the smallest p among dependent tests, from its null sample; extrapolated as p x effective number."""
+    count = len(smallest)
+    if p >= np.quantile(smallest, 0.05):
+        return float((np.sum(smallest <= p) + 1) / (count + 1))
+    number = 0.05 / np.quantile(smallest, 0.05)
+    return float(min(1.0, number * p))
+
+
+@dataclass(frozen=True)
+class PairScan:
+    """M pairs of hypotheses, each at the levels of its highest worth."""
+
+    members: tuple[tuple[int, int], ...]
+    gain: np.ndarray  # (M,)
+    worth: np.ndarray  # (M,)
+    q: tuple[np.ndarray, ...]  # coordinates of the first member, then of the second
+    p: np.ndarray  # (M,) p-value of each pair by itself
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+    null: np.ndarray  # (N, M) worth on simulated nulls
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return self.p_of(float(self.p.min())) if len(self.p) else 1.0
+
+    def p_of(self, p: float) -> float:
+        """Family-wise p-value of a pair's own."""
+        return family(self.smallest, p)
+
+
+@dataclass(frozen=True)
+class NullRefits:
+    """What was found in N simulated days with nothing missing."""
+
+    p: np.ndarray  # (N,) what `Search.p_value` would be
+    alarms: int
+    """How many of them would not have been called `none`."""
+
+    def p_of(self, p: float) -> float:
+        """Share of days with nothing in them whose p-value is as small, the drives in question counted in."""
+        return float((np.sum(self.p <= p) + 1) / (len(self.p) + 1))
+
+    @property
+    def upper(self) -> float:
+        """Upper end of the one-sided 95 % interval of the false-alarm rate."""
+        return upper_rate(self.alarms, len(self.p))

@@ -3,40 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-
-import numpy as np
 
 from sysid.logs.log import Trial
 from sysid.missing.refit import Refitter
-from sysid.verdict.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
-from sysid.verdict.falsifiers import Tested, in_words, put_to_test
+from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
+from sysid.verdict.falsification import put_to_test
 from sysid.verdict.found import Search, Thresholds
-
-
-@dataclass(frozen=True)
-class Stood:
-    """What speaks for one effect of a joint fit, and against it."""
-
-    effect: str
-    sizes: np.ndarray  # (G,) that each manoeuvre by itself asks for, as a factor on the joint fit
-    errors: np.ndarray  # (G,) their standard errors
-    agreement: Heterogeneity
-    foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
-    interval: tuple[float, float]
-    """95 % of the sum of it, manoeuvres drawn anew."""
-    falsifiers: tuple[Tested, ...]
-
-    def against(self, thresholds: Thresholds) -> list[str]:
-        """What contradicts the effect, in words."""
-        out = [in_words(one) for one in self.falsifiers if one.outcome == "falsified"]
-        seen = int(self.agreement.asked.sum())
-        if self.agreement.outcome == "differ" and self.agreement.least > thresholds.scatter:
-            out.append(f"the {seen} manoeuvres that excite {self.effect} differ on its size by "
-                       f"{self.agreement.scatter:.0%} of it (at least {self.agreement.least:.0%})")
-        if seen > 1 and self.interval[1] <= 0:
-            out.append(f"{self.effect} is wrong about manoeuvres that were held back")
-        return out
+from sysid.verdict.result import Stood
 
 
 def stand(

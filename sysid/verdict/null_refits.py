@@ -10,47 +10,27 @@ drives would raise a false alarm, and calibrate its p-value without the assumpti
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
-from sysid.missing.evidence import Evidence, at_fit, white_leftover
-from sysid.missing.reference import alike
-from sysid.missing.refit import ITERATIONS, Refit, Refitter, Start, side_by_side
-from sysid.missing.ridge import Solver
-from sysid.missing.wander import Wander
+from sysid.missing.days import Wander, alike
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.joint_fit import Refit, Start
+from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
+from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import Search, Thresholds, excess_of, explained_share
-from sysid.verdict.pairs import PairScan, scan_again
-from sysid.verdict.rounds import refitted
-from sysid.verdict.scan import Scan, best, drawn_away, family, tail
-from sysid.verdict.search import pair_round
+from sysid.verdict.found import NullRefits, PairScan, Scan, Search, Thresholds, excess_of, explained_share, family, tail
+from sysid.verdict.pairs import scan_again
+from sysid.verdict.rounds import pair_round, refitted
+from sysid.verdict.scan import best, drawn_away
 
 TOGETHER, ACCELERATED = 16, 100
 """Days whose base fits advance side by side on a processor, and on an accelerator."""
-
-
-@dataclass(frozen=True)
-class NullRefits:
-    """What was found in N simulated days with nothing missing."""
-
-    p: np.ndarray  # (N,) what `Search.p_value` would be
-    alarms: int
-    """How many of them would not have been called `none`."""
-
-    def p_of(self, p: float) -> float:
-        """Share of days with nothing in them whose p-value is as small, the drives in question counted in."""
-        return float((np.sum(self.p <= p) + 1) / (len(self.p) + 1))
-
-    @property
-    def upper(self) -> float:
-        """Upper end of the one-sided 95 % interval of the false-alarm rate."""
-        return upper_rate(self.alarms, len(self.p))
 
 
 def run(

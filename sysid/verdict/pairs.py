@@ -8,16 +8,16 @@ base model, worth with what each wanders from day to day, and p-values from the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from sysid.missing.catalogue import Hypothesis
-from sysid.missing.evidence import Columns, Evidence
-from sysid.missing.ridge import RIDGE, Solver
-from sysid.missing.wander import Wander
-from sysid.verdict.scan import REACH, family, null_moments
+from sysid.missing.days import Wander
+from sysid.missing.evidence import RIDGE, Columns, Evidence, Solver
+from sysid.verdict.found import PairScan
+from sysid.verdict.scan import REACH, null_moments
 
 DRAWS = 300
 """Simulated nulls for the p-values of pairs: each is asked of some ten thousand columns."""
@@ -25,28 +25,6 @@ TOGETHER = 256
 """Pairs of columns that are solved in one call."""
 CHI_SQUARED = 2.0
 """Size over which the tail of chi-squared falls by e."""
-
-
-@dataclass(frozen=True)
-class PairScan:
-    """M pairs of hypotheses, each at the levels of its highest worth."""
-
-    members: tuple[tuple[int, int], ...]
-    gain: np.ndarray  # (M,)
-    worth: np.ndarray  # (M,)
-    q: tuple[np.ndarray, ...]  # coordinates of the first member, then of the second
-    p: np.ndarray  # (M,) p-value of each pair by itself
-    smallest: np.ndarray  # (N,) smallest p-value of each null
-    null: np.ndarray  # (N, M) worth on simulated nulls
-
-    @property
-    def p_family(self) -> float:
-        """p-value of the smallest p-value."""
-        return self.p_of(float(self.p.min())) if len(self.p) else 1.0
-
-    def p_of(self, p: float) -> float:
-        """Family-wise p-value of a pair's own."""
-        return family(self.smallest, p)
 
 
 class Bench:

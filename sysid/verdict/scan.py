@@ -15,34 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.missing.catalogue import Axis, Hypothesis
-from sysid.missing.evidence import Columns, Evidence
-from sysid.missing.ridge import Solver
-from sysid.missing.wander import Wander
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Columns, Evidence, Solver
+from sysid.verdict.found import Scan, tail
 
 REACH = 1.6
 """How far beyond a level its columns are trusted, as a factor on the level."""
 SPREAD_FREEDOM = 8  # degrees of freedom that the day-to-day spread rests on
-
-
-@dataclass(frozen=True)
-class Scan:
-    """Gains of H hypotheses, each at the level of its highest worth."""
-
-    gain: np.ndarray  # (H,)
-    worth: np.ndarray  # (H,)
-    q: tuple[np.ndarray, ...]  # (k,) per hypothesis
-    null: np.ndarray  # (N, H) worth on simulated nulls
-    p: np.ndarray  # (H,) p-value of each by itself
-    smallest: np.ndarray  # (N,) smallest p-value of each null
-
-    @property
-    def p_family(self) -> float:
-        """p-value of the smallest p-value."""
-        return family(self.smallest, float(self.p.min()))
-
-    def p_of(self, h: int, worth: float) -> float:
-        """Family-wise p-value of hypothesis h if this is its worth."""
-        return family(self.smallest, float(tail(self.null[:, h], worth)))
 
 
 @dataclass(frozen=True)
@@ -179,27 +158,3 @@ def drawn_away(factor: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     scale = np.sqrt(SPREAD_FREEDOM / rng.chisquare(SPREAD_FREEDOM))
     return scale * factor @ rng.standard_normal(len(factor))
 
-
-def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:
-    """P(null >= value), beyond the draws by an exponential tail through their upper tenth."""
-    from scipy import stats
-
-    value = np.asarray(value, float)
-    ordered = np.sort(null)
-    count = len(ordered)
-    empirical = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
-    top = ordered[int(0.9 * count) :]
-    start = top[0]
-    excess = np.maximum(top - start, 0.0)
-    scale = max(float(excess.mean()), 1e-9)
-    far = 0.1 * stats.expon.sf(value - start, scale=scale)
-    return np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical)
-
-
-def family(smallest: np.ndarray, p: float) -> float:
-    """p-value of the smallest p among dependent tests, from its null sample; extrapolated as p x effective number."""
-    count = len(smallest)
-    if p >= np.quantile(smallest, 0.05):
-        return float((np.sum(smallest <= p) + 1) / (count + 1))
-    number = 0.05 / np.quantile(smallest, 0.05)
-    return float(min(1.0, number * p))

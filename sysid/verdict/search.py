@@ -9,17 +9,17 @@ from functools import partial
 import numpy as np
 
 from sysid.missing.catalogue import Hypothesis
-from sysid.missing.evidence import Evidence, at_fit
-from sysid.missing.refit import Refit, Refitter, Start, moved_last
-from sysid.missing.ridge import Solver
-from sysid.missing.wander import Wander
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.joint_fit import Refit, Start, moved_last
+from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
-from sysid.verdict.agreement import beside, disagreement, foretold, interval_of_sum
+from sysid.verdict.agreement import beside, disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.forms import other_forms
 from sysid.verdict.found import LARGEST, Candidate, Search, Thresholds, excess_of, explained_share
 from sysid.verdict.pairs import scan_pairs
-from sysid.verdict.rounds import FIRST_LOOK, POLISH, candidate_of, refitted, rescan
+from sysid.verdict.rounds import POLISH, _class_of, candidate_of, pair_round, refitted, rescan
 from sysid.verdict.scan import best, run
 
 
@@ -115,58 +115,6 @@ def _drop_stand_ins(
             found.accepted[-1] = replace(found.accepted[-1], refit=without, share=explained(without), own=True)
             found.rounds.append([found.accepted[-1]])
             return
-
-
-def pair_round(
-    found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
-    similar: np.ndarray, thresholds: Thresholds, explained: Callable[[Refit], float], tried: set[str],
-) -> None:
-    """Two effects instead of what was accepted, where only together they explain the drives.
-
-    Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
-    another, and together they must explain more than what was accepted one by one.
-
-    Args:
-        tried: effects whose pairs had their chance, with the other one as a further effect.
-    """
-    pairs = found.pairs
-    assert pairs is not None
-    least = float(found.scan.gain.max()) if len(found.scan.gain) else 0.0
-    order, seen = [], set()
-    for m in np.argsort(-pairs.gain):
-        names = frozenset(hypotheses[h].effect for h in pairs.members[m])
-        if (names not in seen and not names & tried and pairs.gain[m] > least
-                and pairs.p_of(float(pairs.p[m])) < thresholds.alpha):
-            seen.add(names)
-            order.append(int(m))
-    starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
-              for m in order[: thresholds.pairs]]
-    if not starts:
-        return
-    fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
-    both = min(fits, key=lambda fit: fit.cost)
-    alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
-                             POLISH)
-    if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
-        both, alone = moved_last(both, 0), alone[::-1]
-    if explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
-        return
-    members = []
-    for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
-        h = hypotheses.index(fit.hypotheses[-1])
-        one = candidate_of(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
-        part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
-        told = foretold(fit, part, evidence.groups, refitter.precision)
-        if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
-                or disagreement(fit, part, evidence.groups, refitter.precision) > thresholds.differ
-                or interval_of_sum(told)[0] <= 0):
-            return
-        members.append(replace(one, own=True))
-    members[0] = replace(members[0], refit=alone[0], share=explained(alone[0]))
-    found.accepted = members
-    found.classes = [_class_of(one, [one], hypotheses, similar, thresholds) for one in members]
-    found.rounds += [[one] for one in members]
-    found.together = max(pairs.p_family, *(one.p for one in members))
 
 
 def _own(
@@ -280,23 +228,3 @@ def _missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
     both = max(search_p, excess_p) < thresholds.alpha
     return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
 
-
-def _class_of(
-    best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
-    thresholds: Thresholds,
-) -> list[str]:
-    """Effects that these drives do not tell from the best: nearly as good a fit, alike signatures, or a
-    fit so much better than imitating the best would bring that the truth may lie between the two."""
-    mine = hypotheses.index(best.hypothesis)
-    near: dict[str, float] = {}
-    for other in candidates:
-        imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
-        ratio = other.gain / best.gain
-        own = (ratio - imitated) / max(1 - imitated, 1e-9)
-        if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
-            near[other.hypothesis.effect] = ratio
-    for j, one in enumerate(hypotheses):
-        if similar[mine, j] > thresholds.alike:
-            near[one.effect] = max(near.get(one.effect, 0.0), float(similar[mine, j]))
-    near.pop(best.hypothesis.effect, None)
-    return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks import fit, fit_coverage, fit_searches
-from benchmarks.fit import Benchmark
 from benchmarks.fit_jobs import (
     RememberedCosts,
     compile_once,
@@ -21,6 +20,7 @@ from benchmarks.fit_jobs import (
     staged,
     write_result,
 )
+from benchmarks.fit_settings import Benchmark
 from benchmarks.plant.chair import VEHICLES, Chair
 from sysid.errors.space import Space, make_space, searched
 from sysid.intervals.independence import Evidence

@@ -17,9 +17,9 @@ from sysid.design import load_subject
 from sysid.logs.log import load_log, read_csv
 from sysid.logs.measured import load_drive, load_mrclam
 from sysid.logs.rosbag import read_bag
+from sysid.pages.report import read_report, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, load, save
 from sysid.replay.mjcf_file import load_robot
-from sysid.report import read_report, write_html, write_report
 from whill_mjx.logs.dataset import write_fields, write_trial
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.vehicle_file import save_vehicle

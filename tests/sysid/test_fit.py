@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import sysid.fit as fit_module
-from sysid.fit import FitConfig, fit_dataset, fit_log
 from sysid.logs.log import load_log
 from sysid.logs.scenarios import Scenario
 from sysid.logs.synthetic import SensorNoise, write_dataset
+from sysid.pages.fit_report import fit_dataset
+from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant
-from sysid.report import REPLAYS
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
@@ -104,7 +106,7 @@ def test_held_out_trials_never_reach_the_fit(planted, monkeypatch):
     def capture(plant, params, space, trials, noise):
         raise Reached(trials, noise)
 
-    monkeypatch.setattr(fit_module, "make_objective", capture)
+    monkeypatch.setattr("sysid.search.fitting.make_objective", capture)
     seen = []
     for spoil in (False, True):
         trials = tuple(

@@ -12,8 +12,9 @@ from conftest import shared_folder
 
 import sysid
 import sysid.inspect as inspect_module
-from sysid.inspect import InspectConfig, inspect, load_whole, main, text
+from sysid.inspect import InspectConfig, main
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
+from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill

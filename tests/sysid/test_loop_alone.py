@@ -12,8 +12,8 @@ import pytest
 from sysid.errors.features import BIN, bin_width, make_features
 from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
-from sysid.missing.evidence import manoeuvre_groups
-from sysid.missing.refit import Refit
+from sysid.missing.joint_fit import Refit
+from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict.alone import UNTOLD, judged, simplest, stands_alone
 from sysid.verdict.found import Candidate, Thresholds
@@ -125,7 +125,7 @@ class Cart:
 
 
 def test_a_replay_shows_the_pose_late_and_the_odometry_in_time():
-    from sysid.replay.rollout import Plant
+    from sysid.replay.records import Plant
 
     def observe(state):
         return jnp.concatenate([state, jnp.zeros(2), state[:1], state[:1], jnp.zeros(3)])[:9]

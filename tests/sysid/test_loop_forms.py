@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.missing.catalogue import Axis, Hypothesis
-from sysid.missing.refit import Refit
+from sysid.missing.joint_fit import Refit
 from sysid.verdict.forms import modulated, other_forms
 from sysid.verdict.found import Candidate, Thresholds
 from sysid.verdict.rounds import _rivals, _starts

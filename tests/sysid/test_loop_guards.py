@@ -7,12 +7,14 @@ import pytest
 
 from sysid.logs.log import Command, OdometryStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
-from sysid.missing.refit import Refit
-from sysid.verdict import falsifiers
+from sysid.missing.joint_fit import Refit
+from sysid.verdict import falsification, falsifiers
 from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
-from sysid.verdict.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, course_of, side, sizes_in_parts
+from sysid.verdict.falsification import course_of, sizes_in_parts
+from sysid.verdict.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, side
 from sysid.verdict.found import Candidate, Search, Thresholds
-from sysid.verdict.guards import Stood, guarded
+from sysid.verdict.guards import guarded
+from sysid.verdict.result import Stood
 from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
@@ -78,7 +80,7 @@ def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
     parts = np.stack([effect * q[1] * ~half, effect * q[1] * half], axis=-1)
     refitter = SimpleNamespace(precision=np.eye(1), reference=SimpleNamespace(u=np.zeros(1)))
     size, covariance = sizes_in_parts(fit, slice(0, 1), parts, refitter, [[2 * k, 2 * k + 1] for k in range(3)])
-    return size, covariance, falsifiers._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
+    return size, covariance, falsification._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
 
 
 def test_an_effect_with_one_size_stands_its_split():
@@ -121,7 +123,7 @@ def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(othe
     quiet[:, :300] = True
     p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
     settled = falsifiers._SETTLED
-    tested = falsifiers._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
+    tested = falsification._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
     assert tested.outcome == outcome
 
 

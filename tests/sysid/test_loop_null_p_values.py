@@ -13,8 +13,8 @@ from scipy import stats
 
 from sysid.errors.noise import Whitener
 from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.days import Leftover, Reference, expected_without, mean_by_day
 from sysid.missing.evidence import Evidence, column_layout
-from sysid.missing.reference import Leftover, Reference, expected_without, mean_by_day
 from sysid.missing.wander import _pooled, coordinates
 from sysid.verdict.scan import drawn_noise, run
 

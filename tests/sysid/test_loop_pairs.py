@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sysid.follow_up.power import false_alarms, power_curve, simulated_days
 from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.days import no_wander
 from sysid.missing.evidence import Evidence, column_layout
-from sysid.missing.power import false_alarms, power_curve, simulated_days
-from sysid.missing.refit import Refit, moved_last
-from sysid.missing.wander import no_wander
+from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
 from sysid.verdict.found import Thresholds
 from sysid.verdict.pairs import scan_again, scan_pairs, tail

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from sysid.errors.noise import fit_roughness, fit_whitener
-from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.missing.drives import DRAIN, ROUND, SESSION, Drives
-from sysid.missing.evidence import Columns, signature_columns
-from sysid.missing.refit import Refit, Refitter
-from sysid.missing.wander import Wander, _pooled
+from sysid.missing.catalogue import ROUND, Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.days import Wander
+from sysid.missing.drives import DRAIN, SESSION, Drives
+from sysid.missing.evidence import Columns
+from sysid.missing.joint_fit import Refit
+from sysid.missing.refit import Refitter
+from sysid.missing.signatures import signature_columns
+from sysid.missing.wander import _pooled
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import Candidate, Search, Thresholds

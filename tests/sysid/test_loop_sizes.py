@@ -6,15 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sysid.follow_up.trust import at_the_end, intervals, undone
 from sysid.logs.metrics import replicate_noise
 from sysid.missing.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
+from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
+from sysid.missing.joint_fit import Refit
 from sysid.missing.pose_fit import by_own_noise
-from sysid.missing.refit import Refit, Refitter
-from sysid.missing.wander import no_wander
-from sysid.replay.rollout import Measured
+from sysid.missing.refit import Refitter
+from sysid.replay.records import Measured
 from sysid.verdict.rounds import elsewhere
-from sysid.verdict.trust import at_the_end, intervals, undone
 from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick

@@ -14,7 +14,7 @@ import pytest
 from cart import cart
 
 from sysid import fit as fit_module
-from sysid.fit import Arguments, FitConfig, fit_log
+from sysid.fit import Arguments
 from sysid.logs.log import Command, OdometryStream, PoseStream, make_trial
 from sysid.logs.scenarios import Scenario
 from sysid.logs.synthetic import write_dataset
@@ -22,7 +22,10 @@ from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.mjcf_file import load_robot, resolve, write_mjcf
-from sysid.replay.models import function_model, load_model, make_parameters, model_space, set_parameters
+from sysid.replay.model_files import load_model
+from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import command_table
 from whill_mjx.vehicle.specs import WHILL_CR
 

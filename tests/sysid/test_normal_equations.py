@@ -15,6 +15,7 @@ from sysid.errors.noise import fit_whitener
 from sysid.errors.normal_equations import NormalEquations, make_equations
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.prior import Prior
+from sysid.errors.robust import huber_weight, robust_cost
 from sysid.replay.courses import CourseReplay
 from sysid.replay.differences import DifferenceReplay
 from sysid.search import least_squares, starts
@@ -49,8 +50,8 @@ def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robu
     value, slope, hessian = equations.quadratic(SETS, robust)
     np.testing.assert_allclose(value, equations.costs(SETS, robust), rtol=1e-4)
     residual, jacobian = one.jacobian(SETS)
-    weight = least_squares.huber_weight(residual) if robust else np.ones_like(residual)
-    np.testing.assert_allclose(value, least_squares.robust_cost(residual, robust), rtol=1e-3)
+    weight = huber_weight(residual) if robust else np.ones_like(residual)
+    np.testing.assert_allclose(value, robust_cost(residual, robust), rtol=1e-3)
     for parameter in range(3):
         step = np.eye(3)[parameter] * 0.01
         fallen = (equations.costs(SETS + step, robust) - equations.costs(SETS - step, robust)) / 0.04
@@ -85,7 +86,7 @@ def test_a_replay_that_diverges_is_dear_and_has_no_slope(poses):
     broken = DifferenceReplay(Diverging(replay), UNICYCLE_SPACE)
     one = dataclasses.replace(poses, replay=broken)
     value, slope, hessian = NormalEquations(one, at_once=1).quadratic(SETS[:1])
-    assert np.isfinite(value).all() and value[0] > 1e3 * least_squares.robust_cost(poses.residuals(SETS[:1]), False)[0]
+    assert np.isfinite(value).all() and value[0] > 1e3 * robust_cost(poses.residuals(SETS[:1]), False)[0]
     assert not slope.any() and not hessian.any()
 
 

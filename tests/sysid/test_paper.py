@@ -12,10 +12,11 @@ import pytest
 from conftest import TRUTH, unicycle_plant
 
 import sysid.paper as paper_module
-from sysid.fit import Fit
 from sysid.intervals.statistics import EXACT_UP_TO, holm, mean_sd, sign_flip_p, smallest_p, upper_rate
-from sysid.paper import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, main, markdown, select
+from sysid.pages.paper_page import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, markdown
+from sysid.paper import main, select
 from sysid.replay.rollout import make_batch, predictions, simulate
+from sysid.search.fitting import Fit
 from sysid.search.result import FitResult
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 from whill_mjx.vehicle.parameters import describe, set_values

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
-from sysid.fit import FitConfig, fit_log
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, crossings, profile
 from sysid.pages.fit_page import profiles as profiles_section
 from sysid.search import least_squares
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
 
 
 @pytest.fixture(scope="module")

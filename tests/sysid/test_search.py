@@ -10,10 +10,10 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, 
 
 from sysid.errors.pose_objective import Noise
 from sysid.errors.space import Space
-from sysid.fit import FitConfig
 from sysid.intervals import uncertainty
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search import least_squares, tpe
+from sysid.search.settings import FitConfig
 from sysid.search.valleys import gradient_search
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)

@@ -10,10 +10,13 @@ import pytest
 from cart import cart
 
 from sysid import searches
-from sysid.fit import FitConfig, make_problem
 from sysid.search import least_squares
+from sysid.search.comparison import METHODS, Judge, Recorder, arrivals, trace
+from sysid.search.fitting import make_problem
+from sysid.search.result import Trace
+from sysid.search.settings import FitConfig
 from sysid.search.studies import BATCH
-from sysid.searches import Arguments, Judge, Recorder, Trace, arrivals, trace
+from sysid.searches import Arguments
 
 LAG = "(0.1, 0.02, 1.0)"
 MODEL = cart("tau_v", "tau_omega", f'{{"tau_v": {LAG}, "tau_omega": {LAG}, "turn": (1.0, 0.5, 1.5)}}')
@@ -31,7 +34,7 @@ def compared(unicycle_log, problem):
     """One run of each search."""
     judge = Judge(problem, unicycle_log)
     return [trace(problem, judge, 0.5, method, 0, evaluations=64, iterations=14, start_count=2)
-            for method in searches.METHODS]
+            for method in METHODS]
 
 
 def test_each_search_is_followed_to_its_end(compared, problem):

@@ -13,10 +13,10 @@ import numpy as np
 
 from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
-from sysid.missing.evidence import Columns, Evidence
-from sysid.missing.ridge import Solver
-from sysid.missing.wander import Wander
-from sysid.verdict.scan import Scan, family, look, null_moments, tail
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Columns, Evidence, Solver
+from sysid.verdict.found import Scan, family, tail
+from sysid.verdict.scan import look, null_moments
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls

@@ -11,25 +11,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import Prediction
+from sysid.follow_up.tables import (
+    Products,
+    Table,
+    few_terms,
+    from_first_wave,
+    held_back,
+    multiplied,
+    penalties,
+    turned,
+)
+from sysid.follow_up.terms import Term, columns_of, in_words
+from sysid.logs.log import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
-from sysid.missing.tables import Products, Table, few_terms, from_first_wave, held_back, multiplied, penalties, turned
-from sysid.missing.terms import Term, columns_of, in_words
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
-from sysid.replay.rollout import Plant, Replay, make_batch, predictions
+from sysid.replay.records import Plant
+from sysid.replay.rollout import Replay, make_batch, predictions
+from sysid.verdict.result import Result
+from sysid.verdict.vehicles import fitted_before, refit_poses
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.types import VehicleParams
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
 
 KINDS = ("push", "brake")
 """A wrench whatever the motion, or one that turns with its direction."""
@@ -146,7 +154,6 @@ def find_unnamed(result: Result) -> Unnamed | None:
 
     Where the base model is refitted to whole poses, so is it with the wrench that is kept.
     """
-    from sysid.close_loop import refit_poses
 
     if result.search.verdict != "unexplained":
         return None
@@ -157,7 +164,7 @@ def find_unnamed(result: Result) -> Unnamed | None:
         trials = result.log.training
         if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
             names = list(result.reference.space.names)
-            return replace(found, vehicle=set_values(found.vehicle, names, get_values(result.before, names)))
+            return replace(found, vehicle=set_values(found.vehicle, names, get_values(fitted_before(result), names)))
         plant = with_start_angles(result.plant, trials, found.angles)
         result = replace(result, prepared=replace(result.prepared, plant=plant))
     return replace(found, vehicle=refit_poses(result, found.vehicle))
@@ -310,19 +317,6 @@ def as_report(found: Unnamed) -> dict[str, Any]:
         "kept": found.kept,
         "parameters": dict(zip(names, np.asarray(get_values(found.vehicle, names), float).tolist(), strict=True)),
     }
-
-
-def describe_unnamed(one: dict[str, Any]) -> str:
-    """The fitted wrench of a report in words."""
-    units, symbolic = one["units"], one["symbolic"]
-    way = "braking force and torque" if one["kind"] == "brake" else "force and torque"
-    text = (f"{way} over z = {one['quantity']} [{units['quantity']}]: predicts {one['gain']['held_back']:.0%} of the "
-            "excess on held-back manoeuvres")
-    if not one["kept"]:
-        return f"no wrench over one quantity explains it; the best, {text}"
-    sums = ("no compact term stands for the tables" if symbolic is None else
-            f"force {symbolic['force']} N, torque {symbolic['torque']} N m")
-    return f"kept as effect `unnamed`: {text}; {sums}"
 
 
 def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:

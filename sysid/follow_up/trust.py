@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from sysid.missing.refit import Refit, Start
+from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.unexplained import held_back_gains
 from sysid.verdict.agreement import with_prior
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
+from sysid.verdict.result import Result
 
 CONFIDENCE = 0.95
 FOLLOWED = 0.9
@@ -92,7 +88,7 @@ def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
     """
     from scipy import stats
 
-    from sysid.missing.next_manoeuvre import refitter_of
+    from sysid.verdict.vehicles import refitter_of
 
     final, reference = result.search.final, result.reference
     away = final.u - reference.u

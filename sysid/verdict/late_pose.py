@@ -11,8 +11,8 @@ be better. Later fits hold the delay: they would bend it to what the base model 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.space import make_space
@@ -20,9 +20,9 @@ from sysid.logs.pose_lag import pose_lag
 from sysid.missing.evidence import with_values
 from sysid.missing.pose_fit import fit_poses
 from sysid.verdict.found import Candidate
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
+from sysid.verdict.result import Result
+from sysid.verdict.vehicles import drives_of, fitted_before
+from whill_mjx.vehicle.parameters import set_values
 
 NAME = "pose_delay"
 PARAMETER = "pose_delay.delay"
@@ -63,7 +63,6 @@ def told_late(result: Result, alpha: float) -> Result:
 
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     """White residuals (N, B, n) of the binned drives with values (N, all)."""
-    from sysid.close_loop import drives_of
 
     reference = result.reference
     drives, before = drives_of(result, result.log.training, reference.params)
@@ -75,13 +74,10 @@ def residuals(result: Result, values: np.ndarray) -> np.ndarray:
 
 def fitted(result: Result, delay: float) -> np.ndarray:
     """Values (all,) of the base model fitted to whole poses that are late by `delay` [s]."""
-    import jax.numpy as jnp
 
-    from sysid.close_loop import drives_of
-    from whill_mjx.vehicle.parameters import set_values
 
     names, reference = list(result.names), result.reference
-    drives, values = drives_of(result, result.log.training, result.before)
+    drives, values = drives_of(result, result.log.training, fitted_before(result))
     values = with_values(values, names, {PARAMETER: delay})
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +22,18 @@ from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
 from sysid.logs.metrics import ideal_replay
 from sysid.missing.catalogue import Hypothesis, base_values
-from sysid.missing.drives import Drives, make_drives
-from sysid.missing.evidence import base_columns, with_values
-from sysid.missing.refit import STEP_Q, Refit, Refitter
-from sysid.missing.refit import Start as FitStart
+from sysid.missing.drives import Drives
+from sysid.missing.evidence import with_values
+from sysid.missing.joint_fit import Refit
+from sysid.missing.joint_fit import Start as FitStart
+from sysid.missing.refit import STEP_Q, Refitter
+from sysid.missing.signatures import base_columns
+from sysid.pages.loop_page import command_of
+from sysid.verdict.result import Result
+from sysid.verdict.vehicles import refitter_of
 from whill_mjx.effects import EFFECTS
 from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
-
-if TYPE_CHECKING:
-    from sysid.close_loop import Result
 
 FILE = "next_command.csv"
 TIE = 0.2
@@ -117,7 +119,7 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
     groups = [_refitted(result, refitter, number, each) for number, each in rounds]
     pairs = [pair for group in groups for pair in combinations(group, 2)]
     room_fixed = any(EFFECTS[one.effect].room_fixed for group in groups for one in group)
-    library = drives_of(result, HEADINGS if room_fixed else HEADINGS[:1])
+    library = drive_library(result, HEADINGS if room_fixed else HEADINGS[:1])
     separation, library = separations(result, refitter, groups, library)
     return _proposal(pairs, separation, library)
 
@@ -138,16 +140,6 @@ def rivals_of(result: Result) -> list[tuple[int, list[tuple[str, Refit | None]]]
     return out
 
 
-def refitter_of(result: Result) -> Refitter:
-    """A refitter like that of the search, through the replay that it compiled."""
-    base = base_values(result.full)
-    values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.plant, result.full, result.names, result.log.training, result.reference.width,
-                         result.prepared.paths)
-    drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
-    return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
-
-
 def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[tuple[str, Refit | None]]
               ) -> list[Rival]:
     """Rivals of accepted effect `number`; those that the search took for alike and did not refit are refitted now."""
@@ -163,7 +155,7 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
     return [Rival(name, more[name] if fit is None else fit) for name, fit in rivals]
 
 
-def drives_of(result: Result, headings: Sequence[float] = HEADINGS) -> list[Drive]:
+def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[Drive]:
     """The library: every manoeuvre at several sizes and start headings [degrees], within the speeds, the space and the
     time that the training trials took up."""
     trials = result.log.training
@@ -357,28 +349,6 @@ def sensor_for(a: str, b: str) -> str:
     """What would tell two effects apart that no drive does."""
     known = [SENSORS[name] for name in (a, b) if name in SENSORS]
     return known[0] if known else "motor currents, which tell how much force the drives need"
-
-
-def sentence(proposal: dict[str, Any]) -> str:
-    """A proposal in words."""
-    parts = []
-    if proposal["name"] is not None:
-        parameters, start = proposal["parameters"], proposal["start"]
-        times = f"{proposal['replicates']} times" if proposal["replicates"] > 1 else "once"
-        parts.append(f"{proposal['name']} at up to {parameters['v']:.2g} m/s and {parameters['omega']:.2g} rad/s, "
-                     f"heading {math.degrees(start['heading']):.0f} degrees at the start, {times}, tells "
-                     f"{', '.join(proposal['splits'])} apart by {proposal['expected_separation']:.0f} standard "
-                     f"deviations a drive ({proposal['file']})")
-    for one in proposal["not_split"]:
-        parts.append(f"no drive tells {' from '.join(one['effects'])}; {one['sensor']} would")
-    return "; ".join(parts)
-
-
-def command_of(proposal: dict[str, Any]) -> Command:
-    """The commands of a proposal."""
-    parameters = proposal["parameters"]
-    return make_command(proposal["name"], parameters["v"], parameters["omega"], parameters["seconds"],
-                        parameters["dt"])
 
 
 def write_next_command(out: Path, proposal: dict[str, Any] | None) -> Path | None:

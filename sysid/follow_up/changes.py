@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Trial
-from sysid.logs.metrics import METRICS, UNITS, Prediction
+from sysid.logs.log import Prediction, Trial
+from sysid.logs.metrics import METRICS, UNITS
 
 BLOCK = 2.0
 """Length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember."""
