@@ -23,7 +23,7 @@ from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
-from whill_mjx.evaluation.policy_file import RUN_FILE
+from whill_mjx.evaluation.policy_file import RUN_FILE, camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best, say
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
@@ -363,19 +363,17 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
     """Write a policy file."""
-    from whill_mjx.vehicle.vehicle_file import load_vehicle
-
     task = preset.task
-    spec, _, _ = load_vehicle(vehicle)
+    course = make_course(preset, vehicle)
     contract = PolicyContract(
         action_low=(task.v_min, -task.omega_max),
         action_high=(task.v_max, task.omega_max),
         task=options.task,
         rate_hz=10.0,
         action_repeat=task.action_repeat,
-        camera=dataclasses.asdict(spec.camera),
+        camera=camera_contract(course.env.model, course.params),
     )
-    step, carry = policy_of(options, preset, result, make_course(preset, vehicle))
+    step, carry = policy_of(options, preset, result, course)
     try:
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:

@@ -13,10 +13,10 @@ import numpy as np
 from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import roughness
 from sysid.logs.log import Trial
-from sysid.missing.catalogue import ROUND
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
+from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.types import parameters_of
 

@@ -25,7 +25,8 @@ from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.delays import delayed, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, YAW_COLUMNS, Batch, Measured, Plant, Simulated
-from whill_mjx.effects import OdometryLag, SensorDelay
+from whill_mjx.effects.odometry_lag import OdometryLag
+from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.processor import as_one_function
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec

@@ -9,7 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from damage import check, check_packed
+from damaged_bytes import check, check_packed
 from test_convert import StoragePlugin, write_bag
 from test_models import ROBOT
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.errors.noise import fit_roughness, fit_whitener
-from sysid.missing.catalogue import ROUND, Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
 from sysid.missing.drives import DRAIN, SESSION, Drives
 from sysid.missing.evidence import Columns
@@ -18,6 +18,7 @@ from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import Candidate, Search, Thresholds
 from sysid.verdict.search import _decide, _own
+from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
 
 

@@ -9,7 +9,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from damage import check
+from damaged_bytes import check
 
 from whill_mjx.evaluate import saved_task
 from whill_mjx.tasks.tasks import ObstacleCourse, make_task

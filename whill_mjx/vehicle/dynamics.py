@@ -21,6 +21,7 @@ from whill_mjx.vehicle.ground import footing, plane_under
 from whill_mjx.vehicle.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.vehicle.model import VehicleModel, box_inertia
 from whill_mjx.vehicle.scalars import apart, scan_apart
+from whill_mjx.vehicle.specs import GRAVITY
 from whill_mjx.vehicle.types import (
     Drive,
     Geometry,
@@ -39,7 +40,6 @@ DAMPING_RATIO = 0.5  # [-] of the suspension
 LEAST_SAG = 8.0  # [m/s^2] times the squared physics step: with 3 instead, loads ring and wheels lose the floor
 LOAD_ROUNDS = 2  # in which loads and what wheels pull by them find together
 SMOOTH_LOAD = 0.04  # share of the static load over which a contact loses it smoothly when it lifts
-GRAVITY = 9.81  # [m/s^2]
 
 
 def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:

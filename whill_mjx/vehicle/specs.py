@@ -11,6 +11,9 @@ from dataclasses import dataclass, replace
 
 from whill_mjx import fields
 
+GRAVITY = 9.81
+"""Standard gravity [m/s^2]."""
+
 
 @dataclass(frozen=True)
 class CameraMount:

@@ -155,8 +155,8 @@ def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[
         checked = fields.check_table(str(path), fields.EFFECT, table, f"effects[{index}]", NEWER)
         if checked["name"] not in EFFECTS:
             raise ValueError(f"{path}: unknown effect {fields.shown(checked['name'])} (known: "
-                             f"{', '.join(sorted(EFFECTS))}). Correct its name or use a newer version of this program."
-                             )
+                             f"{', '.join(sorted(EFFECTS))}). Install or register the package that defines it, or "
+                             "remove the effect.")
         found.append((checked["name"], checked["parameters"]))
     return found
 

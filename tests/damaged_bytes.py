@@ -6,14 +6,13 @@ More examples on request: DAMAGED_FILES=2000 python -m pytest -k damaged
 from __future__ import annotations
 
 import gzip
-import os
 import re
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from damage import Costs, few
+from hypothesis import given
 from hypothesis import strategies as st
 
-EXAMPLES = int(os.environ.get("DAMAGED_FILES", 0))
 TOKENS = [
     b"", b"\0", b"\xff\xfe", b"\xef\xbb\xbf", b"\xe9", b"\n", b"\n\n", b"\r", b",", b",,", b";", b"=", b"#", b'"', b"'",
     b"nan", b"-inf", b"inf", b"1e400", b"-1e9", b"0", b"-1", b"1" + b"0" * 400, b"9" * 5000, b"1_0", b"0x10", b"1,5",
@@ -55,13 +54,13 @@ def damaged(draw, good: bytes):
 
 def check(path, good, read, examples=40):
     """Write damaged files at `path` and read each: a value, or an error with the name of the file or its folder."""
-    @settings(max_examples=EXAMPLES or examples, deadline=None, database=None, derandomize=not EXAMPLES,
-              suppress_health_check=list(HealthCheck))
+    @few(examples)
     @given(damaged(good))
     def one(data):
         path.write_bytes(data)
         try:
-            read()
+            with Costs():
+                read()
         except (ValueError, FileNotFoundError) as error:
             assert str(path.parent) in str(error) and len(str(error)) < 2000 + 3 * len(str(path))
             assert type(error) in (ValueError, FileNotFoundError)
