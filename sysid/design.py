@@ -20,6 +20,7 @@ from sysid import command_line
 from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import DEFAULT, Criterion, propose
 from sysid.logs.manoeuvre_library import Limits
+from whill_mjx.fields import Field, check_table
 from whill_mjx.vehicle.specs import VehicleSpec
 
 
@@ -92,9 +93,12 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
     report = read_report(Path(name))
     file = str(Path(name) / "vehicle.toml")
     spec, params, _ = load_vehicle(file)
-    scale = report["noise"]["scale"]
-    noise = Noise(np.array([scale[f"ground_truth.{key}"] for key in ("x", "y", "yaw")]),
-                  np.array([scale[f"odometry.{key}"] for key in ("x", "y", "yaw", "v", "omega")]), "fit")
+    outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
+        ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))
+    fields = [Field(key, "SI", 1e-12, 1e6, remedy="Fit the log again.") for key in (*outside, *own)]
+    found = report["noise"].get("scale")
+    scale = check_table(str(Path(name) / "report.json"), fields, found, "noise.scale", others=True)
+    noise = Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
     return spec, params, load_intervals(file), noise
 
 

@@ -8,9 +8,9 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
-import json
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +24,9 @@ from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, 
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
 from whill_mjx.evaluation.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
+from whill_mjx.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.reading import read_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 
 SCRIPTED = ("planner", "random")
@@ -146,8 +148,7 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     changes: dict[str, Any] = {}
     run = policy.path.parent / RUN_FILE if policy else None
     if policy and run and run.is_file() and policy.task == name:
-        saved = json.loads(run.read_text())["preset"]["task"]
-        changes = {field: tuple(v) if isinstance(v, list) else v for field, v in saved.items() if field in known}
+        changes = saved_task(run, known)
         say(f"task: fields from {run}")
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
@@ -158,6 +159,17 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
             raise ValueError(f"--set {text}: task {name!r} has no field {field!r} (known: {', '.join(sorted(known))}).")
         changes[field] = _parse(value, known[field], text)
     return make_task(name, **{**changes, "layout": options.layout})
+
+
+def saved_task(run: Path, known: Iterable[str]) -> dict[str, Any]:
+    """The fields of a training's task among the `known` ones; ValueError where its run.json is damaged."""
+    hint = "Put the file of the training there, or take it away to evaluate on the task as it is."
+    content = read_json(run, f"missing. {hint}", hint)
+    preset = check_table(str(run), RUN, content, others=True)["preset"]
+    task = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
+    rows = {field.name: field for field in TASK}
+    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
+            for name, value in task.items() if name in known}
 
 
 def _parse(text: str, like: Any, whole: str) -> Any:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -45,7 +46,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
     from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose
     from whill_mjx.vehicle.model import build_model
 
-    config = config or VehicleConfig()
+    config = replace(config or VehicleConfig(), limited=False)  # a log has commands that the vehicle took
     model = build_model(spec, config)
 
     def observe(state: Any) -> jax.Array:

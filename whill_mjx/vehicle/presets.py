@@ -44,6 +44,9 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     }  # fmt: skip
     if name in whill:
         spec = find_spec("whill_cr")
+        if name == "whill_cr_documented":
+            limits: Any = {key: command_quantisation.MAKER[key] for key in ("v_min", "v_max", "omega_max")}
+            spec = replace(spec, **limits)
         return spec, whill[name](spec)
     if name not in SPECS:
         known = ", ".join(sorted({*whill, *SPECS}))
