@@ -15,7 +15,8 @@ import signal
 import sys
 import threading
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
@@ -96,6 +97,17 @@ def check_known(option: str, value: str, known: Iterable[str]) -> None:
         raise OptionError(f"{option} {value}: unknown (known: {', '.join(names)}). Correct the name.")
 
 
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Turn a ValueError or FileNotFoundError of the block into OptionError: nothing was touched yet."""
+    try:
+        yield
+    except OptionError:
+        raise
+    except (ValueError, FileNotFoundError) as error:
+        raise OptionError(one_line(error)) from error
+
+
 def check_options(options: Any, prefix: str = "") -> None:
     """Raise OptionError for the first number of an options dataclass that is not finite or not in its `Range`."""
     hints = typing.get_type_hints(type(options), include_extras=True)
@@ -127,8 +139,8 @@ def run(
     """
     import tyro
 
-    listen(stopped)
-    _State.working = True
+    listen()
+    _State.working, _State.stopped = True, stopped
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
     try:
         chosen: Any = tyro.cli(options, description=description, config=config, args=args)
@@ -177,20 +189,19 @@ class _State:
 
     working = False
     """`run` has begun; before, a signal ends the imports at once."""
-    stopped = STOPPED
+    stopped = "stopped before the work began."
     before: dict[int, Any] = {}
     """Handlers that were there before."""
     wakeup: tuple[int, int] | None = None
     leaving = threading.Lock()
 
 
-def listen(stopped: str = STOPPED) -> None:
+def listen() -> None:
     """Let a signal end this process with one line and exit code 130, also while no Python code runs.
 
     The handler raises KeyboardInterrupt, so that the work can keep what it has. A thread, woken by the operating system
     itself, ends the process after `GRACE_S`, or at a second signal. A command calls this before its slow imports.
     """
-    _State.stopped = stopped
     if _State.wakeup is not None or threading.current_thread() is not threading.main_thread():
         return
     reader, writer = os.pipe()

@@ -35,23 +35,32 @@ class FolderRefused(OptionError):
     """A folder that this command must not write to; nothing in it was touched."""
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file, whole or not at all: it gets its name when all of it is on the disk."""
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A path to write, of the same ending, that becomes `path` when the block ends well and vanishes otherwise.
+
+    An OSError of the block names `path`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
-        with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
+        yield temporary
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         with WRITING:
             os.replace(temporary, path)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.strerror:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file, whole or not at all: it gets its name when all of it is on the disk."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def check_place(option: str, path: Path, least_free: int = LEAST_FREE) -> None:
@@ -86,15 +95,17 @@ class Claim:
         """The identity of the run that the folder holds; None for a new one."""
         return None if self._found is None else self._found["identity"]
 
-    def settle(self, identity: Mapping[str, Any], **more: Any) -> None:
+    def settle(self, identity: Mapping[str, Any], begun: bool = True, **more: Any) -> None:
         """Write the identity once, with more tables beside it; raise FolderRefused where the folder holds another.
 
         Args:
             identity: name -> JSON value of everything that changes the result. A name that the folder's identity lacks
                 is not compared: it is newer than the run.
+            begun: whether the folder holds any work yet; before, another identity replaces its own.
+            more: tables to write beside the identity.
         """
         identity = json.loads(json.dumps(identity, default=str))
-        if self.identity is not None:
+        if self.identity is not None and (begun or self.identity == identity):
             there = self.identity
             differs = [f"{name} is {_short(there[name])} there and {_short(value)} here"
                        for name, value in identity.items() if name in there and there[name] != value]
@@ -141,7 +152,7 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(timespec="seconds")}
         (out / LOCK_FILE).write_text(json.dumps(me) + "\n")
-        for leftover in out.glob(".*.tmp"):
+        for leftover in out.glob(".*.tmp*"):
             leftover.unlink(missing_ok=True)
         yield Claim(out, kind, read_identity(out, kind))
     finally:
