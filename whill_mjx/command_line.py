@@ -67,8 +67,8 @@ class Range:
         return low and (value < self.high if self.below else value <= self.high)
 
     def __str__(self) -> str:
-        low = f"{'above' if self.above else 'at least'} {self.low:g}" if math.isfinite(self.low) else ""
-        high = f"{'below' if self.below else 'at most'} {self.high:g}" if math.isfinite(self.high) else ""
+        low = f"{'above' if self.above else 'at least'} {self.low}" if math.isfinite(self.low) else ""
+        high = f"{'below' if self.below else 'at most'} {self.high}" if math.isfinite(self.high) else ""
         return " and ".join(part for part in (low, high) if part) or "a finite number"
 
 
