@@ -9,10 +9,11 @@ from typing import Any
 
 OWN = ("sysid", "whill_mjx", "benchmarks")
 MAKERS = {
-    ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"), ("numpy._core.numeric", "_frombuffer"),
-    ("jax._src.array", "_reconstruct_array"), ("pathlib", "PosixPath"), ("pathlib._local", "PosixPath"), ("builtins", "set"), ("builtins", "frozenset"),
-    ("builtins", "slice"), ("builtins", "complex"),
+    ("numpy", "ndarray"), ("numpy", "dtype"),
+    ("numpy._core.multiarray", "_reconstruct"), ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"), ("jax._src.array", "_reconstruct_array"),
+    ("pathlib", "PosixPath"), ("pathlib._local", "PosixPath"),
+    ("builtins", "set"), ("builtins", "frozenset"), ("builtins", "slice"), ("builtins", "complex"),
 }  # fmt: skip
 """What arrays and plain values are made by."""
 

@@ -38,7 +38,8 @@ class Runs:
 
 
 @pytest.mark.parametrize("function, arguments", [
-    (os.system, ("touch ran",)), (eval, ("open('ran', 'w')",)), (Path.touch, (Path("ran"),)), (getattr, (Driven, "tag")),
+    (os.system, ("touch ran",)), (eval, ("open('ran', 'w')",)), (Path.touch, (Path("ran"),)),
+    (getattr, (Driven, "tag")),
 ])  # fmt: skip
 def test_a_file_that_would_run_something_is_refused(function, arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
