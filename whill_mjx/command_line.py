@@ -264,7 +264,7 @@ def leave(line: str, flush: bool = True) -> None:
         for child in sys.modules["multiprocessing"].active_children():
             child.kill()
     try:
-        os.write(2, f"\n{line}\n".encode())
+        os.write(2, f"{'' if flush else chr(10)}{line}\n".encode())  # a bar may stand on the line of the cursor
     finally:
         os._exit(INTERRUPTED)
 

@@ -117,7 +117,11 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
         plan = make_plan(options)
     with claim_folder(options.out, KIND, OUTPUTS) as claim:
         claim.settle({})  # an evaluation replaces an earlier one as a whole
-        return evaluate(plan, began)
+        try:
+            return evaluate(plan, began)
+        except OSError as error:
+            error.add_note("The figures so far are in the lines above; the same command begins anew.")
+            raise
 
 
 def make_plan(options: EvaluateOptions) -> Plan:
