@@ -193,6 +193,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
         if meta["schema"] == SCHEMA and {"config", "files", "env_steps", "wall_s"} <= set(meta):
             return meta
         problem = f"schema {meta['schema']} is not {SCHEMA}, or an entry is missing"
+    except FileNotFoundError:
+        raise Damaged(f"{path}: there is no such checkpoint. Resume from an older one or start anew.") from None
     except (ValueError, KeyError, TypeError) as error:
         problem = f"not readable as JSON with the expected entries ({error})"
     raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")

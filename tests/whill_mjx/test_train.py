@@ -287,7 +287,7 @@ def test_colleagues_can_read_what_the_users_umask_lets_them(run):
     options, _ = run
     umask = os.umask(0)
     os.umask(umask)
-    for path in (options.out, *options.out.rglob("*")):
+    for path in options.out.rglob("*"):
         if path.is_dir() and "policy" not in path.parts:
             assert path.stat().st_mode & 0o777 == 0o777 & ~umask, path
 
