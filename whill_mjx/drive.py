@@ -262,12 +262,17 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     check_place("--out", options.out)
 
 
-def cli(options: DriveOptions) -> None:
+def drive_and_say(options: DriveOptions) -> None:
     """Drive, and say what to do with the dataset."""
     folder = main(options)
     count = len(list((folder / "trials").iterdir()))
     print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
 
 
+def cli() -> None:
+    """Command line."""
+    run(DriveOptions, drive_and_say, __doc__, positional=False)
+
+
 if __name__ == "__main__":
-    run(DriveOptions, cli, __doc__, positional=False)
+    cli()

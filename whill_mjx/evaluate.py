@@ -333,5 +333,10 @@ def _named(text: str) -> tuple[str, str]:
     return name, value
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     run(EvaluateOptions, main, __doc__, positional=False)
+
+
+if __name__ == "__main__":
+    cli()

@@ -221,6 +221,11 @@ def main(options: Look) -> None:
     print(f"{options.out}: {options.scene}")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     # `--task` is the option's former name.
     run(Look, main, __doc__, args=["--scene" if word == "--task" else word for word in sys.argv[1:]])
+
+
+if __name__ == "__main__":
+    cli()

@@ -504,5 +504,10 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         return None
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     run(TrainOptions, main, __doc__, stopped=STOPPED)
+
+
+if __name__ == "__main__":
+    cli()
