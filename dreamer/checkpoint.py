@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
+import re
 import shutil
-import tempfile
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer import parallel
-from dreamer.config import DreamerConfig
 
 KEEP = 2
+UNFINISHED = ".unfinished-"
 SCHEMA = 1
 
 
@@ -37,7 +40,7 @@ Rows = tuple[str, int, int]
 def save(
     folder: Path,
     state: Any,
-    config: DreamerConfig,
+    config: Any,
     env_steps: int,
     wall_s: float = 0.0,
     rows: Rows | None = None,
@@ -48,7 +51,7 @@ def save(
     Args:
         folder: of all checkpoints.
         state: pytree of arrays; typed random keys are allowed.
-        config: saved beside it and compared on reading.
+        config: dataclass with a default for every field; saved beside it and compared on reading.
         env_steps: names the checkpoint.
         wall_s: time trained so far [s].
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
@@ -58,13 +61,15 @@ def save(
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
+    _remove_unfinished(folder)
     target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
     if not parallel.is_first_process():
         return target
-    temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
+    temporary = folder / f"{UNFINISHED}{target.name}"
+    temporary.mkdir()  # with the user's own rights: colleagues resume and evaluate too
     try:
-        with _checkpointer(ocp) as writer:
+        with _os_errors(target), _checkpointer(ocp) as writer:
             writer.save((temporary / "state").resolve(), {k: v for k, v in arrays.items() if v.size})
         meta = {
             "schema": SCHEMA,
@@ -75,13 +80,42 @@ def save(
         }
         (temporary / "meta.json").write_text(json.dumps(meta, indent=1))
         if target.exists():
-            shutil.rmtree(target)
+            os.replace(target, temporary.with_name(f"{temporary.name}.old"))
         os.replace(temporary, target)
+        _remove_unfinished(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     for old in complete(folder)[:-KEEP]:
         shutil.rmtree(old, ignore_errors=True)
     return target
+
+
+@contextmanager
+def _os_errors(target: Path) -> Iterator[None]:
+    """Turn the errors by which tensorstore reports a full disk, say, into an OSError that names the checkpoint."""
+    logger = logging.getLogger("absl")  # orbax logs the tracebacks of its threads besides
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    except ValueError as error:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(target)) from None
+    finally:
+        logger.disabled = before
+
+
+def is_whole(state: Any) -> bool:
+    """Whether all arrays of an interrupted run are there: an interrupt may come while the next ones replace them."""
+    return not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in jax.tree.leaves(state))
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove what a killed process has left; one process at a time writes checkpoints."""
+    if parallel.is_first_process():
+        for path in folder.glob(f"{UNFINISHED}*"):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def complete(folder: Path) -> list[Path]:
@@ -94,7 +128,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path)
 
 
-def restore(folder: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]] | None:
+def restore(folder: Path, template: Any, config: Any) -> tuple[Any, dict[str, Any]] | None:
     """State and meta.json of the newest usable checkpoint, or None where there is none at all.
 
     A damaged checkpoint is passed over with a warning if an older one is whole.
@@ -123,7 +157,7 @@ class Damaged(CheckpointError):
     """A checkpoint whose files are not what was written."""
 
 
-def load(path: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]]:
+def load(path: Path, template: Any, config: Any) -> tuple[Any, dict[str, Any]]:
     """Read one checkpoint. Arguments and errors as for `restore`."""
     import orbax.checkpoint as ocp
 
@@ -159,15 +193,17 @@ def _read_meta(path: Path) -> dict[str, Any]:
         if meta["schema"] == SCHEMA and {"config", "files", "env_steps", "wall_s"} <= set(meta):
             return meta
         problem = f"schema {meta['schema']} is not {SCHEMA}, or an entry is missing"
+    except FileNotFoundError:
+        raise Damaged(f"{path}: there is no such checkpoint. Resume from an older one or start anew.") from None
     except (ValueError, KeyError, TypeError) as error:
         problem = f"not readable as JSON with the expected entries ({error})"
     raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")
 
 
-def _check_config(path: Path, saved: dict[str, Any], config: DreamerConfig) -> None:
+def _check_config(path: Path, saved: dict[str, Any], config: Any) -> None:
     current = json.loads(json.dumps(dataclasses.asdict(config)))
     # A field that is newer than the checkpoint had the value that is now its default.
-    saved = {**json.loads(json.dumps(dataclasses.asdict(DreamerConfig()))), **saved}
+    saved = {**json.loads(json.dumps(dataclasses.asdict(type(config)()))), **saved}
     names = sorted(set(saved) | set(current))
     changed = [f"{n}: saved {saved.get(n)}, now {current.get(n)}" for n in names if saved.get(n) != current.get(n)]
     if changed:

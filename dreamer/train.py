@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -10,11 +11,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, ParamSpec
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from filelock import FileLock, Timeout
 from jax.sharding import Mesh
 
 from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
@@ -31,6 +33,7 @@ __all__ = ["TrainResult", "TrainState", "evaluate", "init_state", "train", "trai
 EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
 StopFn = Callable[[dict[str, float]], bool]
+P = ParamSpec("P")
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
@@ -98,6 +101,25 @@ class Meter:
         return line
 
 
+def alone(function: Callable[P, TrainResult]) -> Callable[P, TrainResult]:
+    """A training that holds its folder `out`, its third argument, until it ends; a kill leaves no lock behind."""
+
+    @functools.wraps(function)
+    def held(*args: P.args, **named: P.kwargs) -> TrainResult:
+        out = Path(named["out"] if "out" in named else args[2])  # type: ignore[arg-type]
+        if not parallel.is_first_process():
+            return function(*args, **named)
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            with FileLock(out / ".training.lock", timeout=0):
+                return function(*args, **named)
+        except Timeout:
+            raise ValueError(f"{out}: another process trains there. Wait for its end or give another folder.") from None
+
+    return held
+
+
+@alone
 def train(
     env: FunctionalEnv,
     config: DreamerConfig,
@@ -121,7 +143,7 @@ def train(
     """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
 
     `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
-    again goes on from its last checkpoint as if nothing had happened.
+    again goes on from its last checkpoint as if nothing had happened. One process at a time trains in a folder.
 
     Where the configuration asks for pretraining, it comes first. Its lines have `env_steps` 0, say in `pretrain_steps`
     and `pretrain_updates` how far it is, and all their figures are named pretrain/...
@@ -151,10 +173,11 @@ def train(
 
     Raises:
         ImportError: tensorboard is asked for and tensorboardX is not installed.
-        ValueError: environment and configuration do not fit, the checkpoint does not belong to them, or a replay in the
-            host's memory is asked for with several seeds or devices.
+        ValueError: environment and configuration do not fit, the checkpoint does not belong to them or to the seed, a
+            replay in the host's memory is asked for with several seeds or devices, or another process trains there.
     """
     out = Path(out)
+    _check_seed(out, seed, resume)
     out.mkdir(parents=True, exist_ok=True)
     mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
     if mesh is not None and not isinstance(seed, int):
@@ -207,15 +230,18 @@ def train(
                 if ready is not None:
                     wait([ready])
                 line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, line["env_steps"]).items()}
-            waiting.pop(0)
             log.write(line)
+            waiting.pop(0)  # interrupted just before, the line is written twice and read once
             stops = stops or (params is not None and stop is not None and stop(line))
         return stops
 
     waiting: list[tuple[dict[str, Any], Params | None]] = []
     logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
     stopped, iterations = False, 0
+    missing = env_steps // eval_every > log.evaluated_at // eval_every or env_steps >= total_steps > log.evaluated_at
     try:
+        if eval_fn is not None and counted and env_steps and parallel.agree(missing):
+            stopped = write_log(state, True, at_once=True)  # it was interrupted between a step and its evaluation
         while (env_steps < total_steps or not counted) and not stopped:
             state, metrics = iterate(state)
             begins = False
@@ -246,7 +272,7 @@ def train(
                 counted = True
                 iterate = iterate if finished or stopped else compiled(train_iteration)
     except KeyboardInterrupt:
-        if jax.process_count() == 1:  # the other processes may not be there to take part
+        if jax.process_count() == 1 and checkpoint.is_whole(state):  # other processes may not be there to take part
             try:
                 write_waiting(at_once=True)
             finally:  # interrupted again, say
@@ -257,6 +283,21 @@ def train(
         log.close()
     updates = int(state.agent.updates) if counted else 0
     return TrainResult(out, state.agent, env_steps, updates, wall_s(), log.last)
+
+
+def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
+    """Raise ValueError where a run would go on with another seed than it was begun with."""
+    path = out / "config.json"
+    if not resume or not path.exists() or not checkpoint.complete(out / "checkpoints"):
+        return
+    try:
+        begun = json.loads(path.read_text())["seed"]
+    except (ValueError, KeyError, TypeError):
+        return  # the checkpoint has the configuration, and its keys those of the seed
+    asked = seed if isinstance(seed, int) else list(seed)
+    if begun != asked:
+        raise ValueError(f"{out}: the run there was begun with seed {begun}, not {asked}. Give that seed, or another "
+                         "folder.")
 
 
 def _in_thread(call: Callable[[Params], Any], params: Params) -> Future:
@@ -358,6 +399,8 @@ class _Log:
         self._path, self._on_metrics, self._config = path, on_metrics, config
         self._board = Board(path.parent, place) if tensorboard and parallel.is_first_process() else None
         self.last: dict[str, float] = {}
+        self.evaluated_at = 0
+        """Steps at the last evaluation so far."""
         kept: list[str] = []
         if not parallel.is_first_process():
             return
@@ -366,9 +409,11 @@ class _Log:
                 line = json.loads(text)
             except ValueError:
                 continue  # cut off by the kill
-            if pretrain.position(config, line) <= place:
+            if pretrain.position(config, line) <= place and text not in kept[-1:]:
                 kept.append(text)
                 self.last = line
+                if any(name.startswith("eval/") for name in line):
+                    self.evaluated_at = line["env_steps"]
         _write_atomically(path, "".join(text + "\n" for text in kept))
 
     def write(self, line: dict[str, float]) -> None:
@@ -393,3 +438,9 @@ def _write_atomically(path: Path, text: str) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
     os.replace(temporary, path)
+
+
+if __name__ == "__main__":
+    print("dreamer.train is a function for programs: train(env, config, out, total_steps, seed), see docs/dreamer.md.\n"
+          "The command that trains the vehicle is python -m whill_mjx.train --help.")  # fmt: skip
+    sys.exit(0 if {"-h", "--help"} & set(sys.argv[1:]) else 2)

@@ -8,11 +8,16 @@ motion; depth, labels and normals; its video is a walk. `--scene all` writes eve
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+from whill_mjx.command_line import SEED, OptionError, Range, check_known, listen, run
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +25,8 @@ import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
-from whill_mjx.tasks.tasks import TASKS
+from whill_mjx.folders import check_place, whole_file, write_whole
+from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.gallery import gallery, walk
@@ -44,13 +50,13 @@ class Look:
     """randomised or fixed."""
     looks: bool = False
     """Also draw colours, light and textures at random, and change the images photometrically."""
-    worlds: int = 6
+    worlds: Annotated[int, Range(1, 100)] = 6
     """Columns of the sheet."""
-    steps: int = 18
+    steps: Annotated[int, Range(1, 10_000)] = 18
     """Control steps that the planner drives before the second picture."""
-    scale: int = 3
+    scale: Annotated[int, Range(1, 50)] = 3
     """Enlargement of the pictures."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """First random key."""
 
 
@@ -108,10 +114,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
     ok, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not ok:
         raise ValueError(f"{path}: an image of shape {image.shape} and type {image.dtype} cannot be written as PNG.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_bytes(data.tobytes())
-    os.replace(temporary, path)
+    write_whole(path, data.tobytes())
 
 
 def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
@@ -179,12 +182,10 @@ def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10
     """Write frames (H, W, 3) uint8 as a video, whole or not at all."""
     import imageio.v2 as imageio
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.stem}.part{path.suffix}")
     large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
     options = {"duration": 1000 / rate, "loop": 0} if path.suffix == ".gif" else {"fps": rate, "macro_block_size": 2}
-    imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:
@@ -195,9 +196,13 @@ def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
     if options.scene not in (*known, "all"):
-        raise ValueError(f"unknown scene {options.scene!r} (known: {', '.join(known)}, all).")
+        raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")
+    check_known("--layout", options.layout, LAYOUTS)
     if options.out.suffix not in (".png", *VIDEOS):
-        raise ValueError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
+        raise OptionError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
+    if options.out.is_dir():
+        raise OptionError(f"--out {options.out}: is a folder. Give the name of a file.")
+    check_place("--out", options.out)
     if options.scene == "all":
         for name in known:
             out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
@@ -218,10 +223,8 @@ def main(options: Look) -> None:
 
 def cli() -> None:
     """Command line."""
-    import tyro
-
     # `--task` is the option's former name.
-    main(tyro.cli(Look, args=["--scene" if word == "--task" else word for word in sys.argv[1:]]))
+    run(Look, main, __doc__, args=["--scene" if word == "--task" else word for word in sys.argv[1:]])
 
 
 if __name__ == "__main__":
