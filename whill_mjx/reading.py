@@ -31,7 +31,7 @@ ARRAY_BYTES = 100 * MB  # of a .npz or .gz when unpacked
 MEMBERS = 20_000  # arrays of a .npz
 NPY_HEADER = 10_000  # bytes
 LONGEST_LINE = 100_000  # characters of a CSV
-LONG_KEY = re.compile(r"""(?:[\w\-"' \t]*+\.){100}""")
+LONG_KEY = re.compile(r"""(?<![\w\-"' \t.])(?:[\w\-"' \t]*+\.){100}""")
 """A key of a hundred parts, for which the parser takes the square of their number."""
 LONGEST_REASON = 160  # characters of what a library says
 
