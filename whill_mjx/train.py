@@ -289,11 +289,7 @@ def choose_preset(options: TrainOptions) -> Preset:
 
 def given_vehicle(options: TrainOptions) -> Vehicle | None:
     """The vehicle that the options name; None if they name none. A bad file is refused before anything is written."""
-    if options.vehicle is None:
-        return None
-    if options.vehicle.suffix == ".toml":
-        return load_vehicle(options.vehicle)
-    return load_vehicle(options.vehicle)
+    return None if options.vehicle is None else load_vehicle(options.vehicle)
 
 
 def prepare_vehicle(options: TrainOptions, preset: Preset, claim: Claim, given: Vehicle | None = None) -> None:
