@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bridge import ros
+from bridge.commands import CommandListener
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
@@ -137,13 +138,13 @@ class RecordNode:
     """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
 
     def __init__(self, node: Any, writer: TrialWriter, options: argparse.Namespace) -> None:
-        from geometry_msgs.msg import Twist
         from nav_msgs.msg import Odometry
 
         self.writer = writer
         self._started = time.monotonic()
         self._seconds = options.seconds
-        node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable(10))
+        self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
+        ros.steady_timer(node, 0.1, self._commands.look)
         node.create_subscription(Odometry, options.odometry_topic, self._on_odometry, ros.best_effort())
         node.create_subscription(Odometry, options.ground_truth_topic, self._on_ground_truth, ros.best_effort())
         ros.steady_timer(node, 1.0, writer.flush)
@@ -152,8 +153,8 @@ class RecordNode:
         """Return whether the recording time is over."""
         return bool(self._seconds) and time.monotonic() - self._started > self._seconds
 
-    def _on_command(self, message: Any) -> None:
-        self.writer.command(time.monotonic(), message.linear.x, message.angular.z)
+    def _on_command(self, v: float, omega: float) -> None:
+        self.writer.command(time.monotonic(), v, omega)
 
     def _on_odometry(self, message: Any) -> None:
         speed = message.twist.twist
@@ -176,6 +177,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
     parser.add_argument("trial", help="name of the trial, like circle_1")
     parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
+    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--vehicle", default="WHILL Model CR")
@@ -199,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bridge.record: {error}", file=sys.stderr)
         return 2
     try:
-        with ros.node_session("bridge_record", ros_arguments) as node:
+        with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
             ros.spin(node, RecordNode(node, writer, options).finished)
     finally:
         folder = writer.close()

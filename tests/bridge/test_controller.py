@@ -79,7 +79,7 @@ def test_unusable_frame_reaches_neither_policy_nor_wheels_and_stops_the_vehicle_
     stop = world.tick(0.011)
     assert (stop.v, stop.omega, stop.reason) == (0.0, 0.0, "frame age")
     if "stamp_age" not in bad:
-        assert world.controller.supervisor.counts["unusable"] == 5 and world.controller.last_error
+        assert world.controller.supervisor.counts["unusable"] == 5 and world.controller.unusable
 
 
 def test_silent_camera_stops_the_vehicle_within_260_ms_of_its_last_frame():

@@ -7,7 +7,6 @@ import tomllib
 
 import pytest
 
-from bridge.guard import Watchdog
 from bridge.record import TrialWriter, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 
@@ -95,24 +94,3 @@ def test_own_dds_profile_is_used_unless_the_user_chose_one():
 def test_ros_arguments_are_passed_on():
     assert split_ros_arguments(["a", "--b", "--ros-args", "-r", "x:=y"]) == (["a", "--b"], ["--ros-args", "-r", "x:=y"])
     assert split_ros_arguments(["a"]) == (["a"], [])
-
-
-def test_guard_sends_zeros_only_after_a_motion_was_followed_by_silence():
-    guard = Watchdog()
-    assert not any(guard.tick(t / 100) for t in range(100))  # nothing was ever commanded
-    guard.command(1.0, True)
-    sent = [t for t in range(100, 200) if guard.tick(t / 100)]
-    assert sent[0] in (117, 118) and len(sent) == 10 and guard.stops == 1
-    guard.command(2.0, True)
-    guard.command(2.1, False)  # the policy node stopped by itself
-    assert not any(guard.tick(2.1 + t / 100) for t in range(100))
-
-
-def test_guard_stays_silent_while_commands_flow_and_yields_when_they_return():
-    guard = Watchdog()
-    for i in range(100):
-        guard.command(i * 0.125, True)
-        assert not any(guard.tick(i * 0.125 + t / 100) for t in range(12))
-    assert guard.tick(99 * 0.125 + 0.2)
-    guard.command(99 * 0.125 + 0.21, True)
-    assert not guard.tick(99 * 0.125 + 0.26)
