@@ -101,7 +101,7 @@ class Peer:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.commands, self.statuses, self.frames = [], [], 0
-        self.clock_offset, self.shown = 0.0, 0
+        self.clock_offset, self.encoding = 0.0, "rgb8"  # of the camera
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -156,7 +156,7 @@ class Peer:
         def make():
             self.frames += 1
             pixels[0] = 5 if frozen else self.frames % 250
-            message = image(height=size[0], width=size[1], encoding="rgb8", step=3 * size[1])
+            message = image(height=size[0], width=size[1], encoding=self.encoding, step=3 * size[1])
             message.data = array.array("B", pixels)
             stamp = time.time() + self.clock_offset
             message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
