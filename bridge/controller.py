@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from bridge.image import ImageError, to_rgb8
+from bridge.image import Crop, ImageError, compressed_to_rgb8, to_rgb8
 from bridge.policy import Policy
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 
@@ -28,7 +28,7 @@ class Controller:
     """One policy driving one vehicle."""
 
     def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic,
-                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False) -> None:
+                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, crop: Crop | None = None) -> None:
         """Join a policy and its limits.
 
         Args:
@@ -38,6 +38,7 @@ class Controller:
             on_blind: what a dark or saturated camera causes.
             pace_by_stamp: run the policy at its rate in the time of the stamps instead of the wall clock's, for a
                 simulator whose time is slower or faster than the wall clock.
+            crop: the part of the camera's image that the policy sees; None: all of it.
         """
         self.policy = policy
         self.supervisor = Supervisor(safety)
@@ -50,6 +51,8 @@ class Controller:
         self._clock = clock
         self._on_blind = on_blind
         self._pace_by_stamp = pace_by_stamp
+        self._crop = crop
+        self._size = (policy.contract.height, policy.contract.width)
         self._period = 1 / policy.contract.rate_hz
         self._due = -np.inf
         self._arrived = -np.inf
@@ -68,13 +71,23 @@ class Controller:
             stamp_age: time of receipt minus stamp, on the clock that made the stamp [s].
             height, width, encoding, step, data: the fields of sensor_msgs/Image.
         """
-        contract, supervisor = self.policy.contract, self.supervisor
         self.image_bytes = height * step
+        return self._on_decoded(now, stamp, stamp_age, lambda: to_rgb8(height, width, encoding, step, data, self._size,
+                                                                       self._crop))
+
+    def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
+        """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""
+        content = bytes(data)  # type: ignore[call-overload]  # any buffer
+        self.image_bytes = len(content)
+        return self._on_decoded(now, stamp, stamp_age, lambda: compressed_to_rgb8(content, self._size, self._crop))
+
+    def _on_decoded(self, now: float, stamp: float, stamp_age: float, decode: Callable[[], np.ndarray]
+                    ) -> Command | None:
         try:
-            image = to_rgb8(height, width, encoding, step, data, (contract.height, contract.width))
+            image = decode()
         except ImageError as error:
             self.unusable = str(error)
-            supervisor.counts["unusable"] += 1
+            self.supervisor.counts["unusable"] += 1
             return None
         self.unusable = ""
         return self.on_rgb8(now, stamp, stamp_age, image)

@@ -48,6 +48,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--slew", type=float, nargs=2, metavar=("V", "OMEGA"), default=(math.inf, math.inf),
                         help="largest change of commands [m/s2, rad/s2]; a stop is not slowed")
     parser.add_argument("--image-topic", default=ros.IMAGE_TOPIC)
+    parser.add_argument("--compressed", action="store_true",
+                        help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
+    parser.add_argument("--crop", type=int, nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
+                        help="the part of the camera's image that the policy sees [pixels]")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
@@ -91,7 +95,7 @@ class DriveNode:
     """Connects one controller to the ROS graph."""
 
     def __init__(self, node: Any, controller: Controller, options: argparse.Namespace) -> None:
-        from sensor_msgs.msg import Image
+        from sensor_msgs.msg import CompressedImage, Image
         from std_msgs.msg import Empty, String
 
         self.node, self.controller, self.options = node, controller, options
@@ -113,7 +117,9 @@ class DriveNode:
         self._commanders: list[str] = []
         self._listeners: list[Endpoint] = []
         self._guard_stops = 0
-        ros.subscribe_images(node, Image, self._image_topic, self._on_image, self._on_incompatible, self._on_lost)
+        self._image_type = CompressedImage if options.compressed else Image
+        ros.subscribe_images(node, self._image_type, self._image_topic, self._on_image, self._on_incompatible,
+                             self._on_lost)
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
         node.create_subscription(String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
         self._inputs.subscribe(node, self._on_input)
@@ -154,8 +160,12 @@ class DriveNode:
         now = time.monotonic()
         stamp = ros.stamp_seconds(message.header.stamp)
         age = self.node.get_clock().now().nanoseconds * 1e-9 - stamp
-        self._publish(self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
-                                               message.step, message.data))
+        if self.options.compressed:
+            command = self.controller.on_compressed(now, stamp, age, message.data)
+        else:
+            command = self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
+                                               message.step, message.data)
+        self._publish(command)
         digest = -self.supervisor.counts["unusable"] if self.controller.unusable else self.controller.digest
         self._frames.frame(now, stamp, age, digest)
 
@@ -238,8 +248,8 @@ class DriveNode:
         self._frames.trim(now)
         cameras = endpoints(self.node.get_publishers_info_by_topic(self._image_topic))
         return Evidence(
-            image_topic=self._image_topic, image_type="sensor_msgs/msg/Image", cameras=cameras, frames=self._frames,
-            rate_hz=self.controller.policy.contract.rate_hz, stamp_limit=self.options.stamp_age,
+            image_topic=self._image_topic, image_type=f"sensor_msgs/msg/{self._image_type.__name__}", cameras=cameras,
+            frames=self._frames, rate_hz=self.controller.policy.contract.rate_hz, stamp_limit=self.options.stamp_age,
             command_topic=self.commands.name, command_type=self.commands.kind, listeners=self._listeners,
             guard=self.guard.problem(now), silence=self._frames.silence(now), image_bytes=self.controller.image_bytes,
             incompatible=self._incompatible, unusable=self.controller.unusable, blind=self.controller.is_blind,
@@ -265,7 +275,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return 2
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime) as node:
-        controller = Controller(policy, safety, on_blind=options.blind, pace_by_stamp=options.pace == "stamp")
+        controller = Controller(policy, safety, on_blind=options.blind, pace_by_stamp=options.pace == "stamp",
+                                crop=options.crop and tuple(options.crop))
         drive = DriveNode(node, controller, options)
         try:
             ros.spin(node)

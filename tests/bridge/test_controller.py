@@ -68,7 +68,7 @@ def test_each_frame_gives_one_command_and_a_new_episode_begins_with_a_fresh_stat
 
 
 @pytest.mark.parametrize("bad", [
-    {"encoding": "mono8"}, {"height": 9}, {"data": b"short"}, {"step": 23}, {"width": 0}, {"stamp_age": 5.0},
+    {"encoding": "16UC1"}, {"height": 9}, {"data": b"short"}, {"step": 23}, {"width": 0}, {"stamp_age": 5.0},
 ])
 def test_unusable_frame_reaches_neither_policy_nor_wheels_and_stops_the_vehicle_in_time(bad):
     world = World()
