@@ -24,6 +24,7 @@ from bridge.diagnosis import Evidence, FrameLog, causes
 from bridge.guard import BEAT_PERIOD, GuardLink
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import Command, SafetyConfig, State
+from bridge.whill import ChairGate, ChairState
 
 WATCH_PERIOD = 0.01
 LOOK_PERIOD = 0.2
@@ -43,6 +44,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("policy", nargs="+", help="policy file: a folder or a zip of it; of several the last counts")
     parser.add_argument("--base", choices=sorted(BASES), default="whill",
                         help="what is below the command topic: its range, and whether it needs zeros held after a stop")
+    parser.add_argument("--whill-state", default="", metavar="TOPIC",
+                        help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
+                             f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
     parser.add_argument("--v-limits", type=float, nargs=2, metavar=("LOW", "HIGH"), help="[m/s]; default: the policy's")
     parser.add_argument("--omega-limits", type=float, nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
     parser.add_argument("--slew", type=float, nargs=2, metavar=("V", "OMEGA"), default=(math.inf, math.inf),
@@ -123,6 +127,9 @@ class DriveNode:
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
         node.create_subscription(String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
         self._inputs.subscribe(node, self._on_input)
+        self._chair = ChairGate(self.supervisor) if options.whill_state else None
+        if self._chair is not None:
+            node.create_subscription(ros.chair_state_type(), options.whill_state, self._on_chair, ros.best_effort(10))
         self._jump = self._watch_clock()
         self.supervisor.block(NO_BASE, True)
         self._on_watch()
@@ -176,6 +183,8 @@ class DriveNode:
             self.supervisor.clock_jump()
         self._clock_offset = offset
         self._inputs.watch(now)
+        if self._chair is not None:
+            self._chair.watch(now)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
         if self._ear.foreign_zero(now):
             self.supervisor.foreign_command(now)
@@ -195,6 +204,12 @@ class DriveNode:
         self._guard_stops = self.guard.stops
 
     def _on_input(self, now: float) -> None:
+        self._publish(self.controller.on_tick(now))
+
+    def _on_chair(self, state: Any) -> None:
+        now = time.monotonic()
+        if self._chair is not None:
+            self._chair.take(now, ChairState.of(state))
         self._publish(self.controller.on_tick(now))
 
     def _on_rearm(self, _: Any) -> None:

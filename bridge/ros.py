@@ -19,6 +19,7 @@ GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
+CHAIR_STATE_TOPIC = "whill/states/model_cr2"
 E_STOP_TOPIC = "e_stop"
 ENABLE_TOPIC = "enable"
 JOY_TOPIC = "joy"
@@ -168,6 +169,20 @@ def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> An
     from rclpy.clock import Clock, ClockType
 
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def chair_state_type() -> Any:
+    """Return the message class of the WHILL driver's state.
+
+    Raises:
+        SystemExit: the maker's message package is not installed.
+    """
+    try:
+        from whill_msgs.msg import ModelCr2State
+    except ImportError as error:
+        raise SystemExit(f"{error}. The chair's state is a whill_msgs/ModelCr2State. Build the maker's "
+                         "ros2_whill_interfaces in your workspace and source it.") from error
+    return ModelCr2State
 
 
 def stamp_seconds(stamp: Any) -> float:

@@ -34,6 +34,15 @@ Twist = message("Twist", linear=Vector3, angular=Vector3)
 TwistStamped = message("TwistStamped", header=Header, twist=Twist)
 Bool, Empty, String = message("Bool", data=bool), message("Empty"), message("String", data=str)
 Joy = message("Joy", header=Header, axes=list, buttons=list)
+ModelCr2State = message(
+    "ModelCr2State", battery_power=int, battery_current=float, right_motor_angle=float, left_motor_angle=float,
+    right_motor_speed=float, left_motor_speed=float, power_on=int, speed_mode_indicator=int, error=int, joy_front=int,
+    joy_side=int)
+Quaternion = message("Quaternion", x=float, y=float, z=float, w=float)
+Pose = message("Pose", position=Vector3, orientation=Quaternion)
+PoseWithCovariance = message("PoseWithCovariance", pose=Pose, covariance=list)
+TwistWithCovariance = message("TwistWithCovariance", twist=Twist, covariance=list)
+Odometry = message("Odometry", header=Header, child_frame_id=str, pose=PoseWithCovariance, twist=TwistWithCovariance)
 Image = message("Image", header=Header, height=int, width=int, encoding=str, is_bigendian=int, step=int, data=bytes)
 CompressedImage = message("CompressedImage", header=Header, format=str, data=bytes)
 
@@ -175,6 +184,8 @@ def install():
         "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO=0)},
         "std_msgs": {}, "std_msgs.msg": {"Bool": Bool, "Empty": Empty, "String": String, "Header": Header},
         "sensor_msgs": {}, "sensor_msgs.msg": {"Image": Image, "CompressedImage": CompressedImage, "Joy": Joy},
+        "nav_msgs": {}, "nav_msgs.msg": {"Odometry": Odometry},
+        "whill_msgs": {}, "whill_msgs.msg": {"ModelCr2State": ModelCr2State},
         "geometry_msgs": {}, "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped},
     }
     for name in [name for name in sys.modules if name.split(".")[0] in modules]:
