@@ -3,11 +3,12 @@
 import argparse
 import csv
 import math
+import os
 import tomllib
 
 import pytest
 
-from bridge.record import TrialWriter, parse_arguments, toml_text, write_dataset_file
+from bridge.record import TrialWriter, finish, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 
 pytestmark = pytest.mark.quick
@@ -94,3 +95,19 @@ def test_own_dds_profile_is_used_unless_the_user_chose_one():
 def test_ros_arguments_are_passed_on():
     assert split_ros_arguments(["a", "--b", "--ros-args", "-r", "x:=y"]) == (["a", "--b"], ["--ros-args", "-r", "x:=y"])
     assert split_ros_arguments(["a"]) == (["a"], [])
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(tmp_path, capsys):
+    writer = TrialWriter(tmp_path, "full")
+    writer.odometry(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.flush()
+    writer._files["command"] = open("/dev/full", "w")  # each write to it fails for want of space
+    writer.command(0.1, 0.3, 0.0)
+    with pytest.raises(OSError, match="No space"):
+        writer.flush()
+    assert finish(writer) is None
+    said = capsys.readouterr().err
+    assert "No space left on device" in said and "Make room" in said
+    (partial,) = tmp_path.glob(".full.partial-*")
+    assert len((partial / "odometry.csv").read_text().splitlines()) == 2 and not (tmp_path / "trials" / "full").exists()
