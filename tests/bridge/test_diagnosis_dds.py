@@ -31,7 +31,7 @@ def test_unreadable_encoding_is_named_while_it_lasts_and_blamed_for_no_later_sto
     robot.encoding = "rgb8"
     robot.wait_for_status(driving=True)
     second = graph.peer("second")
-    second.camera(frozen=True)
+    second.camera()
     status = robot.wait_for_status(causes="2 publishers")
     assert "/robot" in str(status["causes"]) and "/second" in str(status["causes"]) and "8UC3" not in str(status)
 

@@ -4,6 +4,8 @@ import time
 
 import pytest
 
+from benchmarks.bridge_robot import message_type
+
 
 def latched_profile():
     from bridge import ros
@@ -13,10 +15,8 @@ def latched_profile():
 
 @pytest.mark.parametrize("topic", ["e_stop", "collision_sensor"])
 def test_stop_that_was_latched_before_the_bridge_started_is_heard(graph, policy, topic):
-    from ros_graph import message_type
-
     robot = graph.peer("robot")
-    beat = robot.robot()
+    beat = robot.whole()
     if topic == "e_stop":
         beat.timer.cancel()
     bell = robot.publisher("std_msgs/Bool", topic, latched_profile())
@@ -29,8 +29,6 @@ def test_stop_that_was_latched_before_the_bridge_started_is_heard(graph, policy,
 
 @pytest.mark.parametrize("durability", ["volatile", "transient local"])
 def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(graph, policy, durability):
-    from ros_graph import message_type
-
     robot = graph.peer("robot")
     robot.base(), robot.watch(), robot.camera()
     boolean = message_type("std_msgs/Bool")
@@ -42,19 +40,17 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
     state["pulled"] = True
     robot.wait_for_status(state="disarmed", reason="emergency stop", holds="emergency stop")
     robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
-    rearm = robot.publisher("std_msgs/Empty", "bridge/rearm")
-    robot.wait_until(lambda _: rearm.get_subscription_count())
-    rearm.publish(message_type("std_msgs/Empty")())
+    robot.arm()
     graph.wait_for("drive", "not armed: emergency stop still holds")
     state["pulled"] = False
     robot.wait_for_status(state="disarmed", holds="[]")
-    rearm.publish(message_type("std_msgs/Empty")())
+    robot.arm()
     robot.wait_for_status(driving=True)
 
 
 def test_emergency_stop_that_falls_silent_while_driving_stops_and_needs_arming(graph, policy):
     robot = graph.peer("robot")
-    beat = robot.robot()
+    beat = robot.whole()
     graph.start("drive", policy)
     robot.wait_for_status(driving=True)
     beat.timer.cancel()
@@ -73,10 +69,8 @@ def test_nothing_moves_while_no_emergency_stop_is_heard(graph, policy):
 
 
 def test_vehicle_moves_only_while_the_dead_man_button_is_held(graph, policy):
-    from ros_graph import message_type
-
     robot = graph.peer("robot")
-    robot.robot()
+    robot.whole()
     joy = robot.publisher("sensor_msgs/Joy", "joy")
     buttons = [0, 0, 0]
     timer = robot.repeat(joy, 0.05, lambda: message_type("sensor_msgs/Joy")(buttons=buttons))

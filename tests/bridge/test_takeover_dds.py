@@ -5,26 +5,12 @@ import time
 import pytest
 
 
-def joystick(peer, v, topic="whill/controller/cmd_vel", kind="geometry_msgs/Twist"):
-    """A publisher on the command topic and a maker of its commands."""
-    from ros_graph import message_type
-
-    publisher = peer.publisher(kind, topic)
-
-    def make(v=v):
-        message = message_type(kind)()
-        getattr(message, "twist", message).linear.x = float(v)
-        return message
-
-    return publisher, make
-
-
 def test_person_who_takes_over_while_driving_is_never_fought_and_the_bridge_needs_arming_afterwards(graph, policy):
     robot = graph.peer("robot")
-    robot.robot()
+    robot.whole()
     graph.start("drive", policy, "--allow-other-commanders")
     person = graph.peer("joystick")
-    publisher, make = joystick(person, 0.11)
+    publisher, make = person.commander(0.11)
     robot.wait_for_status(driving=True)
     robot.wait_until(lambda robot: robot.moving())
     timer = person.repeat(publisher, 0.05, make)
@@ -37,18 +23,15 @@ def test_person_who_takes_over_while_driving_is_never_fought_and_the_bridge_need
     since = time.monotonic()
     time.sleep(0.5)
     assert not [command for command in robot.commands if command[0] > since]  # the WHILL is left to its rider
-    rearm = person.publisher("std_msgs/Empty", "bridge/rearm")
-    robot.wait_until(lambda robot: rearm.get_subscription_count())
-    from ros_graph import message_type
-    rearm.publish(message_type("std_msgs/Empty")())
+    person.arm()
     robot.wait_for_status(driving=True)
 
 
 def test_single_stray_command_of_another_node_ends_the_drive(graph, policy):
     robot = graph.peer("robot")
-    robot.robot()
+    robot.whole()
     graph.start("drive", policy, "--allow-other-commanders")
-    publisher, make = joystick(graph.peer("stray"), 9.0)
+    publisher, make = graph.peer("stray").commander(9.0)
     robot.wait_for_status(driving=True)
     publisher.publish(make())
     robot.wait_for_status(state="disarmed", reason="another node drove")
@@ -56,9 +39,9 @@ def test_single_stray_command_of_another_node_ends_the_drive(graph, policy):
 
 def test_base_that_keeps_its_last_command_is_stopped_when_the_other_driver_falls_silent(graph, policy):
     robot = graph.peer("robot")
-    robot.robot()
+    robot.whole()
     graph.start("drive", policy, "--allow-other-commanders", "--base", "generic")
-    publisher, make = joystick(graph.peer("joystick"), 0.11)
+    publisher, make = graph.peer("joystick").commander(0.11)
     robot.wait_for_status(driving=True)
     publisher.publish(make())
     robot.wait_for_status(state="disarmed")
@@ -68,19 +51,15 @@ def test_base_that_keeps_its_last_command_is_stopped_when_the_other_driver_falls
 @pytest.mark.parametrize("kind", ["geometry_msgs/Twist", "geometry_msgs/TwistStamped"])
 def test_commands_come_in_the_type_that_the_base_listens_to(graph, policy, kind):
     robot = graph.peer("robot")
-    robot.robot() if kind == "geometry_msgs/Twist" else None
-    if kind != "geometry_msgs/Twist":
-        robot.base(kind=kind)
-        robot.camera()
-        robot.e_stop()
+    robot.base(kind=kind), robot.camera(), robot.e_stop()
     graph.start("drive", policy)
     robot.wait_until(lambda robot: robot.moving())
 
 
 def test_second_commander_that_is_there_before_the_start_is_named_and_nothing_moves(graph, policy):
     robot = graph.peer("robot")
-    robot.robot()
-    joystick(graph.peer("planner"), 0.0)
+    robot.whole()
+    graph.peer("planner").commander(0.0)
     graph.start("drive", policy)
     robot.wait_for_status(state="standing", reason="another node publishes commands", causes="/planner")
     time.sleep(0.5)
@@ -88,12 +67,9 @@ def test_second_commander_that_is_there_before_the_start_is_named_and_nothing_mo
 
 
 def test_arming_one_of_two_bridges_in_namespaces_leaves_the_other_disarmed(graph, policy):
-    from ros_graph import message_type
-
     robot = graph.peer("robot")
     for side in ("left", "right"):
-        for topic in ("e_stop",):
-            robot.e_stop(f"/{side}/{topic}")
+        robot.e_stop(f"/{side}/e_stop")
         robot.base(f"/{side}/whill/controller/cmd_vel")
         robot.camera(f"/{side}/sensing/camera/front/image_raw")
         graph.start("drive", policy, "--require-arm", "--ros-args", "-r", f"__ns:=/{side}", key=side)
@@ -101,9 +77,7 @@ def test_arming_one_of_two_bridges_in_namespaces_leaves_the_other_disarmed(graph
     left.watch("/left/bridge/status"), right.watch("/right/bridge/status")
     for operator in (left, right):
         operator.wait_for_status(state="disarmed", holds="[]")
-    rearm = left.publisher("std_msgs/Empty", "/left/bridge/rearm")
-    left.wait_until(lambda _: rearm.get_subscription_count())
-    rearm.publish(message_type("std_msgs/Empty")())
+    left.arm("/left/bridge/rearm")
     left.wait_for_status(driving=True)
     time.sleep(1.0)
     assert right.wait_for_status(state="disarmed")["driving"] is False
