@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.metadata
 import json
 import os
+import re
 import signal
 import statistics
 import subprocess
@@ -198,18 +200,18 @@ FAULTS: dict[str, tuple[tuple[str, ...], Any, Any]] = {
     "wrong_encoding": ((), lambda bridge: setattr(bridge.robot, "encoding", "bayer_rggb8"),
                        lambda bridge: setattr(bridge.robot, "encoding", "rgb8")),
     "guard_killed": ((), lambda bridge: os.kill(bridge.guard(), signal.SIGKILL), lambda bridge: None),
-    "node_frozen": (("--signal-age", "5"), lambda bridge: bridge.process.send_signal(signal.SIGSTOP),
+    "node_stopped": (("--signal-age", "5"), lambda bridge: bridge.process.send_signal(signal.SIGSTOP),
                     lambda bridge: bridge.process.send_signal(signal.SIGCONT)),
     "node_ends": ((), lambda bridge: bridge.process.terminate(), None),
-    "node_killed": ((), lambda bridge: bridge.process.kill(), None),
-    "node_killed_first": ((), lambda bridge: bridge.process.kill(), None),
+    "killed": ((), lambda bridge: bridge.process.kill(), None),
+    "killed_first": ((), lambda bridge: bridge.process.kill(), None),
 }
 """Options, injection and its end by the name of a fault; without an end each repeat takes a new node."""
 
 
-def measure_faults(policy: Path, domain: int, repeats: int) -> dict[str, list[float]]:
-    """Return the reaction times [ms] to every fault, and how many commands came after a person took over."""
-    found: dict[str, list[float]] = {}
+def measure_faults(policy: Path, domain: int, repeats: int) -> Figures:
+    """Return the reaction times to every fault."""
+    found: Figures = {}
     for number, (name, (options, inject, end)) in enumerate(FAULTS.items()):
         reactions: list[float] = []
         while len(reactions) < repeats:
@@ -218,7 +220,8 @@ def measure_faults(policy: Path, domain: int, repeats: int) -> dict[str, list[fl
                 reactions.extend(reaction_times(bridge, name, inject, end, repeats if end else 1, len(reactions)))
             finally:
                 bridge.close()
-        found[f"stop_{name}_ms"] = reactions
+        title = "e_stop_ms" if name == "e_stop" else f"stop_{name}_ms"
+        found[title] = (reactions, "ms from the fault to the first zero")
     return found
 
 
@@ -227,7 +230,7 @@ def reaction_times(bridge: Bridge, name: str, inject: Any, end: Any, repeats: in
     robot, found = bridge.robot, []
     for i in range(repeats):
         robot.wait_until(moving_after(time.monotonic()))
-        if name != "node_killed_first":
+        if name != "killed_first":
             time.sleep(0.7 + 0.037 * (i + phase))
         at = time.monotonic()
         inject(bridge)
@@ -285,74 +288,115 @@ def cold_start(policy_path: Path) -> float:
     return time.perf_counter() - start
 
 
-def measure(seconds: float, resets: int, kills: int, policy_path: Path | None) -> dict[str, tuple[list[float], str]]:
-    """Return every figure as its repeats and unit."""
-    figures: dict[str, tuple[list[float], str]] = {}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        stand_in = export_stand_in(folder / "stand_in")
-        policy = policy_path or stand_in
-        domain = 1 + os.getpid() % 60
-        healthy_stops, growth = 0, []
+Figures = dict[str, tuple[list[float], str]]
+"""Repeats and unit of each figure by its name."""
 
-        for suffix in ("", "_realtime"):
-            run = Run(folder, policy, "EndlessRobot", domain, realtime=bool(suffix))
-            domain += 1
-            time.sleep(5)
-            before = memory_mb(run.drive.pid)
-            time.sleep(seconds)
-            growth.append(memory_mb(run.drive.pid) - before)
-            results, drive = run.finish()
-            healthy_stops += stops(drive)
-            delays, intervals = settled(results)
-            figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
-            figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
-            figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
-            figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(np.abs(intervals - 100), 99))], "ms")
-            run = Run(folder, policy, "EndlessRobot", domain, "--image-size", "720", "1280", realtime=bool(suffix))
-            domain += 1
-            time.sleep(seconds + 5)
-            results, drive = run.finish()
-            healthy_stops += stops(drive)
-            figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
-            end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
-            shown = sum(t < end - 0.01 for t in results["image_times"])
-            figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
-        figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
 
-        figures["healthy_stops"] = ([float(healthy_stops)], f"stops in {4 * (seconds + 5):.0f} healthy seconds")
-        figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first 5 s")
-        run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
-        run.simulate.wait(30 + 4 * resets)
-        results, _ = run.finish()
-        episodes = results["episodes"]
-        figures["stop_input_ms"] = ([1e3 * first_zero(results, episode["ended"]) for episode in episodes], "ms")
-        stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
-                    for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
-        figures["stale_after_reset"] = ([float(stale)], f"commands before the third frame, {resets - 1} resets")
-
-        run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
-        run.simulate.wait(90)
-        results, _ = run.finish()
-        whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in results["episodes"]]
-        figures["stop_action_ms"] = ([1e3 * first_zero(results, white - 0.03) - 30 for white in whites], "ms")
-
-        for name, reactions in measure_faults(policy, domain + 2, kills).items():
-            figures[name] = (reactions, "ms from the fault to the first zero")
-        figures["fuzz_violations"] = ([float(fuzz(1_000_000))], "of 1,000,000 outputs of a policy: any 64 bits")
-        figures["policy_p99_ms"] = ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms")
-        figures["cold_start_s"] = ([cold_start(policy) for _ in range(3)], "s")
+def measure_steady(policy: Path, folder: Path, domain: int, seconds: float) -> Figures:
+    """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives."""
+    figures: Figures = {}
+    healthy_stops, growth = 0, []
+    for number, suffix in enumerate(("", "_realtime")):
+        run = Run(folder, policy, "EndlessRobot", domain + 2 * number, realtime=bool(suffix))
+        time.sleep(5)
+        before = memory_mb(run.drive.pid)
+        time.sleep(seconds)
+        growth.append(memory_mb(run.drive.pid) - before)
+        results, drive = run.finish()
+        healthy_stops += stops(drive)
+        delays, intervals = settled(results)
+        figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
+        figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
+        figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
+        figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(np.abs(intervals - 100), 99))], "ms")
+        run = Run(folder, policy, "EndlessRobot", domain + 2 * number + 1, "--image-size", "720", "1280",
+                  realtime=bool(suffix))
+        time.sleep(seconds + 5)
+        results, drive = run.finish()
+        healthy_stops += stops(drive)
+        figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
+        end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
+        shown = sum(t < end - 0.01 for t in results["image_times"])
+        figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
+    figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
+    figures["healthy_stops"] = ([float(healthy_stops)], f"stops in {4 * (seconds + 5):.0f} healthy seconds")
+    figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first 5 s")
     return figures
 
 
+def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, resets: int) -> Figures:
+    """Return the reactions to a camera that falls silent, at resets, and to an action that is not a number."""
+    run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
+    run.simulate.wait(30 + 4 * resets)
+    results, _ = run.finish()
+    episodes = results["episodes"]
+    stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
+                for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
+    run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
+    run.simulate.wait(90)
+    white_results, _ = run.finish()
+    whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in white_results["episodes"]]
+    return {
+        "stop_input_ms": ([1e3 * first_zero(results, episode["ended"]) for episode in episodes], "ms"),
+        "stale_after_reset": ([float(stale)], f"commands before the third frame, {resets - 1} resets"),
+        "stop_action_ms": ([1e3 * first_zero(white_results, white - 0.03) - 30 for white in whites], "ms"),
+    }
+
+
+def measure_policy(policy: Path, seconds: float) -> Figures:
+    """Return duration and cold start of the policy, and the size of what it needs."""
+    return {
+        "policy_p99_ms": ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms"),
+        "cold_start_s": ([cold_start(policy) for _ in range(3)], "s"),
+        "installed_mb": ([installed_mb("numpy", "onnxruntime")], "MB of numpy, onnxruntime and what they require"),
+    }
+
+
+def installed_mb(*names: str) -> float:
+    """Return the size [MB] of installed distributions and all that they require."""
+    found: dict[str, float] = {}
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        files = [Path(str(distribution.locate_file(file))) for file in distribution.files or ()]
+        found[name] = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
+        required = [line for line in distribution.requires or () if "extra ==" not in line]
+        waiting.extend(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in required)
+    return sum(found.values())
+
+
 def main() -> None:
+    parts = ("steady", "episodes", "faults", "fuzz", "policy")
     parser = argparse.ArgumentParser(description="Measure the bridge.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each steady run")
     parser.add_argument("--resets", type=int, default=20)
-    parser.add_argument("--kills", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=5, help="of each fault")
     parser.add_argument("--policy", type=Path, help="policy file to measure; default: a stand-in of 10 M parameters")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     options = parser.parse_args()
-    figures = measure(options.seconds, options.resets, options.kills, options.policy)
+    figures: Figures = {}
+    domain = 1 + os.getpid() % 60
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        stand_in = export_stand_in(folder / "stand_in")
+        policy = options.policy or stand_in
+        if "steady" in options.parts:
+            figures |= measure_steady(policy, folder, domain, options.seconds)
+        if "episodes" in options.parts:
+            figures |= measure_episodes(policy, stand_in, folder, domain + 4, options.resets)
+        if "faults" in options.parts:
+            figures |= measure_faults(policy, domain + 6, options.repeats)
+            figures["faults_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the faults")
+        if "fuzz" in options.parts:
+            figures["fuzz_outside_limits"] = ([float(fuzz(1_000_000))], "of 1,000,000 outputs of any 64 bits")
+        if "policy" in options.parts:
+            figures |= measure_policy(policy, options.seconds)
 
     from benchmarks.harness import figure, record
 
