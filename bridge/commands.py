@@ -151,7 +151,7 @@ class CommandListener:
             planar = message.twist if kind == "TwistStamped" else message
             self._on_command(planar.linear.x, planar.angular.z)
 
-        self.node.create_subscription(self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
+        ros.subscribe_own(self.node, self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
 
 
 class CommandTopic(CommandListener):
