@@ -123,6 +123,7 @@ class DriveNode:
         self._heartbeat = node.create_publisher(String, ros.HEARTBEAT_TOPIC, ros.reliable())
         self._incompatible = self._said_driving = False
         self._started = time.monotonic()
+        self._camera_since = self._started
         self._last_frame = self._looked = self._said = -math.inf
         self._clock_offset = time.time() - self._started
         self._reported: tuple[str, ...] = ()
@@ -201,7 +202,7 @@ class DriveNode:
         if self._chair is not None:
             self._chair.watch(now)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
-        if self._ear.foreign_zero(now):
+        if self._ear.foreign_zero():
             self.supervisor.foreign_command(now)
         self._publish(self.controller.on_tick(now))
         since = now - self._last_frame
@@ -217,14 +218,13 @@ class DriveNode:
             self._on_status()
 
     def _on_command(self, v: float, omega: float) -> None:
-        now = time.monotonic()
-        if self._ear.heard(now, v, omega):
-            self.supervisor.foreign_command(now)
+        if self._ear.heard(v, omega):
+            self.supervisor.foreign_command(time.monotonic())
 
     def _on_guard(self, message: Any) -> None:
         now = time.monotonic()
         self.guard.heard(now, message.data)
-        self._ear.guard_reports(now, self.guard.zeros)
+        self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
             self.supervisor.fault(GUARD_STOPPED)
         self._guard_stops = self.guard.stops
@@ -290,12 +290,16 @@ class DriveNode:
         now = time.monotonic()
         self._frames.trim(now)
         cameras = endpoints(self.node.get_publishers_info_by_topic(self._image_topic))
+        if not cameras:
+            self._camera_since = now
+        settled = self._frames.is_full(now) if self._frames.count else now - self._camera_since > STARTING
         return Evidence(
             image_topic=self._image_topic, image_type=f"sensor_msgs/msg/{self._image_type.__name__}", cameras=cameras,
             frames=self._frames, rate_hz=self.controller.policy.contract.rate_hz, stamp_limit=self.options.stamp_age,
             command_topic=self.commands.name, command_type=self.commands.kind, listeners=self._listeners,
-            guard=self.guard.problem(now), silence=self._frames.silence(now), image_bytes=self.controller.image_bytes,
-            incompatible=self._incompatible, unusable=self.controller.unusable, blind=self.controller.is_blind,
+            guard=self.guard.problem(now), settled=settled, silence=self._frames.silence(now),
+            image_bytes=self.controller.image_bytes, incompatible=self._incompatible,
+            unusable=self.controller.unusable, blind=self.controller.is_blind,
             pace_by_stamp=self.options.pace == "stamp", commanders=self._commanders,
             starting=now - self._started < STARTING)
 
