@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
-from whill_mjx.randomize import randomize_looks
-from whill_mjx.render import Quality, camera_rotation, pinhole, render
-from whill_mjx.render.pallas import Tiling, render_pallas
-from whill_mjx.scene import Boxes, Marker, Scene, default_looks
-from whill_mjx.solids import Solids, person, stack_rounds
+from whill_mjx.world.randomize import randomize_looks
+from whill_mjx.world.render import Quality, camera_rotation, pinhole, render
+from whill_mjx.world.render.pallas import Tiling, render_pallas
+from whill_mjx.world.scene import Boxes, Marker, Scene, default_looks
+from whill_mjx.world.solids import Solids, person, stack_rounds
 
 BOXES = 32  # the goal marker is one of them
 WALLS = Path(__file__).parent / "stata_basement_walls.csv"

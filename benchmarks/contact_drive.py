@@ -18,8 +18,9 @@ import numpy as np
 from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
 from benchmarks.plant.make import make_log
-from sysid.fit import FitConfig, fit_log, predict
-from sysid.log import Log, load_log
+from sysid.logs.log import Log, load_log
+from sysid.search.fitting import fit_log, predict
+from sysid.search.settings import FitConfig
 
 FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
 

@@ -29,9 +29,18 @@ from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
-from whill_mjx.dataset import plain, write_json
-from whill_mjx.inside import mean_figures
-from whill_mjx.policy_file import RUN_FILE
+from whill_mjx.evaluation.policy_file import RUN_FILE
+from whill_mjx.learning.checks import mean_figures
+from whill_mjx.learning.setup import (
+    TRUTH,
+    find_preset,
+    functional_env,
+    make_training_env,
+    with_layout,
+    with_repeat,
+    with_settings,
+)
+from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.train import (
     TrainOptions,
     choose_preset,
@@ -40,15 +49,6 @@ from whill_mjx.train import (
     preset_name,
     train_baseline,
     train_policy,
-)
-from whill_mjx.training import (
-    TRUTH,
-    find_preset,
-    functional_env,
-    make_training_env,
-    with_layout,
-    with_repeat,
-    with_settings,
 )
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
@@ -224,7 +224,7 @@ def _changes(config: dict[str, Any], size: str) -> dict[str, Any]:
 def planner(options: argparse.Namespace) -> None:
     """Return, success and arrival of the ground-truth planner over `episodes` randomised worlds."""
     from whill_mjx.env import make_env, reset_state, step_state
-    from whill_mjx.planner import first_plan, for_task, plan_action
+    from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
 
     env, params = make_env("obstacle_course")
     config = for_task(env.task)

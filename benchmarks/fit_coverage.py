@@ -23,16 +23,17 @@ import numpy as np
 from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
-from sysid.fit import FitConfig, choose, fit_log, fitted_plant, make_problem
-from sysid.independence import Evidence
-from sysid.log import Log, load_log
-from sysid.models import with_effects
-from sysid.space import NUISANCE, Space, make_space, searched
-from sysid.synthetic import write_dataset
-from sysid.uncertainty import Estimate, estimate, uncertainty_of
-from whill_mjx.parameters import get_values, set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR, VehicleSpec
+from sysid.errors.space import NUISANCE, Space, make_space, searched
+from sysid.intervals.independence import Evidence
+from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
+from sysid.logs.log import Log, load_log
+from sysid.logs.synthetic import write_dataset
+from sysid.replay.models import with_effects
+from sysid.search.fitting import choose, fit_log, fitted_plant, make_problem
+from sysid.search.settings import FitConfig
+from whill_mjx.vehicle.parameters import get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec
 
 MANOEUVRES = ("straight", "turn", "circle", "s_curve")
 PLANT_MANOEUVRES = ("straight", "turn", "s_curve", "stop_and_go", "random")

@@ -32,16 +32,16 @@ from benchmarks.fit_scores import CLAIM
 from benchmarks.harness import figure, record
 from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
-from sysid import gradient, starts
-from sysid.feature_objective import make_features_objective
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, fit_log, make_problem
-from sysid.log import Log, Trial, load_log
-from sysid.metrics import command_in_force
-from sysid.objective import estimate_noise
-from sysid.searches import Judge, Recorder
-from sysid.valleys import gradient_search
-from whill_mjx.parameters import get_values, set_values
-from whill_mjx.presets import preset_params
+from sysid.errors.bin_objective import make_features_objective
+from sysid.errors.pose_objective import estimate_noise
+from sysid.logs.log import Log, Trial, command_in_force, load_log
+from sysid.search import least_squares, starts
+from sysid.search.comparison import Judge, Recorder
+from sysid.search.fitting import fit_log, make_problem
+from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
+from sysid.search.valleys import gradient_search
+from whill_mjx.vehicle.parameters import get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
 
 NAMES = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "body.yaw_inertia", "body.com_x")
 MANOEUVRES = ("straight", "turn", "circle", "s_curve", "stop_and_go", "random")
@@ -228,7 +228,7 @@ def fit_ours(log: Log, settings: Peer) -> tuple[Curve, Curve, dict[str, float], 
     judge = Judge(problem, replace(log, trials=tuple(replace(trial, held_out=True) for trial in log.training)))
 
     def on_poses(objective: Any) -> np.ndarray:
-        return gradient.fit(objective, space, iterations=settings.iterations, robust=True).u
+        return least_squares.fit(objective, space, iterations=settings.iterations, robust=True).u
 
     def by_default(objective: Any) -> np.ndarray:
         points = starts.draw(objective, [0], log.spec.track, 0)

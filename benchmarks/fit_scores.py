@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.harness import figure
-from sysid.fit import Fit, predict
-from sysid.log import Log, Trial
-from sysid.metrics import own_floor
-from sysid.report import error_rows, summaries
+from sysid.logs.log import Log, Trial
+from sysid.logs.metrics import own_floor
+from sysid.pages.report import error_rows, summaries
+from sysid.search.fitting import Fit, predict
 
 CLAIM = "How near a fit comes to the noise floor of its data"
 

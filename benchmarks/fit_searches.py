@@ -16,14 +16,17 @@ import numpy as np
 
 from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
-from sysid import gradient, starts, tpe
-from sysid.feature_objective import make_features_objective
-from sysid.fit import FEATURE_ITERATIONS, FitConfig, Problem, choose, fitted_plant
-from sysid.log import Log, load_log
-from sysid.objective import HUGE, Objective
-from sysid.searches import Judge, Trace, arrivals, trace, write
-from sysid.studies import BATCH
-from sysid.valleys import from_all, gradient_search
+from sysid.errors.bin_objective import make_features_objective
+from sysid.errors.pose_objective import HUGE, Objective
+from sysid.logs.log import Log, load_log
+from sysid.search import least_squares, starts, tpe
+from sysid.search.comparison import Judge, arrivals, trace
+from sysid.search.fitting import Problem, choose, fitted_plant
+from sysid.search.result import Trace
+from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
+from sysid.search.studies import BATCH
+from sysid.search.valleys import from_all, gradient_search
+from sysid.searches import write
 
 STARTS = 32
 SAME = 0.01
@@ -43,9 +46,9 @@ def find_log(name: str, shared: Path, trials: int = 18) -> Log:
     """`planted`, `plant` (the shared plain chair) or a folder; of the latter two at most `trials` are fitted."""
     if name != "planted":
         return short_log(load_log(shared / "data" / "plant" / "plain" if name == "plant" else Path(name)), trials)
-    from sysid.synthetic import write_dataset
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from sysid.logs.synthetic import write_dataset
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     with tempfile.TemporaryDirectory() as folder:
         return load_log(write_dataset(Path(folder) / "planted", WHILL_CR, preset_params(WHILL_CR, "physical"),
@@ -64,7 +67,8 @@ def start_job(
 ) -> dict[str, Any]:
     """The default search from one of STARTS starts: features, then poses with the delays profiled.
 
-    Start 0 has the initial values; the others are drawn over the whole range of every parameter (`sysid.starts.draw`).
+    Start 0 has the initial values; the others are drawn over the whole range of every parameter
+    (`sysid.search.starts.draw`).
 
     Args:
         folder: for what each of its three stages gave.
@@ -108,7 +112,7 @@ def common_costs(problem: Problem, track: float, ends: np.ndarray) -> np.ndarray
         before, best = best, int(costs.argmin())
         if best == before:
             break
-        costs = gradient.costs_of(bins.renewed(ends[best]), ends, robust=True)
+        costs = least_squares.costs_of(bins.renewed(ends[best]), ends, robust=True)
     return costs
 
 

@@ -17,6 +17,8 @@ from typing import Any
 
 import jax
 
+from whill_mjx import __version__
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -59,7 +61,7 @@ def record(
     replacing: str | tuple[str, ...] | None = None,
 ) -> Path:
     """Merge `figures` into `folder/stem.json` and return its path. Figures of other names in the file are kept, but for
-    those that begin with `replacing`: they are of an earlier run which had others. A figure measured elsewhere may tell
+    those that begin with `replacing`: they are of an earlier run which had others. A figure measured elsewhere may have
     `versions` of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}.json"
@@ -76,9 +78,9 @@ def record(
 
 
 def provenance() -> dict[str, Any]:
-    """Command, versions, commit and date of what is running."""
-    return {"command": " ".join(["python", "-m", _module_name(), *map(told, sys.argv[1:])]), "versions": versions(),
-            "commit": _commit(), "date": datetime.date.today().isoformat()}
+    """Command, release, versions, commit and date of what is running."""
+    return {"command": " ".join(["python", "-m", _module_name(), *map(portable, sys.argv[1:])]), "release": __version__,
+            "versions": versions(), "commit": _commit(), "date": datetime.date.today().isoformat()}
 
 
 def versions() -> dict[str, str]:
@@ -86,9 +88,9 @@ def versions() -> dict[str, str]:
     return {name: _version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "numpy")}
 
 
-def told(word: str) -> str:
-    """An argument as results tell it: of an absolute path what lies inside the tree, else the name alone, since where a
-    machine keeps it says nothing."""
+def portable(word: str) -> str:
+    """An argument as result files have it: of an absolute path what lies inside the tree, else the name alone. Where a
+    machine keeps a file says nothing."""
     if not os.path.isabs(word):
         return word
     path, root = Path(os.path.abspath(word)), RESULTS.parent.parent

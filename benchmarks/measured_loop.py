@@ -25,18 +25,20 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
-from sysid.close_loop import LoopConfig, Result, close_loop, refit_poses
-from sysid.log import Log, Trial
-from sysid.loop.late_pose import NAME, PARAMETER
-from sysid.loop.report import effects, replay
-from sysid.loop.unnamed import find_unnamed, replay_unnamed
-from sysid.lost_pose import without_lost
-from sysid.measured import load_drive, load_mrclam, split
-from sysid.metrics import Prediction, ideal_replay, score
-from sysid.models import with_effects
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
+from sysid.logs.log import Log, Prediction, Trial
+from sysid.logs.lost_pose import without_lost
+from sysid.logs.measured import load_drive, load_mrclam, split
+from sysid.logs.metrics import ideal_replay, score
+from sysid.pages.loop_report import effects, replay
+from sysid.replay.models import with_effects
+from sysid.verdict.late_pose import NAME, PARAMETER
+from sysid.verdict.pipeline import find_missing
+from sysid.verdict.result import LoopConfig, Result
+from sysid.verdict.vehicles import fitted_after, fitted_before, refit_poses
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
@@ -120,13 +122,14 @@ def one_loop(
     done = kept(settings, name)
     if done is not None:
         return done
-    result = close_loop(log, config=config, progress=lambda _, text: print(f"  {name}: {text}", flush=True), **given)
+    result = find_missing(log, config=config, progress=lambda _, text: print(f"  {name}: {text}", flush=True), **given)
     found = verdict_of(result)
     if not scored:
         return keep(settings, name, found)
     held = log.held_out
-    before = refit_poses(result, result.before)  # as often as what comes after, so that this is no reason to be better
-    after = refit_poses(result, result.after) if found["verdict"] == "named" else before
+    # As often as what comes after, so that this is no reason to be better.
+    before = refit_poses(result, fitted_before(result))
+    after = refit_poses(result, fitted_after(result)) if found["verdict"] == "named" else before
     found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
     found["before"], found["after"] = (errors(held, replay(result, one, held)) for one in (before, after))
     wrench = find_unnamed(result)

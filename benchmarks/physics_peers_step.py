@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.harness import RESULTS, figure
 from benchmarks.plant.chair import TIMESTEP, Chair, Nominal, build
-from whill_mjx.manoeuvres import command_table
+from whill_mjx.logs.manoeuvres import command_table
 
 STEPS = (0.008, 0.004, 0.002, 0.001, 0.0005)  # s
 TICK = 0.008  # s, of the wheel-speed control: a multiple of every step

@@ -68,8 +68,8 @@ def work_of(vehicle: str, count: int = 64) -> Work:
 
     The host's compiler counts, on any machine: an accelerator's may not.
     """
-    from benchmarks.physics import random_instances
-    from whill_mjx.vehicle import substep
+    from benchmarks.physics_rolls import random_instances
+    from whill_mjx.vehicle.dynamics import substep
 
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         model, params, states = random_instances(vehicle, count)
@@ -134,7 +134,7 @@ def recorded_rates(ending: str = "") -> dict[int, float]:
 
 def measure_roofline(vehicle: str = "loaded", count: int = 1024) -> dict[str, dict[str, Any]]:
     """Figures of work, limits and distance from them."""
-    from benchmarks.physics import compiled_roll
+    from benchmarks.physics_rolls import compiled_roll
 
     work, platform = work_of(vehicle), jax.devices()[0].platform
     compiled = compiled_roll(vehicle, count, 1, "fused")[1]

@@ -32,8 +32,8 @@ from dreamer.iteration import Metrics, TrainState, compile_iteration, init_state
 from dreamer.replay import Replay
 from dreamer.types import FunctionalEnv, Transition
 from whill_mjx.devices import choose_devices
-from whill_mjx.task import make_task
-from whill_mjx.training import functional_env, make_training_env
+from whill_mjx.learning.setup import functional_env, make_training_env
+from whill_mjx.tasks.tasks import make_task
 
 CLAIM = "Stepping the environment and learning on several devices of one host, at a fixed work per device"
 DEFAULT_COUNTS = (1, 2, 4)

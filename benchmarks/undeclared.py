@@ -27,11 +27,12 @@ from benchmarks import undeclared_figures
 from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
 from benchmarks.undeclared_reference import Driven, prepared, reference_days, reference_of
-from sysid.close_loop import LoopConfig, Prepared, close_loop, prepare
-from sysid.log import load_log
-from sysid.loop.report import make_report, write_run
-from sysid.rollout import vehicle_plant
-from whill_mjx.config import VehicleConfig
+from sysid.logs.log import load_log
+from sysid.pages.loop_report import make_report, write_run
+from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.pipeline import find_missing, prepare
+from sysid.verdict.result import LoopConfig, Prepared
+from whill_mjx.vehicle.config import VehicleConfig
 
 REFERENCES = ("plain", "plain_2", "plain_3", "plain_4", "plain_5", "plain_6")
 SETS = ("a", "b", "c", "d", "e", "f", "g", "h")
@@ -125,7 +126,7 @@ def shared(settings: Benchmark) -> None:
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
-        result = replace(close_loop(log, (), config, reference=ready), references=tuple(references))
+        result = replace(find_missing(log, (), config, reference=ready), references=tuple(references))
         report = make_report(result)
         write_run(settings.work / "shared" / name, result, report)
         content["sets"][name] = {
@@ -174,10 +175,10 @@ def plant(settings: Benchmark) -> None:
 
 def look_alikes(settings: Benchmark) -> None:
     """Classes of effects on the nine manoeuvres, with and without an outside pose."""
-    from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
-    from sysid.loop.classes import classes, imitation
-    from sysid.loop.drives import make_drives
-    from sysid.loop.evidence import gather
+    from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
+    from sysid.missing.drives import make_drives
+    from sysid.missing.signatures import gather
+    from sysid.verdict.classes import classes, imitation
 
     days = reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
@@ -200,7 +201,7 @@ def look_alikes(settings: Benchmark) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write whole or not at all."""
-    from sysid.report import write_report
+    from sysid.pages.report import write_report
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write_report(path, content)

@@ -13,9 +13,9 @@ from benchmarks.harness import device_name, figure, provenance, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_plant import RECORDED, power_sizes
 from benchmarks.undeclared_reference import USUAL, Driven
-from sysid.loop.calibrated import FILE, calibrated
-from sysid.report import write_report
-from sysid.statistics import upper_rate
+from sysid.follow_up.calibrated import FILE, calibrated
+from sysid.intervals.statistics import upper_rate
+from sysid.pages.report import write_report
 
 LEAST = 30
 """Logs with nothing in them on which p-values are calibrated at least."""
@@ -185,7 +185,7 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
 
 
 def warned(one: dict[str, Any]) -> bool:
-    """Whether a name comes with a warning (`sysid.loop.trust.warnings`); one is that more is left than days differ
+    """Whether a name comes with a warning (`sysid.follow_up.trust.warnings`); one is that more is left than days differ
     by, which verdicts of before others were kept tell too."""
     return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
 

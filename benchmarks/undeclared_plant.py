@@ -25,12 +25,13 @@ from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.make import make_log
 from benchmarks.undeclared_reference import USUAL, Driven, reference_days
-from sysid.close_loop import LoopConfig, Prepared, Result, close_loop
-from sysid.log import load_log
-from sysid.loop.report import effects as named_effects
-from sysid.loop.report import make_report, write_run
-from sysid.loop.trust import warnings
-from sysid.report import write_report
+from sysid.follow_up.trust import warnings
+from sysid.logs.log import load_log
+from sysid.pages.loop_report import effects as named_effects
+from sysid.pages.loop_report import make_report, write_run
+from sysid.pages.report import write_report
+from sysid.verdict.pipeline import find_missing
+from sysid.verdict.result import LoopConfig, Prepared, Result
 
 RECORDED = RESULTS / "undeclared.json"
 POWER = 0.84
@@ -256,7 +257,7 @@ def judge(
         make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise, vehicle=driven.vehicle)
     began = time.perf_counter()
     config = replace(config, without=job.without)
-    result = close_loop(load_log(folder), (), config, reference=ready)
+    result = find_missing(load_log(folder), (), config, reference=ready)
     content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, **brief(result),
                "seconds": time.perf_counter() - began}
     if full and result.search.verdict == "named":

@@ -15,13 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.plant.make import make_log
-from sysid.close_loop import LoopConfig, Prepared, prepare
-from sysid.log import Log, load_log
-from sysid.loop.reference import Reference, make_reference
-from sysid.report import code_hashes
-from sysid.rollout import vehicle_plant
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset_params
+from sysid.logs.log import Log, load_log
+from sysid.missing.days import Reference
+from sysid.missing.reference import make_reference
+from sysid.pages.report import code_hashes
+from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.pipeline import prepare
+from sysid.verdict.result import LoopConfig, Prepared
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset_params
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 
 
 def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Prepared:
-    """A set ready for `close_loop`; its days are driven, and fitted, where that was not done before."""
+    """A set ready for `find_missing`; its days are driven, and fitted, where that was not done before."""
     days = reference_days(work, driven, number)
     path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
     if path.exists():

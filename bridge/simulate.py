@@ -83,7 +83,7 @@ class ChairSimulator:
         import jax
 
         from whill_mjx import env as environment
-        from whill_mjx.task import make_task
+        from whill_mjx.tasks.tasks import make_task
 
         env, params = environment.make_env(make_task(task, **changes, action_repeat=1), vehicle)
         self.period = float(env.model.config.control_dt)

@@ -1,1 +1,62 @@
-"""Identification of vehicle parameters from driving logs."""
+"""Identification of vehicle parameters from driving logs.
+
+`python -m sysid` lists the commands. What users import is below and in docs/api.md; everything else is internal.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sysid.logs.log import Command as Command
+    from sysid.logs.log import Log as Log
+    from sysid.logs.log import OdometryStream as OdometryStream
+    from sysid.logs.log import PoseStream as PoseStream
+    from sysid.logs.log import Trial as Trial
+    from sysid.logs.log import load_log as load_log
+    from sysid.logs.measured import load_any as load_any
+    from sysid.pages.fit_report import fit_dataset as fit_dataset
+    from sysid.pages.report import read_report as read_report
+    from sysid.replay.mjcf import mjcf_model as mjcf_model
+    from sysid.replay.models import function_model as function_model
+    from sysid.search.fitting import fit_log as fit_log
+    from sysid.search.fitting import predict as predict
+    from sysid.search.settings import FitConfig as FitConfig
+    from sysid.verdict.found import Thresholds as Thresholds
+    from sysid.verdict.pipeline import find_missing as find_missing
+    from sysid.verdict.pipeline import prepare as prepare
+    from sysid.verdict.result import LoopConfig as LoopConfig
+
+_HOMES = {
+    "Log": "sysid.logs.log",
+    "Trial": "sysid.logs.log",
+    "Command": "sysid.logs.log",
+    "OdometryStream": "sysid.logs.log",
+    "PoseStream": "sysid.logs.log",
+    "load_log": "sysid.logs.log",
+    "load_any": "sysid.logs.measured",
+    "FitConfig": "sysid.search.settings",
+    "fit_log": "sysid.search.fitting",
+    "predict": "sysid.search.fitting",
+    "fit_dataset": "sysid.pages.fit_report",
+    "function_model": "sysid.replay.models",
+    "mjcf_model": "sysid.replay.mjcf",
+    "read_report": "sysid.pages.report",
+    "LoopConfig": "sysid.verdict.result",
+    "Thresholds": "sysid.verdict.found",
+    "prepare": "sysid.verdict.pipeline",
+    "find_missing": "sysid.verdict.pipeline",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use: importing the package stays quick."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sysid.result import Progress
+from sysid.search.result import Progress
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None) -> None:

@@ -7,26 +7,87 @@ import json
 import pytest
 
 from benchmarks import tables
-from benchmarks.harness import figure, record
+from benchmarks.claims import Claim
+from benchmarks.harness import RESULTS, figure, record
 from benchmarks.merge import merge
-from benchmarks.tables import MARKS, page, put_between_marks
+from benchmarks.tables import MARKS, headlines, page, put_between_marks, shown
+from whill_mjx import __version__
 
 pytestmark = pytest.mark.quick
 
 
-def test_a_recorded_figure_appears_on_the_page_with_its_median_and_device(tmp_path):
-    record("physics", "it runs", {"dt_s": figure([0.5, 0.25, 4.0], "s", "test device")}, tmp_path)
+HEAD, ROW = ("what", "median", "range"), ("a run", "{dt_s}", "{dt_s|range}")
+TEST = Claim("Tests", "It runs", "camera", "Seconds.", HEAD, (ROW,))
+
+
+def test_a_recorded_figure_appears_with_its_median_range_and_device(tmp_path, monkeypatch):
+    record("camera", "it runs", {"dt_s": figure([0.5, 0.25, 4.0], "s", "test device")}, tmp_path)
+    monkeypatch.setattr(tables, "CLAIMS", (TEST,))
     text = page(tmp_path)
-    assert "| dt_s | 0.5 | s | 0.5, 0.25, 4 | test device |" in text
+    assert "### It runs\nSeconds." in text
+    assert "| a run | 0.5 | 0.25 to 4 |" in text
+    assert "test device" in text
 
 
-def test_a_note_written_by_hand_stands_below_its_table(tmp_path, monkeypatch):
-    record("camera", "it runs", {"a": figure([1.0], "s", "x")}, tmp_path)
+def test_a_claim_without_figures_is_left_out(tmp_path, monkeypatch):
+    record("camera", "it runs", {"other": figure([1.0], "s", "x")}, tmp_path)
+    monkeypatch.setattr(tables, "CLAIMS", (TEST,))
+    assert "It runs" not in page(tmp_path)
+
+
+def test_a_note_written_by_hand_stands_below_the_tables_of_its_file(tmp_path, monkeypatch):
+    record("camera", "it runs", {"dt_s": figure([1.0], "s", "x")}, tmp_path)
     monkeypatch.setattr(tables, "NOTES", tmp_path)
+    monkeypatch.setattr(tables, "CLAIMS", (TEST,))
     assert "predicted" not in page(tmp_path)
     (tmp_path / "camera.md").write_text("| predicted | measured |\n")
     text = page(tmp_path)
-    assert text.index("| a | 1 |") < text.index("| predicted | measured |")
+    assert text.index("| a run | 1 |") < text.index("| predicted | measured |")
+
+
+@pytest.mark.parametrize(
+    ("form", "text"),
+    [("", "0.986"), ("%", "98.6 %"), ("1e3", "986"), ("range %", "95.5 % to 99.5 %"), ("n", "3"), (".steps", "22,000")],
+)
+def test_a_cell_shows_a_figure_in_each_form(form, text):
+    entry = {"value": 0.9857, "repeats": [0.955, 0.9857, 0.995], "steps": 22000}
+    assert shown(entry, form) == text
+
+
+def test_every_claim_and_headline_names_figures_that_were_recorded():
+    figures = tables.Figures(RESULTS)
+    for claim in tables.CLAIMS:
+        content = figures.content(claim.stem)
+        for row in claim.rows(content) if callable(claim.rows) else claim.rows:
+            assert len(row) == len(claim.head), (claim.title, row)
+            assert figures.fill(row[1], claim.stem) is not None or any(
+                figures.fill(cell, claim.stem) for cell in row[1:]), (claim.title, row)
+    for stem, what, value in tables.HEADLINES:
+        assert figures.fill(value, stem), what
+
+
+def test_readme_has_at_most_ten_figures_and_both_pages_agree_with_the_result_files():
+    assert len(tables.HEADLINES) <= 10
+    for path, text in tables.pages().items():
+        assert path.read_text() == text, f"{path}: run python -m benchmarks.tables."
+
+
+def test_a_figure_of_another_release_is_marked_as_older(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "HEADLINES", (("camera", "a run", "{dt_s} s"),))
+    path = record("camera", "it runs", {"dt_s": figure([1.0], "s", "x")}, tmp_path)
+    assert "| a run | 1 s | x |" in headlines(tmp_path)
+    path.write_text(path.read_text().replace(f'"release": "{__version__}"', '"release": "0.0.1"'))
+    assert "| a run | 1 s* | x |" in headlines(tmp_path)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--check"]])
+def test_help_and_check_rewrite_nothing(arguments, monkeypatch):
+    monkeypatch.setattr(tables, "write", lambda *_: pytest.fail("a page was written"))
+    if arguments == ["--help"]:
+        with pytest.raises(SystemExit, match="0"):
+            tables.main(arguments)
+    else:
+        tables.main(arguments)
 
 
 def test_recording_keeps_figures_of_other_names_and_replaces_those_of_the_same(tmp_path):

@@ -1,5 +1,72 @@
-"""Batched simulator of micromobility vehicles on MuJoCo MJX."""
+"""Batched simulator of micromobility vehicles on MuJoCo MJX.
+
+`python -m whill_mjx` lists the commands. What users import is below and in docs/api.md; everything else is internal.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from whill_mjx.processor import share_results
 
+if TYPE_CHECKING:
+    from whill_mjx.batch import make_batch as make_batch
+    from whill_mjx.effects import EFFECTS as EFFECTS
+    from whill_mjx.effects import make_effect as make_effect
+    from whill_mjx.effects import register as register
+    from whill_mjx.env import make_env as make_env
+    from whill_mjx.env import reset as reset
+    from whill_mjx.env import step as step
+    from whill_mjx.evaluation.policy_file import load_policy as load_policy
+    from whill_mjx.gym import WhillEnv as WhillEnv
+    from whill_mjx.tasks.tasks import Corridor as Corridor
+    from whill_mjx.tasks.tasks import ObstacleCourse as ObstacleCourse
+    from whill_mjx.vehicle.config import VehicleConfig as VehicleConfig
+    from whill_mjx.vehicle.parameters import describe as describe
+    from whill_mjx.vehicle.parameters import get_values as get_values
+    from whill_mjx.vehicle.parameters import set_values as set_values
+    from whill_mjx.vehicle.presets import preset as preset
+    from whill_mjx.vehicle.specs import VehicleSpec as VehicleSpec
+    from whill_mjx.vehicle.types import VehicleParams as VehicleParams
+    from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle
+    from whill_mjx.vehicle.vehicle_file import save_vehicle as save_vehicle
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "make_env": "whill_mjx.env",
+    "reset": "whill_mjx.env",
+    "step": "whill_mjx.env",
+    "make_batch": "whill_mjx.batch",
+    "WhillEnv": "whill_mjx.gym",
+    "ObstacleCourse": "whill_mjx.tasks.tasks",
+    "Corridor": "whill_mjx.tasks.tasks",
+    "VehicleSpec": "whill_mjx.vehicle.specs",
+    "VehicleConfig": "whill_mjx.vehicle.config",
+    "VehicleParams": "whill_mjx.vehicle.types",
+    "preset": "whill_mjx.vehicle.presets",
+    "load_vehicle": "whill_mjx.vehicle.vehicle_file",
+    "save_vehicle": "whill_mjx.vehicle.vehicle_file",
+    "describe": "whill_mjx.vehicle.parameters",
+    "get_values": "whill_mjx.vehicle.parameters",
+    "set_values": "whill_mjx.vehicle.parameters",
+    "EFFECTS": "whill_mjx.effects",
+    "make_effect": "whill_mjx.effects",
+    "register": "whill_mjx.effects",
+    "load_policy": "whill_mjx.evaluation.policy_file",
+}
+__all__ = list(_HOMES)
+
 share_results()
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use: importing the package stays quick."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

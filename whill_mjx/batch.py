@@ -22,8 +22,8 @@ from whill_mjx.env import (
     step_state,
     time_step,
 )
-from whill_mjx.randomize import randomize_params
-from whill_mjx.types import TimeStep, VehicleParams
+from whill_mjx.vehicle.types import TimeStep, VehicleParams
+from whill_mjx.world.randomize import randomize_params
 
 
 @struct.dataclass

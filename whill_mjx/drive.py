@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.config import VehicleConfig
-from whill_mjx.dataset import (
+from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.logs.dataset import (
     COMMAND_HEADER,
     write_csv,
     write_encoder,
@@ -34,16 +34,16 @@ from whill_mjx.dataset import (
     write_imu,
     write_odometry,
 )
-from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.sensors import SensorNoise, Sensors, seen, times
-from whill_mjx.specs import VehicleSpec
-from whill_mjx.types import VehicleParams, VehicleState, parameters_of
-from whill_mjx.vehicle import place, substep
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.logs.manoeuvres import MANOEUVRES, Scenario, command_table
+from whill_mjx.logs.simulated_sensors import SensorNoise, Sensors, seen, times
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import place, substep
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams, VehicleState, parameters_of
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 MEASUREMENT_DT = 0.05  # s
 
@@ -258,7 +258,8 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
         raise ValueError(f"--out {options.out}: exists already; a drive never replaces another. Choose another folder.")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     chosen = tyro.cli(DriveOptions)
@@ -268,3 +269,7 @@ if __name__ == "__main__":
         sys.exit(f"whill_mjx.drive: {error}")
     count = len(list((folder / "trials").iterdir()))
     print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
+
+
+if __name__ == "__main__":
+    cli()

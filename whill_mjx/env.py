@@ -10,19 +10,19 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.augment import Photometry, augment, draw_photometry, neutral
-from whill_mjx.kinematics import body_twist, camera_pose, reference_pose
-from whill_mjx.model import VehicleModel, build_model
-from whill_mjx.presets import preset
-from whill_mjx.randomize import randomize_looks
-from whill_mjx.render import pinhole, render
-from whill_mjx.scene import Scene, clearance, collides, footprint
-from whill_mjx.specs import VehicleSpec
-from whill_mjx.starts import draw_start
-from whill_mjx.task import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
-from whill_mjx.types import TimeStep, VehicleParams, VehicleState
-from whill_mjx.vehicle import drive, place
-from whill_mjx.vehicle_file import load_vehicle as load_vehicle_file
+from whill_mjx.tasks.starts import draw_start
+from whill_mjx.tasks.tasks import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
+from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
+from whill_mjx.vehicle.model import VehicleModel, build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
+from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle_file
+from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
+from whill_mjx.world.randomize import randomize_looks
+from whill_mjx.world.render import pinhole, render
+from whill_mjx.world.scene import Scene, clearance, collides, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode."""
@@ -43,7 +43,8 @@ class Env:
     photometric: bool = False
     """Apply the paper's photometric randomisation to the images."""
     exploring_starts: float = 0.0
-    """Share of episodes that begin at a random free place on the way to the goal; for training (`whill_mjx.starts`)."""
+    """Share of episodes that begin at a random free place on the way to the goal; for training
+    (`whill_mjx.tasks.starts`)."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.exploring_starts <= 1.0:

@@ -19,13 +19,13 @@ import jax
 import numpy as np
 import tyro
 
-from whill_mjx.dataset import plain, write_json
-from whill_mjx.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.env import make_env
-from whill_mjx.evaluation import NEAR_M, Course, Episodes, episode_keys, summarise
-from whill_mjx.policy_file import RUN_FILE, PolicyFile, load_policy
-from whill_mjx.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
-from whill_mjx.task import TASKS, Task, make_task
+from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
+from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
+from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
+from whill_mjx.evaluation.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
+from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.tasks.tasks import TASKS, Task, make_task
 
 SCRIPTED = ("planner", "random")
 
@@ -125,10 +125,10 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
     evaluation["seconds"] = time.perf_counter() - began
     write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
     if options.html:
-        from whill_mjx.report import page
+        from whill_mjx.evaluation.pages import page
 
         title = f"{options.policy} on {evaluation['task']['name']}"
-        page(title, evaluation, pictures, videos, options.out / "report.html")
+        page(title, evaluation, pictures, videos, options.out / "pages.html")
     say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
     return evaluation
 
@@ -231,28 +231,28 @@ def draw(
     sweeps: list[Sweep],
 ) -> tuple[list[Path], list[Path]]:  # fmt: skip
     """Write pictures and videos; what cannot be written for want of a package is left out and said."""
-    from whill_mjx import report
+    from whill_mjx.evaluation import pages
 
     out, episodes = options.out, driven[main_name]
     failed = np.flatnonzero(episodes.ends["success"] < 0.5)
     rate, radius = 1.0 / episodes.control_dt, task.goal_radius
-    jobs: dict[str, Any] = {"paths.png": lambda path: report.paths_from_above(episodes, radius, path)}
+    jobs: dict[str, Any] = {"paths.png": lambda path: pages.paths_from_above(episodes, radius, path)}
     for name in driven:
         if name not in (main_name, "random"):
             jobs[f"paths_{name.replace(' ', '_')}.png"] = (
-                lambda path, name=name: report.paths_from_above(driven[name], radius, path, count=8)
+                lambda path, name=name: pages.paths_from_above(driven[name], radius, path, count=8)
             )
     if len(failed):
-        jobs["failures.png"] = lambda path: report.paths_from_above(episodes.some(failed), radius, path)
+        jobs["failures.png"] = lambda path: pages.paths_from_above(episodes.some(failed), radius, path)
     for sweep in sweeps:
         label = "_".join(axis.name for axis in sweep.axes)
-        jobs[f"sweep_{label}.png"] = lambda path, sweep=sweep: report.sweep_picture(sweep, path, main_name)
+        jobs[f"sweep_{label}.png"] = lambda path, sweep=sweep: pages.sweep_picture(sweep, path, main_name)
         if any(axis.name in ("obstacle_x", "obstacle_y") for axis in sweep.axes):
-            jobs[f"paths_{label}.png"] = lambda path, sweep=sweep: report.sweep_paths(sweep, path, radius)
+            jobs[f"paths_{label}.png"] = lambda path, sweep=sweep: pages.sweep_paths(sweep, path, radius)
     if len(failed) and options.videos:
         def failures(path: Path) -> None:
             shown = np.asarray(failed[: options.videos])
-            report.episode_video(*course.film(driver, episodes.keys[shown]), path, rate)
+            pages.episode_video(*course.film(driver, episodes.keys[shown]), path, rate)
 
         jobs["failures.mp4"] = failures
     written = []
@@ -280,8 +280,13 @@ def _named(text: str) -> tuple[str, str]:
     return name, value
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     try:
         main(tyro.cli(EvaluateOptions, description=__doc__))
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    cli()

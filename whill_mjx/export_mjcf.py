@@ -12,8 +12,8 @@ writes DIR/vehicle.xml, DIR/vehicle.toml and DIR/drive.py, an example. In MuJoCo
     data.ctrl[:] = 0.5, 0.3          # v [m/s], omega [rad/s]
     mujoco.mj_step(model, data)
 
-The callback does what `whill_mjx.vehicle.forces` does, with the same code compiled for the processor: the command in
-data.ctrl passes the effects, drive and ground give a wrench and wheel torques, and they are written to
+The callback does what `whill_mjx.vehicle.dynamics.forces` does, with the same code compiled for the processor: the
+command in data.ctrl passes the effects, drive and ground give a wrench and wheel torques, and they are written to
 data.qfrc_applied of the vehicle's own joints. It keeps the memory of the effects (delays, integrals), once per step of
 data.time, and the odometry. Two vehicles in one scene need two callbacks, and names of their own.
 
@@ -36,14 +36,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from whill_mjx.config import VehicleConfig
 from whill_mjx.effects.base import apply_chain
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.model import ASSET, VehicleModel, build_model, mujoco_model
-from whill_mjx.specs import VehicleSpec
-from whill_mjx.types import Odometry, VehicleParams, VehicleState
-from whill_mjx.vehicle import advance_odometry, forces, mass_distribution, nominal_world, place, substep
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import advance_odometry, forces, mass_distribution, nominal_world, place, substep
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import ASSET, VehicleModel, build_model, mujoco_model
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import Odometry, VehicleParams, VehicleState
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 FILES = ("vehicle.xml", "vehicle.toml", "drive.py")
 EXAMPLE = '''"""Drives the vehicle in C MuJoCo for ten seconds; prints where it is and where it thinks it is."""
@@ -300,8 +300,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Export, check and say what was written."""
-    from whill_mjx.manoeuvres import Scenario, command_table
-    from whill_mjx.presets import preset
+    from whill_mjx.logs.manoeuvres import Scenario, command_table
+    from whill_mjx.vehicle.presets import preset
 
     named = options.vehicle.endswith(".toml")
     spec, params = load_vehicle(options.vehicle)[:2] if named else preset(options.vehicle)

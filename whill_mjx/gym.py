@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from whill_mjx.env import make_env, reset, step
-from whill_mjx.task import Task
+from whill_mjx.tasks.tasks import Task
 
 INFO = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
 ENDINGS = ("success", "collision", "diverged")

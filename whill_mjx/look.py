@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
-from whill_mjx.gallery import gallery, walk
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.planner import first_plan, for_task, plan_action
-from whill_mjx.render import Intrinsics, Quality, pinhole, render, render_frame
-from whill_mjx.render.film import Film, develop, motion_blur
-from whill_mjx.scene import box, footprint, stack_boxes
-from whill_mjx.task import TASKS
-from whill_mjx.types import VehicleParams
+from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
+from whill_mjx.tasks.tasks import TASKS
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.world.gallery import gallery, walk
+from whill_mjx.world.render import Intrinsics, Quality, pinhole, render, render_frame
+from whill_mjx.world.render.film import Film, develop, motion_blur
+from whill_mjx.world.scene import box, footprint, stack_boxes
 
 VIDEOS = (".mp4", ".gif")
 """Endings of videos."""
@@ -216,8 +216,13 @@ def main(options: Look) -> None:
     print(f"{options.out}: {options.scene}")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     # `--task` is the option's former name.
     main(tyro.cli(Look, args=["--scene" if word == "--task" else word for word in sys.argv[1:]]))
+
+
+if __name__ == "__main__":
+    cli()

@@ -20,18 +20,16 @@ from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
-from whill_mjx.dataset import plain, write_json, write_text
 from whill_mjx.devices import choose_devices, join
-from whill_mjx.drivers import planner_driver, random_driver
-from whill_mjx.evaluation import Course, episode_keys
-from whill_mjx.final import evaluate_drivers, write_report
-from whill_mjx.inside import Evaluate, Stopper, keep_best, mean_figures, read_best, say
-from whill_mjx.policy_file import RUN_FILE
-from whill_mjx.ppo_run import train_ppo
-from whill_mjx.prediction import write_prediction
-from whill_mjx.rollouts import rollout
-from whill_mjx.safe import Step, find_safety
-from whill_mjx.training import (
+from whill_mjx.evaluation.drivers import planner_driver, random_driver
+from whill_mjx.evaluation.episodes import Course, episode_keys
+from whill_mjx.evaluation.policy_file import RUN_FILE, camera_contract
+from whill_mjx.evaluation.rollouts import rollout
+from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best, say
+from whill_mjx.learning.final_report import evaluate_drivers, write_report
+from whill_mjx.learning.ppo_training import train_ppo
+from whill_mjx.learning.prediction import write_prediction
+from whill_mjx.learning.setup import (
     TRUTH,
     Preset,
     dreamer_policy,
@@ -44,6 +42,8 @@ from whill_mjx.training import (
     with_repeat,
     with_settings,
 )
+from whill_mjx.learning.shaping import Step, find_safety
+from whill_mjx.logs.dataset import plain, write_json, write_text
 
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
@@ -91,7 +91,8 @@ class TrainOptions:
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
-    """Let the world model also tell goal, speeds and free distances, which the simulator knows (`whill_mjx.truth`). The
+    """Let the world model also tell goal, speeds and free distances, which the simulator knows
+    (`whill_mjx.learning.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: float | None = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
@@ -209,8 +210,8 @@ def choose_preset(options: TrainOptions) -> Preset:
 
 def prepare_vehicle(options: TrainOptions) -> Path:
     """RUN/vehicle.toml: a copy of the given file, a preset, or fitted to the log."""
-    from whill_mjx.presets import preset
-    from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+    from whill_mjx.vehicle.presets import preset
+    from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
     target = options.out / "vehicle.toml"
     if options.vehicle is not None:
@@ -225,8 +226,9 @@ def prepare_vehicle(options: TrainOptions) -> Path:
         say(f"vehicle: {target} from an earlier run")
         return target
     import sysid
+    from sysid import FitConfig, fit_dataset
     from sysid.command_line import progress_bar
-    from sysid.fit import FitConfig, expected_steps, fit_dataset
+    from sysid.search.fitting import expected_steps
 
     log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
@@ -333,7 +335,7 @@ def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Co
 
 def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained) -> dict[str, Any]:
     """Drive the final evaluation with the policy, the planner and random actions; write pictures and videos."""
-    from whill_mjx import pictures
+    from whill_mjx.evaluation import pictures
 
     course = make_course(preset, vehicle)
     driver = step_driver(*policy_of(options, preset, result, course), preset.task.action_repeat)
@@ -361,19 +363,17 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
     """Write a policy file."""
-    from whill_mjx.vehicle_file import load_vehicle
-
     task = preset.task
-    spec, _, _ = load_vehicle(vehicle)
+    course = make_course(preset, vehicle)
     contract = PolicyContract(
         action_low=(task.v_min, -task.omega_max),
         action_high=(task.v_max, task.omega_max),
         task=options.task,
         rate_hz=10.0,
         action_repeat=task.action_repeat,
-        camera=dataclasses.asdict(spec.camera),
+        camera=camera_contract(course.env.model, course.params),
     )
-    step, carry = policy_of(options, preset, result, make_course(preset, vehicle))
+    step, carry = policy_of(options, preset, result, course)
     try:
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
@@ -381,7 +381,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         return None
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Command line."""
     import tyro
 
     try:
@@ -390,3 +391,7 @@ if __name__ == "__main__":
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("stopped; give the same command again to go on from the last checkpoint.")
+
+
+if __name__ == "__main__":
+    cli()

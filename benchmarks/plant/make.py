@@ -19,7 +19,7 @@ from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.sensors import odometry, outside_pose
 from benchmarks.plant.trial import Noise, Plant
-from whill_mjx.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
+from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
 
 HELD_OUT = ("figure_eight_1", "figure_eight_2", "figure_eight_3", "s_curve_3", "random_3", "stop_and_go_3", "reverse_3")
 

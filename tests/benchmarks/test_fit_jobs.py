@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks import fit, fit_coverage, fit_searches
-from benchmarks.fit import Benchmark
 from benchmarks.fit_jobs import (
     RememberedCosts,
     compile_once,
@@ -21,12 +20,13 @@ from benchmarks.fit_jobs import (
     staged,
     write_result,
 )
+from benchmarks.fit_settings import Benchmark
 from benchmarks.plant.chair import VEHICLES, Chair
-from sysid.independence import Evidence
-from sysid.models import measured_effects, with_effects
-from sysid.space import Space, make_space, searched
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR, in_proportion
+from sysid.errors.space import Space, make_space, searched
+from sysid.intervals.independence import Evidence
+from sysid.replay.models import measured_effects, with_effects
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR, in_proportion
 
 
 @pytest.mark.quick

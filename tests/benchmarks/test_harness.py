@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.harness import RESULTS, figure, record, told
+from benchmarks.harness import RESULTS, figure, portable, record
 from benchmarks.merge import merge
 
 TREE = RESULTS.parent.parent
@@ -22,7 +22,7 @@ TREE = RESULTS.parent.parent
     ("cpu, 1 core of the H200's host", "cpu, 1 core of the H200's host"),
 ])  # fmt: skip
 def test_a_command_is_told_without_the_places_of_a_machine(word, shown):
-    assert told(word) == shown
+    assert portable(word) == shown
 
 
 @pytest.mark.quick

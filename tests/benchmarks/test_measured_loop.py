@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.measured_loop import Benchmark, climb, config_of, drive_log, interval, is_false, keep, of_terrain
-from sysid.models import with_effects
-from whill_mjx.presets import preset_params
+from sysid.replay.models import with_effects
+from whill_mjx.vehicle.presets import preset_params
 
 pytestmark = pytest.mark.quick
 SHARED = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / ".." / "shared"))
@@ -69,7 +69,7 @@ def test_a_delay_of_the_pose_that_was_named_is_held():
 
 
 def drive_spec():
-    from whill_mjx.specs import WARTHOG
+    from whill_mjx.vehicle.specs import WARTHOG
 
     return WARTHOG
 

@@ -14,8 +14,8 @@ pytest.importorskip("mujoco")
 from benchmarks import undeclared, undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
 from benchmarks import undeclared_reference as days  # noqa: E402
-from sysid.close_loop import LoopConfig  # noqa: E402
-from sysid.loop import calibrated  # noqa: E402
+from sysid.follow_up import calibrated  # noqa: E402
+from sysid.verdict.result import LoopConfig  # noqa: E402
 
 pytestmark = pytest.mark.quick
 

@@ -43,7 +43,7 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
     assert max(distance) == pytest.approx(max(truth) - truth[0], abs=0.05) and max(truth) > 0.2
     rows_per_command = len(distance) / sum(v > 0 for v in speeds)
     assert rows_per_command > 1.2  # 20 Hz against 10 Hz
-    sysid_log = pytest.importorskip("sysid.log")
+    sysid_log = pytest.importorskip("sysid.logs.log")
     (loaded,) = sysid_log.load_log(tmp_path / "logs").trials
     assert loaded.name == "straight_1" and loaded.odometry is not None and loaded.ground_truth is not None
 

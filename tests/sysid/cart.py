@@ -2,7 +2,7 @@
 
 TEXT = '''
 import jax.numpy as jnp
-from sysid.models import function_model
+from sysid.replay.models import function_model
 
 def step(p, state, command):
     x, y, yaw, v, omega = state

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.objective import Objective, estimate_noise
-from sysid.rollout import Plant, Replay, make_batch
-from sysid.scenarios import Scenario
-from sysid.space import Space
-from whill_mjx.specs import WHILL_CR
+from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.errors.space import Space
+from sysid.logs.scenarios import Scenario
+from sysid.replay.records import Plant
+from sysid.replay.rollout import Replay, make_batch
+from whill_mjx.vehicle.specs import WHILL_CR
 
 SHORT = Scenario(v=0.5, omega=0.8, length=3.0)
 
@@ -61,8 +62,8 @@ def unicycle_objective(trials, space: Space = UNICYCLE_SPACE) -> Objective:
 @pytest.fixture(scope="session")
 def unicycle_log(tmp_path_factory):
     """Log of the kinematic vehicle at TRUTH, with sensor noise."""
-    from sysid.log import load_log
-    from sysid.synthetic import write_dataset
+    from sysid.logs.log import load_log
+    from sysid.logs.synthetic import write_dataset
 
     folder = tmp_path_factory.mktemp("unicycle") / "log"
     write_dataset(folder, WHILL_CR, jnp.asarray(TRUTH), replicates=2, scenario=SHORT, plant=unicycle_plant(), seed=3)

@@ -7,46 +7,40 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.close_loop import (
-    Arguments,
-    LoopConfig,
-    close_loop,
-    drives_of,
-    expected_steps,
-    main,
-    manifest,
-    refit_poses,
-    vehicle_after,
-    vehicle_before,
-)
+from sysid.close_loop import Arguments, main
+from sysid.errors.features import CHANNELS, make_features
+from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
-from sysid.log import load_log
-from sysid.loop.catalogue import base_values
-from sysid.loop.drives import make_drives
-from sysid.loop.falsifiers import Falsifier, course_of, put_to_test
-from sysid.loop.features import CHANNELS, make_features
-from sysid.loop.next_manoeuvre import refitter_of
-from sysid.loop.noise import deviations, replicate_groups
-from sysid.loop.null_refits import NullRefits, checked
-from sysid.loop.null_refits import run as run_null_refits
-from sysid.loop.refit import without_each
-from sysid.loop.report import effects, make_report, replay, write_run
-from sysid.loop.tables import Table
-from sysid.loop.trust import beside_still_base, warnings
-from sysid.loop.unnamed import vehicle_of, with_start_angles
-from sysid.metrics import own_floor, score
-from sysid.models import with_effects
-from sysid.rollout import Measured, vehicle_plant
-from sysid.synthetic import write_dataset
-from whill_mjx.config import VehicleConfig
+from sysid.follow_up.tables import Table
+from sysid.follow_up.trust import beside_still_base, warnings
+from sysid.follow_up.unnamed import vehicle_of, with_start_angles
+from sysid.logs.log import load_log
+from sysid.logs.metrics import own_floor, score
+from sysid.logs.synthetic import write_dataset
+from sysid.missing.catalogue import base_values
+from sysid.missing.drives import make_drives
+from sysid.missing.refit import without_each
+from sysid.pages.loop_report import effects, make_report, manifest, replay, write_run
+from sysid.replay.models import with_effects
+from sysid.replay.records import Measured
+from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.falsification import course_of, put_to_test
+from sysid.verdict.found import NullRefits
+from sysid.verdict.null_refits import checked
+from sysid.verdict.null_refits import run as run_null_refits
+from sysid.verdict.pipeline import expected_steps, find_missing
+from sysid.verdict.result import LoopConfig
+from sysid.verdict.vehicles import drives_of, refit_poses, refitter_of, vehicle_after, vehicle_before
 from whill_mjx.effects import make_effect
+from whill_mjx.effects.card import Falsifier
 from whill_mjx.effects.unnamed import KNOTS
-from whill_mjx.manoeuvres import Scenario
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset
-from whill_mjx.types import VehicleParams
-from whill_mjx.vehicle_file import load_vehicle
+from whill_mjx.logs.manoeuvres import Scenario
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 DRIVES = ("straight", "circle", "s_curve")
 CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200, poses=False)
@@ -89,7 +83,7 @@ def stages():
 
 @pytest.fixture(scope="module")
 def sloping(drives, stages):
-    return close_loop(drives["sloping"], (drives["reference_1"], drives["reference_2"]), CONFIG,
+    return find_missing(drives["sloping"], (drives["reference_1"], drives["reference_2"]), CONFIG,
                       progress=lambda steps, stage: stages.append((steps, stage)))
 
 
@@ -112,21 +106,22 @@ def test_a_fit_may_close_the_loop_with_the_same_references(folder, tmp_path, mon
     monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {"prior": None, "dataset": {"notes": []}})
     monkeypatch.setattr("sysid.fit.parameter_table", lambda _: "")
     monkeypatch.setattr("sysid.fit.table", lambda _: "")
-    monkeypatch.setattr("sysid.close_loop.run", lambda *given: asked.append(given))
+    monkeypatch.setattr("sysid.verdict.pipeline.watched", lambda *given: given)
+    monkeypatch.setattr("sysid.pages.loop_report.write_result", lambda *given: asked.append(given))
     fit_main(FitArguments(dataset=folder / "sloping", out=tmp_path, close_loop=True, reference=(folder / "plain",)))
-    [(log, references, out, config)] = asked
+    [(out, (log, references, config))] = asked
     assert (log.name, [one.name for one in references], out) == ("sloping", ["plain"], tmp_path / "close_loop")
     assert config.seed == 0
 
 
 def test_finds_nothing_where_nothing_is(drives, sloping):
-    result = close_loop(drives["plain"], (), CONFIG, reference=sloping.reference)
+    result = find_missing(drives["plain"], (), CONFIG, reference=sloping.reference)
     assert result.search.verdict == "none"
 
 
 def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, sloping):
     config = replace(CONFIG, without=("slope", "wind"))
-    result = close_loop(drives["sloping"], (), config, reference=sloping.prepared)
+    result = find_missing(drives["sloping"], (), config, reference=sloping.prepared)
     assert result.search.verdict != "none"
     assert not {"slope", "wind"} & {one.hypothesis.effect for one in result.search.accepted}
     with pytest.raises(ValueError, match="there is no effect 'slop' .known: "):
@@ -134,7 +129,7 @@ def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, slopin
 
 
 def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sloping):
-    result = close_loop(drives["sloping"], (), replace(CONFIG, refit_nulls=4), reference=sloping.prepared)
+    result = find_missing(drives["sloping"], (), replace(CONFIG, refit_nulls=4), reference=sloping.prepared)
     assert result.search.verdict == "named"
     nulls = result.null_refits
     assert nulls.alarms == 0 and np.all(nulls.p > 1e-3)  # with nothing in them they look nothing like the slope
@@ -152,7 +147,7 @@ def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, 
                                sloping.search.scan, CONFIG.thresholds, 3).p
 
     together = days()
-    monkeypatch.setattr("sysid.loop.null_refits.TOGETHER", 1)
+    monkeypatch.setattr("sysid.verdict.null_refits.TOGETHER", 1)
     np.testing.assert_allclose(days(), together, rtol=1e-6)
 
 
@@ -162,8 +157,8 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
         if accepted:
             found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
 
-    monkeypatch.setattr("sysid.loop.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
-    monkeypatch.setattr("sysid.loop.null_refits.pair_round", rounds)
+    monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
+    monkeypatch.setattr("sysid.verdict.null_refits.pair_round", rounds)
     nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
                             sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
     assert nulls.alarms == (2 if accepted else 0)
@@ -283,7 +278,7 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
 
 def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr("sysid.close_loop.close_loop", lambda *given: asked.append(given) or sloping)
+    monkeypatch.setattr("sysid.verdict.pipeline.find_missing", lambda *given: asked.append(given) or sloping)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
     [(log, references, config, vehicle, _)] = asked
     assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
@@ -346,7 +341,7 @@ def test_held_out_trials_cannot_change_the_verdict(drives, sloping):
             truth = trial.ground_truth
             trial = replace(trial, ground_truth=replace(truth, x=truth.x + 3 * truth.t), odometry=None)
         altered.append(trial)
-    again = close_loop(replace(log, trials=tuple(altered)), (), CONFIG, reference=sloping.reference)
+    again = find_missing(replace(log, trials=tuple(altered)), (), CONFIG, reference=sloping.reference)
     assert again.search.verdict == sloping.search.verdict
     assert np.array_equal(again.search.final.values, sloping.search.final.values)
 
@@ -378,8 +373,8 @@ def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
     every = np.arange(len(made.trials))
     values = np.array([list(base_values(sloping.full).values())] * len(every))
     usual = sloping.prepared.paths(values, made.batch, every)
-    monkeypatch.setattr("sysid.rollout.on_processor", lambda: False)
-    monkeypatch.setattr("sysid.rollout.FETCHED", 2)
+    monkeypatch.setattr("sysid.replay.rollout.on_processor", lambda: False)
+    monkeypatch.setattr("sysid.replay.rollout.FETCHED", 2)
     large = copy.copy(sloping.prepared.paths)
     for large.rows in (len(every) - 2, len(every) + 5):  # the second one has rows to spare, of which one is fetched
         paths = large(values, made.batch, every)
@@ -447,4 +442,4 @@ def test_a_reference_of_another_vehicle_is_refused(drives):
     other = drives["reference_1"]
     other = replace(other, spec=replace(other.spec, track=0.6))
     with pytest.raises(ValueError, match="track is 0.6.*same vehicle"):
-        close_loop(drives["plain"], (other,), CONFIG)
+        find_missing(drives["plain"], (other,), CONFIG)

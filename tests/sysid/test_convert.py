@@ -13,10 +13,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import sysid.convert as convert_module
-from sysid.convert import ConvertConfig, convert
-from sysid.log import Command, OdometryStream, PoseStream, load_log, make_trial
-from sysid.measured import load_drive
-from sysid.rosbag import yaw_of
+from sysid.logs.conversion import ConvertConfig, convert
+from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_trial
+from sysid.logs.measured import load_drive
+from sysid.logs.rosbag import yaw_of
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -12,10 +12,10 @@ import pytest
 from whill_mjx import export_mjcf
 from whill_mjx.effects import make_effect
 from whill_mjx.export_mjcf import VehicleForces, export, held, load_forces, replay, vehicle_mjcf
-from whill_mjx.manoeuvres import Scenario, command_table
-from whill_mjx.presets import preset
-from whill_mjx.specs import HUSKY, WHILL_CR
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.logs.manoeuvres import Scenario, command_table
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 
 def changed(value, **fields):

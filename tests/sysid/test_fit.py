@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 
 import sysid.fit as fit_module
-from sysid.fit import FitConfig, fit_dataset, fit_log
-from sysid.log import load_log
-from sysid.report import REPLAYS
-from sysid.rollout import vehicle_plant
-from sysid.scenarios import Scenario
-from sysid.synthetic import SensorNoise, write_dataset
-from whill_mjx.config import VehicleConfig
-from whill_mjx.parameters import get_values, set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.vehicle_file import load_vehicle
+from sysid.logs.log import load_log
+from sysid.logs.scenarios import Scenario
+from sysid.logs.synthetic import SensorNoise, write_dataset
+from sysid.pages.fit_report import fit_dataset
+from sysid.pages.report import REPLAYS
+from sysid.replay.rollout import vehicle_plant
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 PLANTED = {"body.yaw_inertia": 4.0, "body.com_x": -0.1, "pid_drive.kp": 6.0, "pid_drive.ki": 2.0,
            "lateral_damping.c_front": 1.0, "rolling_resistance.mu_r": 0.02}
@@ -104,7 +106,7 @@ def test_held_out_trials_never_reach_the_fit(planted, monkeypatch):
     def capture(plant, params, space, trials, noise):
         raise Reached(trials, noise)
 
-    monkeypatch.setattr(fit_module, "make_objective", capture)
+    monkeypatch.setattr("sysid.search.fitting.make_objective", capture)
     seen = []
     for spoil in (False, True):
         trials = tuple(

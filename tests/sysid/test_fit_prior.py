@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import fit as fit_module
-from sysid import gradient, uncertainty
-from sysid.courses import CourseReplay
-from sysid.differences import DifferenceReplay
-from sysid.objective import Objective, estimate_noise
-from sysid.prior import UNKNOWN, Prior, bounds_alone, make_prior, moved
-from sysid.space import Space
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.vehicle_file import save_vehicle
+from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.errors.prior import UNKNOWN, Prior, bounds_alone, make_prior, moved
+from sysid.errors.space import Space
+from sysid.intervals import uncertainty
+from sysid.replay.courses import CourseReplay
+from sysid.replay.differences import DifferenceReplay
+from sysid.search import fitting, least_squares
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.vehicle_file import save_vehicle
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -38,7 +38,7 @@ def test_a_weak_prior_yields_to_the_log_and_a_sharp_one_holds(objective):
     """The log tells all three: a weak prior at wrong values hardly moves them, a sharp one does."""
     wrong = U_TRUTH + np.array([0.1, 0.0, 0.1])
     weak, sharp = (dataclasses.replace(objective, prior=Prior(wrong, np.full(3, sd))) for sd in (0.2, 1e-5))
-    ends = [gradient.fit(one, one.space, starts=U_TRUTH[None] + 0.05, iterations=12).u for one in (weak, sharp)]
+    ends = [least_squares.fit(one, one.space, starts=U_TRUTH[None] + 0.05, iterations=12).u for one in (weak, sharp)]
     assert np.abs(ends[0] - U_TRUTH).max() < 0.02
     assert np.abs(ends[1] - wrong).max() < 0.02
     free = uncertainty.estimate(objective, ends[0])
@@ -60,7 +60,7 @@ def test_what_no_drive_tells_stays_in_the_middle_of_its_bounds_and_takes_nothing
                   np.append(UNICYCLE_SPACE.log, False))
     free = Objective(DifferenceReplay(replay, space), space, trials, replay.measured, estimate_noise(trials))
     held = dataclasses.replace(free, prior=bounds_alone(space))
-    found = space.to_values(gradient.fit(held, space, iterations=20, tolerance=1e-6).u)
+    found = space.to_values(least_squares.fit(held, space, iterations=20, tolerance=1e-6).u)
     assert found[3] == pytest.approx(0.5, abs=0.15)
     assert found[0] + 0.1 * found[3] == pytest.approx(TRUTH[0], abs=0.01)
     known = uncertainty.estimate(held, space.to_unit(found)).estimates
@@ -84,7 +84,7 @@ def test_a_vehicle_file_of_another_vehicle_is_an_error(tmp_path):
     path = tmp_path / "vehicle.toml"
     save_vehicle(path, WHILL_CR, params, {"torque_drive.kp": (8.0, 9.0)}, {})
     log = SimpleNamespace(spec=WHILL_CR, name="here")
-    assert fit_module._earlier(path, log)[1] == {"torque_drive.kp": (8.0, 9.0)}
+    assert fitting._earlier(path, log)[1] == {"torque_drive.kp": (8.0, 9.0)}
     other = SimpleNamespace(spec=dataclasses.replace(WHILL_CR, track=0.6), name="there")
     with pytest.raises(ValueError, match="track is .* but 0.6 in 'there'"):
-        fit_module._earlier(path, other)
+        fitting._earlier(path, other)

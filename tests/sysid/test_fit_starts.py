@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import gradient, starts
-from sysid.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, sets_together
-from sysid.feature_objective import FeatureObjective, make_features_objective
+from sysid.errors.bin_objective import FeatureObjective, make_features_objective
+from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.fit import with_effects
-from sysid.objective import Objective, estimate_noise
-from sysid.rollout import Replay, make_batch
+from sysid.replay.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, sets_together
+from sysid.replay.rollout import Replay, make_batch
+from sysid.search import least_squares, starts
 from whill_mjx.effects import make_effect
-from whill_mjx.parameters import describe, get_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.types import VehicleParams
+from whill_mjx.vehicle.parameters import describe, get_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.types import VehicleParams
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -71,12 +71,12 @@ def test_the_jacobian_of_features_is_that_of_their_residual(features):
 
 
 def test_random_starts_in_features_agree_and_lie_where_the_poses_fit_best(poses):
-    points = gradient.random_starts(poses.space, 6, seed=2)
+    points = least_squares.random_starts(poses.space, 6, seed=2)
     found = starts.fit(poses, points, WHILL_CR.track, iterations=20)
     assert starts.agreeing(found.start_costs) == 6
     np.testing.assert_allclose(poses.space.to_values(found.u), TRUTH, rtol=0.1)
-    polished = gradient.fit(poses, poses.space, starts=found.u[None], iterations=8)
-    direct = gradient.fit(poses, poses.space, iterations=30)
+    polished = least_squares.fit(poses, poses.space, starts=found.u[None], iterations=8)
+    direct = least_squares.fit(poses, poses.space, iterations=30)
     assert polished.cost <= direct.cost * 1.001
 
 
@@ -88,10 +88,10 @@ def test_a_drawn_start_is_near_the_truth_and_does_not_depend_on_the_others(poses
 
 
 def test_each_end_of_a_search_is_told_with_the_start_it_comes_from(features):
-    points = gradient.random_starts(features.space, 4, seed=2)
-    found = gradient.fit(features, features.space, starts=points, iterations=1)
+    points = least_squares.random_starts(features.space, 4, seed=2)
+    found = least_squares.fit(features, features.space, starts=points, iterations=1)
     for end, number in zip(found.starts, found.order, strict=True):
-        alone = gradient.fit(features, features.space, starts=points[number][None], iterations=1)
+        alone = least_squares.fit(features, features.space, starts=points[number][None], iterations=1)
         np.testing.assert_allclose(end, alone.u, atol=1e-5)
 
 

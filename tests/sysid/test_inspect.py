@@ -12,12 +12,13 @@ from conftest import shared_folder
 
 import sysid
 import sysid.inspect as inspect_module
-from sysid.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
-from sysid.inspect import InspectConfig, inspect, load_whole, main, text
-from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
-from sysid.metrics import ideal_replay
-from sysid.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
-from whill_mjx.specs import WHILL_CR
+from sysid.inspect import InspectConfig, main
+from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
+from sysid.logs.inspection import inspect, load_whole, text
+from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
+from sysid.logs.metrics import ideal_replay
+from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
+from whill_mjx.vehicle.specs import WHILL_CR
 
 pytestmark = pytest.mark.quick
 DT = 0.02

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from sysid.log import load_log, manoeuvre_of
-from sysid.measured import load_any
-from sysid.streams import trial_quality
-from sysid.synthetic import write_csv, write_text
-from whill_mjx.model import box_inertia
-from whill_mjx.specs import HUSKY, WHILL_CR
+from sysid.logs.log import load_log, manoeuvre_of
+from sysid.logs.measured import load_any
+from sysid.logs.streams import trial_quality
+from sysid.logs.synthetic import write_csv, write_text
+from whill_mjx.vehicle.model import box_inertia
+from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
 
 pytestmark = pytest.mark.quick
 TOML = 'schema = 1\nvehicle = "a chair"\nwheel_radius = 0.13\ntrack = 0.5\nwheelbase = 0.5\nmass = 60.0\n'

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.loop.alone import UNTOLD, judged, simplest, stands_alone
-from sysid.loop.catalogue import Axis, Hypothesis
-from sysid.loop.evidence import manoeuvre_groups
-from sysid.loop.features import BIN, bin_width, make_features
-from sysid.loop.found import Candidate, Thresholds
-from sysid.loop.refit import Refit
-from sysid.rollout import make_batch, path_of
+from sysid.errors.features import BIN, bin_width, make_features
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.joint_fit import Refit
+from sysid.missing.signatures import manoeuvre_groups
+from sysid.replay.rollout import make_batch, path_of
+from sysid.verdict.alone import UNTOLD, judged, simplest, stands_alone
+from sysid.verdict.found import Candidate, Thresholds
 from whill_mjx.effects import make_effect
 
 pytestmark = pytest.mark.quick
@@ -125,7 +125,7 @@ class Cart:
 
 
 def test_a_replay_shows_the_pose_late_and_the_odometry_in_time():
-    from sysid.rollout import Plant
+    from sysid.replay.records import Plant
 
     def observe(state):
         return jnp.concatenate([state, jnp.zeros(2), state[:1], state[:1], jnp.zeros(3)])[:9]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.loop.changes import by_manoeuvre, squared_errors, worse
-from sysid.metrics import Prediction, score
+from sysid.follow_up.changes import by_manoeuvre, squared_errors, worse
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
+from sysid.logs.metrics import score
 
 pytestmark = pytest.mark.quick
 T = np.linspace(0.0, 12.0, 121)

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.loop.catalogue import Axis, Hypothesis
-from sysid.loop.forms import modulated, other_forms
-from sysid.loop.found import Candidate, Thresholds
-from sysid.loop.refit import Refit
-from sysid.loop.rounds import _rivals, _starts
-from sysid.loop.search import _own
+from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.joint_fit import Refit
+from sysid.verdict.forms import modulated, other_forms
+from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.rounds import _rivals, _starts
+from sysid.verdict.search import _own
 
 pytestmark = pytest.mark.quick
 TRIALS, BINS = 6, 80

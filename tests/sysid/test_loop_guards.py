@@ -5,15 +5,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, Start, Trial
-from sysid.loop import falsifiers
-from sysid.loop.agreement import SCATTER, heterogeneity, interval_of_sum
-from sysid.loop.catalogue import Axis, Hypothesis, hypotheses
-from sysid.loop.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, course_of, side, sizes_in_parts
-from sysid.loop.found import Candidate, Search, Thresholds
-from sysid.loop.guards import Stood, guarded
-from sysid.loop.refit import Refit
-from whill_mjx.presets import preset
+from sysid.logs.log import Command, OdometryStream, Start, Trial
+from sysid.missing.catalogue import Hypothesis, hypotheses, outside_hypotheses
+from sysid.missing.catalogue import falsifiers as known
+from sysid.missing.joint_fit import Refit
+from sysid.verdict import falsification
+from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
+from sysid.verdict.falsification import course_of, sizes_in_parts
+from sysid.verdict.falsifiers import QUIET, SPLITS, side
+from sysid.verdict.found import Candidate, Search, Thresholds
+from sysid.verdict.guards import guarded
+from sysid.verdict.result import Stood
+from whill_mjx.effects import EFFECTS
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, QUANTITIES, STATES, Axis, Falsifier
+from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
 TWO = Falsifier("has one size", "speed")
@@ -58,9 +63,11 @@ def test_the_interval_of_a_sum_holds_the_sum():
 def test_every_effect_of_the_catalogue_says_what_would_contradict_it():
     for name in ("whill_cr_physical", "whill_cr"):
         spec, params = preset(name)
-        assert {one.effect for one in hypotheses(spec, params)} <= set(FALSIFIERS)
-    assert "turn_efficiency" in FALSIFIERS and "pose_delay" in FALSIFIERS
-    assert all(one.by in {*SPLITS, *QUIET} for each in FALSIFIERS.values() for one in each)
+        looked_for = (*hypotheses(spec, params), *outside_hypotheses(spec, params, ()))
+        assert {one.effect for one in looked_for} <= set(known())
+    assert "turn_efficiency" in known() and "pose_delay" in known()
+    assert all(one.by in {*SPLITS, *QUIET} for each in known().values() for one in each)
+    assert (tuple(SPLITS), tuple(QUIET)) == (QUANTITIES, STATES)
 
 
 def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
@@ -78,7 +85,7 @@ def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
     parts = np.stack([effect * q[1] * ~half, effect * q[1] * half], axis=-1)
     refitter = SimpleNamespace(precision=np.eye(1), reference=SimpleNamespace(u=np.zeros(1)))
     size, covariance = sizes_in_parts(fit, slice(0, 1), parts, refitter, [[2 * k, 2 * k + 1] for k in range(3)])
-    return size, covariance, falsifiers._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
+    return size, covariance, falsification._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
 
 
 def test_an_effect_with_one_size_stands_its_split():
@@ -98,7 +105,7 @@ def test_an_effect_whose_law_differs_by_a_factor_of_two_is_not_contradicted():
 
 
 def test_what_is_half_as_large_late_in_a_drive_is_no_effect_without_the_time_in_its_law():
-    [lasting] = [one for one in FALSIFIERS["dry_friction"] if one.by == "time in the drive"]
+    [lasting] = [one for one in EFFECTS["dry_friction"].card.forbids if one.by == "time in the drive"]
     assert fitted((1.0, 0.5), prediction=lasting)[2].outcome == "falsified"
     assert fitted((1.0, 0.9), prediction=lasting)[2].outcome == "holds"
 
@@ -120,8 +127,8 @@ def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(othe
     quiet = np.zeros((6, 600, 1), bool)
     quiet[:, :300] = True
     p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
-    settled = falsifiers._SETTLED
-    tested = falsifiers._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
+    settled = GONE_WHEN_SETTLED
+    tested = falsification._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
     assert tested.outcome == outcome
 
 

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.close_loop import LoopConfig
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.loop import late_pose
-from sysid.loop.catalogue import Axis, Hypothesis
-from sysid.loop.evidence import Columns
-from sysid.loop.found import Search
-from sysid.loop.pose_lag import pose_lag, sign_flips
-from sysid.loop.refit import Refit
-from sysid.space import Space
+from sysid.errors.space import Space
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.pose_lag import pose_lag, sign_flips
+from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.evidence import Columns
+from sysid.missing.joint_fit import Refit
+from sysid.verdict import late_pose
+from sysid.verdict.found import Search
+from sysid.verdict.result import LoopConfig
 
 pytestmark = pytest.mark.quick
 BLOCKS = [list(range(4 * b, 4 * b + 4)) for b in range(8)]

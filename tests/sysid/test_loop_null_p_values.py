@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sysid.loop.catalogue import Axis, Hypothesis
-from sysid.loop.evidence import Evidence, column_layout
-from sysid.loop.noise import Whitener
-from sysid.loop.reference import Leftover, Reference, expected_without, mean_by_day
-from sysid.loop.scan import drawn_noise, run
-from sysid.loop.wander import _pooled, coordinates
+from sysid.errors.noise import Whitener
+from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.days import Leftover, Reference, expected_without, mean_by_day
+from sysid.missing.evidence import Evidence, column_layout
+from sysid.missing.wander import _pooled, coordinates
+from sysid.verdict.scan import drawn_noise, run
 
 pytestmark = pytest.mark.quick
 MANOEUVRES, REPLICATES, SAMPLES, SETS = 6, 3, 40, 150

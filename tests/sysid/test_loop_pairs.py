@@ -6,16 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.loop.catalogue import Axis, Hypothesis
-from sysid.loop.evidence import Evidence, column_layout
-from sysid.loop.found import Thresholds
-from sysid.loop.pairs import scan_again, scan_pairs, tail
-from sysid.loop.power import false_alarms, power_curve, simulated_days
-from sysid.loop.refit import Refit, moved_last
-from sysid.loop.report import detectable
-from sysid.loop.scan import run
-from sysid.loop.search import search
-from sysid.loop.wander import no_wander
+from sysid.follow_up.power import false_alarms, power_curve, simulated_days
+from sysid.missing.catalogue import Axis, Hypothesis
+from sysid.missing.days import no_wander
+from sysid.missing.evidence import Evidence, column_layout
+from sysid.missing.joint_fit import Refit, moved_last
+from sysid.pages.loop_report import detectable
+from sysid.verdict.found import Thresholds
+from sysid.verdict.pairs import scan_again, scan_pairs, tail
+from sysid.verdict.scan import run
+from sysid.verdict.search import search
 
 pytestmark = pytest.mark.quick
 EFFECTS = tuple(Hypothesis(name, (Axis(parameter, 0.01, signed=True, limit=50.0),)) for name, parameter in (
@@ -75,7 +75,7 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 class Linear:
-    """Refits of drives whose motion is linear in everything, in the place of `sysid.loop.refit.Refitter`."""
+    """Refits of drives whose motion is linear in everything, in the place of `sysid.missing.refit.Refitter`."""
 
     def __init__(self, evidence):
         self.evidence, self.precision = evidence, evidence.precision
@@ -171,7 +171,7 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
     days = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400)
-    monkeypatch.setattr("sysid.loop.report.base_values", lambda _: dict.fromkeys(
+    monkeypatch.setattr("sysid.pages.loop_report.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
     result = SimpleNamespace(search=SimpleNamespace(scan=scan), evidence=evidence, hypotheses=EFFECTS, full=None,
                              prepared=SimpleNamespace(wander=wander),

@@ -5,17 +5,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.loop.agreement import disagreement, foretold
-from sysid.loop.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
-from sysid.loop.classes import imitation
-from sysid.loop.drives import DRAIN, ROUND, SESSION, Drives
-from sysid.loop.evidence import Columns, signature_columns
-from sysid.loop.found import Candidate, Search, Thresholds
-from sysid.loop.noise import fit_roughness, fit_whitener
-from sysid.loop.refit import Refit, Refitter
-from sysid.loop.search import _decide, _own
-from sysid.loop.wander import Wander, _pooled
-from whill_mjx.presets import preset
+from sysid.errors.noise import fit_roughness, fit_whitener
+from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.days import Wander
+from sysid.missing.drives import DRAIN, SESSION, Drives
+from sysid.missing.evidence import Columns
+from sysid.missing.joint_fit import Refit
+from sysid.missing.refit import Refitter
+from sysid.missing.signatures import signature_columns
+from sysid.missing.wander import _pooled
+from sysid.verdict.agreement import disagreement, foretold
+from sysid.verdict.classes import imitation
+from sysid.verdict.found import Candidate, Search, Thresholds
+from sysid.verdict.search import _decide, _own
+from whill_mjx.effects.supply_sag import ROUND
+from whill_mjx.vehicle.presets import preset
 
 
 @pytest.mark.quick

@@ -6,16 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.loop.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
-from sysid.loop.evidence import column_layout
-from sysid.loop.poses import by_own_noise
-from sysid.loop.refit import Refit, Refitter
-from sysid.loop.rounds import elsewhere
-from sysid.loop.trust import at_the_end, intervals, undone
-from sysid.loop.wander import no_wander
-from sysid.metrics import replicate_noise
-from sysid.rollout import Measured
-from whill_mjx.presets import preset
+from sysid.follow_up.trust import at_the_end, intervals, undone
+from sysid.logs.metrics import replicate_noise
+from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
+from sysid.missing.days import no_wander
+from sysid.missing.evidence import column_layout
+from sysid.missing.joint_fit import Refit
+from sysid.missing.pose_fit import by_own_noise
+from sysid.missing.refit import Refitter
+from sysid.replay.records import Measured
+from sysid.verdict.rounds import elsewhere
+from whill_mjx.effects.side_force import pushed_anywhere
+from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
 ONE = Hypothesis("slope", (Axis("slope.along_x", 0.01, signed=True, limit=50.0),))

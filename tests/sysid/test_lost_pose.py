@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.coverage import sanity
-from sysid.fit import FitConfig, make_problem
-from sysid.log import Command, Log, OdometryStream, PoseStream, Start, Trial
-from sysid.lost_pose import LEAST, lost, without_lost, yaw_contradiction
-from whill_mjx.specs import WARTHOG
+from sysid.logs.coverage import sanity
+from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.lost_pose import LEAST, lost, without_lost, yaw_contradiction
+from sysid.search.fitting import make_problem
+from sysid.search.settings import FitConfig
+from whill_mjx.vehicle.specs import WARTHOG
 
 pytestmark = pytest.mark.quick
 T = np.arange(0.0, 6.0, 0.05)

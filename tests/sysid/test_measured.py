@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import shared_folder
 
-from sysid.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
-from whill_mjx.specs import CREATE, WARTHOG
+from sysid.logs.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
+from whill_mjx.vehicle.specs import CREATE, WARTHOG
 
 pytestmark = pytest.mark.quick
 BLOCKS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")

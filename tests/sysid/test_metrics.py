@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.metrics import Prediction, ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
-from sysid.report import summaries
-from sysid.scenarios import SCENARIOS, Scenario, command_sequence
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
+from sysid.logs.metrics import ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
+from sysid.logs.scenarios import SCENARIOS, Scenario, command_sequence
+from sysid.pages.report import summaries
 
 pytestmark = pytest.mark.quick
 

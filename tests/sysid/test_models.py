@@ -14,17 +14,20 @@ import pytest
 from cart import cart
 
 from sysid import fit as fit_module
-from sysid.cores import on_all_cores
-from sysid.differences import DifferenceReplay
-from sysid.fit import Arguments, FitConfig, fit_log
-from sysid.log import Command, OdometryStream, PoseStream, make_trial
-from sysid.mjcf import mjcf_model
-from sysid.mjcf_file import load_robot, resolve, write_mjcf
-from sysid.models import function_model, load_model, make_parameters, model_space, set_parameters
-from sysid.scenarios import Scenario
-from sysid.synthetic import write_dataset
-from whill_mjx.manoeuvres import command_table
-from whill_mjx.specs import WHILL_CR
+from sysid.fit import Arguments
+from sysid.logs.log import Command, OdometryStream, PoseStream, make_trial
+from sysid.logs.scenarios import Scenario
+from sysid.logs.synthetic import write_dataset
+from sysid.replay.cores import on_all_cores
+from sysid.replay.differences import DifferenceReplay
+from sysid.replay.mjcf import mjcf_model
+from sysid.replay.mjcf_file import load_robot, resolve, write_mjcf
+from sysid.replay.model_files import load_model
+from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
+from whill_mjx.logs.manoeuvres import command_table
+from whill_mjx.vehicle.specs import WHILL_CR
 
 DT = 0.02
 FUNCTION = cart("lag", "lag", '{"lag": (0.1, 0.02, 1.0, "s"), "turn": (1.0, 0.5, 1.5)}')

@@ -6,27 +6,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
-from sysid.loop.catalogue import base_values, hypotheses, with_catalogue
-from sysid.loop.drives import make_drives
-from sysid.loop.features import BIN
-from sysid.loop.next_manoeuvre import (
+from sysid.errors.features import BIN
+from sysid.errors.noise import Whitener
+from sysid.errors.space import make_space
+from sysid.follow_up.next_manoeuvre import (
     FILE,
     LEAST,
     absorbed,
-    command_of,
-    drives_of,
+    drive_library,
     next_manoeuvre,
     plan_drives,
-    sentence,
     write_next_command,
 )
-from sysid.loop.noise import Whitener
-from sysid.loop.refit import Refit
-from sysid.rollout import vehicle_plant
-from sysid.space import make_space
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
+from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
+from sysid.missing.drives import make_drives
+from sysid.missing.joint_fit import Refit
+from sysid.pages.loop_page import command_of, sentence
+from sysid.replay.rollout import vehicle_plant
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset
 
 quick = pytest.mark.quick
 EFFECTS = ("slope", "side_force", "command_scale", "odometry_scale")
@@ -110,7 +109,7 @@ def test_a_cross_slope_is_told_from_a_side_force_by_another_heading(sloping, tmp
 
 def test_the_drive_already_made_would_not_tell_them(sloping):
     rivals = [one.refit.values for one in sloping.search.rounds[0]]
-    again = [one for one in drives_of(sloping, (0.0, 90.0)) if one.manoeuvre == "straight" and one.v == SPEED]
+    again = [one for one in drive_library(sloping, (0.0, 90.0)) if one.manoeuvre == "straight" and one.v == SPEED]
     seen = plan_drives(sloping, sloping.drives, again).simulate(np.stack(rivals))  # (2, D, K, 5)
     apart = np.linalg.norm(((seen[0] - seen[1]) / sloping.reference.whitener.scale).reshape(2, -1), axis=-1)
     ahead, across = (apart[[one.start[2] < 0.1 for one in again].index(which)] for which in (True, False))
@@ -151,7 +150,7 @@ def test_nothing_is_proposed_where_nothing_is_named(subject):
 
 @quick
 def test_the_library_keeps_to_the_speeds_and_the_space_of_the_log(subject):
-    library = drives_of(subject)
+    library = drive_library(subject)
     truth = subject.log.training[0].ground_truth
     low, high = (getattr(np, side)([truth.x, truth.y], 1) for side in ("min", "max"))
     assert len(library) > 20 and len({one.manoeuvre for one in library}) > 8

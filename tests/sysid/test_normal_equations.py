@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import feature_objective, gradient, normal_equations, objective, starts
-from sysid.courses import CourseReplay
-from sysid.differences import DifferenceReplay
-from sysid.feature_objective import make_features_objective
-from sysid.loop.noise import fit_whitener
-from sysid.normal_equations import NormalEquations, make_equations
-from sysid.objective import Objective, estimate_noise
-from sysid.prior import Prior
+from sysid.errors import bin_objective, normal_equations, pose_objective
+from sysid.errors.bin_objective import make_features_objective
+from sysid.errors.noise import fit_whitener
+from sysid.errors.normal_equations import NormalEquations, make_equations
+from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.errors.prior import Prior
+from sysid.errors.robust import huber_weight, robust_cost
+from sysid.replay.courses import CourseReplay
+from sysid.replay.differences import DifferenceReplay
+from sysid.search import least_squares, starts
 
 SETS = np.array([[0.4, 0.5, 0.6], [0.6, 0.4, 0.3], [1.0, 0.45, 0.5]])
 """One of them at a bound, where differences are one-sided."""
@@ -34,7 +36,7 @@ def poses(unicycle_log) -> Objective:
 def on_accelerator(monkeypatch):
     """Objectives take a processor for one, and fill calls up to two sets."""
     monkeypatch.setattr(normal_equations, "on_processor", lambda: False)
-    for module in (objective, feature_objective):
+    for module in (pose_objective, bin_objective):
         monkeypatch.setattr(module, "make_equations", lambda one: (
             NormalEquations(one, at_once=2) if hasattr(one.replay, "traced") else None))
 
@@ -48,8 +50,8 @@ def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robu
     value, slope, hessian = equations.quadratic(SETS, robust)
     np.testing.assert_allclose(value, equations.costs(SETS, robust), rtol=1e-4)
     residual, jacobian = one.jacobian(SETS)
-    weight = gradient.huber_weight(residual) if robust else np.ones_like(residual)
-    np.testing.assert_allclose(value, gradient.robust_cost(residual, robust), rtol=1e-3)
+    weight = huber_weight(residual) if robust else np.ones_like(residual)
+    np.testing.assert_allclose(value, robust_cost(residual, robust), rtol=1e-3)
     for parameter in range(3):
         step = np.eye(3)[parameter] * 0.01
         fallen = (equations.costs(SETS + step, robust) - equations.costs(SETS - step, robust)) / 0.04
@@ -62,10 +64,10 @@ def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robu
 
 
 def test_a_search_with_sums_ends_where_one_with_residuals_does(poses, on_accelerator):
-    points = gradient.random_starts(poses.space, 4, seed=2)
-    host = gradient.fit(dataclasses.replace(poses, replay=Hidden(poses.replay)), poses.space, starts=points,
+    points = least_squares.random_starts(poses.space, 4, seed=2)
+    host = least_squares.fit(dataclasses.replace(poses, replay=Hidden(poses.replay)), poses.space, starts=points,
                         iterations=25, robust=True)
-    there = gradient.fit(dataclasses.replace(poses), poses.space, starts=points, iterations=25, robust=True)
+    there = least_squares.fit(dataclasses.replace(poses), poses.space, starts=points, iterations=25, robust=True)
     assert there.cost == pytest.approx(host.cost, rel=2e-3)
     np.testing.assert_allclose(poses.space.to_values(there.u), TRUTH, rtol=0.1)
     assert there.initial_cost == pytest.approx(host.initial_cost, rel=1e-3)
@@ -84,7 +86,7 @@ def test_a_replay_that_diverges_is_dear_and_has_no_slope(poses):
     broken = DifferenceReplay(Diverging(replay), UNICYCLE_SPACE)
     one = dataclasses.replace(poses, replay=broken)
     value, slope, hessian = NormalEquations(one, at_once=1).quadratic(SETS[:1])
-    assert np.isfinite(value).all() and value[0] > 1e3 * gradient.robust_cost(poses.residuals(SETS[:1]), False)[0]
+    assert np.isfinite(value).all() and value[0] > 1e3 * robust_cost(poses.residuals(SETS[:1]), False)[0]
     assert not slope.any() and not hessian.any()
 
 

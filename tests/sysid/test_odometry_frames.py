@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.frames import at_frames, find_period
-from sysid.log import Command, OdometryStream, Start, Trial
+from sysid.logs.log import Command, OdometryStream, Start, Trial
+from sysid.logs.odometry_frames import at_frames, find_period
 
 NOISE = 3e-4  # m and rad, of a row: ticks of an encoder
 
@@ -95,7 +95,7 @@ def test_a_log_that_says_nothing_of_steady_motion_has_no_frames():
 @pytest.mark.parametrize("period", [0.02, 0.025])
 def test_speeds_of_frames_are_means_over_them_low_passed_once_a_frame(period):
     """Against the recursion itself, as an odometry runs it, at the frames of a drive that starts in motion."""
-    from sysid.sensing import framed
+    from sysid.replay.odometry import framed
 
     dt, time_constant = 0.01, 0.042
     t = np.arange(400) * dt

@@ -12,16 +12,17 @@ import pytest
 from conftest import TRUTH, unicycle_plant
 
 import sysid.paper as paper_module
-from sysid.fit import Fit
-from sysid.paper import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, main, markdown, select
-from sysid.result import FitResult
-from sysid.rollout import make_batch, predictions, simulate
-from sysid.statistics import EXACT_UP_TO, holm, mean_sd, sign_flip_p, smallest_p, upper_rate
-from whill_mjx.manoeuvres import PAPER_MANOEUVRES
-from whill_mjx.parameters import describe, set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.vehicle_file import load_vehicle
+from sysid.intervals.statistics import EXACT_UP_TO, holm, mean_sd, sign_flip_p, smallest_p, upper_rate
+from sysid.pages.paper_page import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, markdown
+from sysid.paper import main, select
+from sysid.replay.rollout import make_batch, predictions, simulate
+from sysid.search.fitting import Fit
+from sysid.search.result import FitResult
+from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
+from whill_mjx.vehicle.parameters import describe, set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 pytestmark = pytest.mark.quick
 
@@ -47,7 +48,7 @@ def test_sign_flips_agree_with_a_count_by_hand():
 def test_many_pairs_are_sampled_and_agree_with_the_exact_count(monkeypatch):
     values = np.random.default_rng(1).normal(0.5, 1.0, EXACT_UP_TO)
     exact = sign_flip_p(values)
-    monkeypatch.setattr("sysid.statistics.EXACT_UP_TO", 4)
+    monkeypatch.setattr("sysid.intervals.statistics.EXACT_UP_TO", 4)
     assert sign_flip_p(values) == pytest.approx(exact, abs=0.01)
     assert sign_flip_p(values, seed=1) == sign_flip_p(values, seed=1)
     assert sign_flip_p(np.full(40, 1.0)) == pytest.approx(smallest_p(40))

@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
-from sysid import feature_objective, gradient, pieces, rollout
-from sysid.courses import CourseReplay
-from sysid.differences import DifferenceReplay
-from sysid.feature_objective import make_features_objective
-from sysid.objective import Objective, estimate_noise
-from sysid.valleys import from_all
-from whill_mjx.config import VehicleConfig
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WHILL_CR
+from sysid.errors import bin_objective
+from sysid.errors.bin_objective import make_features_objective
+from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.replay import pieces, rollout
+from sysid.replay.courses import CourseReplay
+from sysid.replay.differences import DifferenceReplay
+from sysid.search import least_squares
+from sysid.search.valleys import from_all
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR
 
 
 @pytest.fixture
@@ -86,10 +88,10 @@ def test_pieces_begin_at_the_speeds_that_were_measured(unicycle_log):
 
 def test_a_search_in_pieces_ends_on_whole_drives(objective, short_pieces, monkeypatch):
     bins = make_features_objective(objective, 0.5)
-    points = gradient.random_starts(UNICYCLE_SPACE, 3, seed=1)
+    points = least_squares.random_starts(UNICYCLE_SPACE, 3, seed=1)
     expected = from_all(bins, UNICYCLE_SPACE, points, 20)
     assert bins.quicker is bins  # on a processor
-    monkeypatch.setattr(feature_objective, "on_processor", lambda: False)
+    monkeypatch.setattr(bin_objective, "on_processor", lambda: False)
     other = make_features_objective(objective, 0.5)
     assert other.quicker is not other and other.quicker.replay is objective.replay.in_pieces
     found = from_all(other, UNICYCLE_SPACE, points, 20)

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
-from sysid import gradient, uncertainty
-from sysid.fit import FitConfig, fit_log
-from sysid.profiles import Profile, crossings, profile
-from sysid.report_html import profiles as profiles_section
+from sysid.intervals import uncertainty
+from sysid.intervals.profiles import Profile, crossings, profile
+from sysid.pages.fit_page import profiles as profiles_section
+from sysid.search import least_squares
+from sysid.search.fitting import fit_log
+from sysid.search.settings import FitConfig
 
 
 @pytest.fixture(scope="module")
 def fitted(objective):
-    result = gradient.fit(objective, objective.space, iterations=15)
+    result = least_squares.fit(objective, objective.space, iterations=15)
     return result.u, uncertainty.estimate(objective, result.u)
 
 
@@ -44,7 +46,7 @@ def test_the_other_parameters_follow(traced, fitted, objective):
     one = traced[1]
     held = one.others[0]
     start = objective.space.to_unit(np.array([TRUTH[0], held[1], TRUTH[2]]))
-    alone = gradient.fit(objective, objective.space, starts=start[None], frozen=("tau_omega",), iterations=20)
+    alone = least_squares.fit(objective, objective.space, starts=start[None], frozen=("tau_omega",), iterations=20)
     assert one.cost[0] == pytest.approx(alone.cost, rel=1e-3)
     unmoved = objective.space.to_values(u)
     unmoved[1] = held[1]

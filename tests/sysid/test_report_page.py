@@ -14,13 +14,13 @@ import pytest
 from conftest import TRUTH, unicycle_plant
 
 import sysid.report as report_module
-from sysid import series as series_module
-from sysid.html import Cell, Section, html_page, number, png, table
-from sysid.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
-from sysid.report_html import autocorrelation, choose, worse
-from sysid.rollout import make_batch, predictions, simulate
-from sysid.series import Channel, TrialSeries, collect, load, save
-from sysid.svg import Line, bar_chart, interval_bar, line_chart
+from sysid.pages import series as series_module
+from sysid.pages.fit_page import autocorrelation, choose, worse
+from sysid.pages.html import Cell, Section, html_page, number, png, table
+from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
+from sysid.pages.series import Channel, TrialSeries, collect, load, save
+from sysid.pages.svg import Line, bar_chart, interval_bar, line_chart
+from sysid.replay.rollout import make_batch, predictions, simulate
 
 pytestmark = pytest.mark.quick
 
@@ -121,7 +121,8 @@ def test_series_come_back_from_their_file(run, unicycle_log):
 
 
 def test_a_run_without_series_names_the_dataset_that_changed(run, tmp_path, monkeypatch, unicycle_log):
-    monkeypatch.setattr("sysid.measured.load_any", lambda *a, **k: dataclasses.replace(unicycle_log, sha256="other"))
+    other = dataclasses.replace(unicycle_log, sha256="other")
+    monkeypatch.setattr("sysid.logs.measured.load_any", lambda *a, **k: other)
     with pytest.raises(ValueError, match="nowhere: has changed"):
         series_module.replay(tmp_path, read_report(run))
 

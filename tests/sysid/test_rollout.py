@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import TRUTH, unicycle_plant
 
-from sysid.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.rollout import Replay, make_batch, predictions
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.replay.rollout import Replay, make_batch, predictions
 
 
 def test_the_replay_holds_commands_and_interpolates_at_the_measurements_times():
@@ -37,10 +37,10 @@ def test_yaw_is_unwrapped_over_several_turns_from_any_start():
 
 def test_a_vehicle_that_starts_in_motion_is_under_way_at_the_start_pose():
     """A vehicle with a delay and a slow integral would otherwise begin with a stumble."""
-    from sysid.rollout import vehicle_plant
-    from whill_mjx.config import VehicleConfig
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from sysid.replay.rollout import vehicle_plant
+    from whill_mjx.vehicle.config import VehicleConfig
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     t = np.arange(0.0, 0.8, 0.05)
     command = Command(np.array([0.0]), np.array([0.5]), np.array([0.4]))
@@ -63,11 +63,11 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
     import jax
     import jax.numpy as jnp
 
-    from sysid.rollout import path_of, vehicle_plant
-    from whill_mjx.config import VehicleConfig
+    from sysid.replay.rollout import path_of, vehicle_plant
     from whill_mjx.effects import make_effect
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from whill_mjx.vehicle.config import VehicleConfig
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.005))
     params = preset_params(WHILL_CR, "physical")
@@ -90,11 +90,11 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
 
 def test_many_drives_side_by_side_are_those_of_a_few_and_so_are_their_derivatives():
     """Few are computed by one function, which XLA cannot compile for many."""
-    from sysid.rollout import IN_ONE, vehicle_plant
-    from whill_mjx.config import VehicleConfig
-    from whill_mjx.parameters import get_values, set_values
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from sysid.replay.rollout import IN_ONE, vehicle_plant
+    from whill_mjx.vehicle.config import VehicleConfig
+    from whill_mjx.vehicle.parameters import get_values, set_values
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     t = np.arange(0.0, 0.2, 0.05)
     trial = Trial("a_1", "a", Command(np.array([0.0]), np.array([0.5]), np.array([0.4])), None,
@@ -141,11 +141,11 @@ def test_a_drive_that_starts_in_motion_is_settled_by_the_quick_way_of_many_steps
 @pytest.mark.parametrize("speeds", [(0.0, 0.0), (0.5, 0.4)])
 def test_a_replay_reads_late_odometry_off_the_path(speeds):
     """As the odometry without latency was that long before; counted from where the vehicle starts, as a log is."""
-    from sysid.rollout import vehicle_plant
-    from whill_mjx.config import VehicleConfig
+    from sysid.replay.rollout import vehicle_plant
     from whill_mjx.effects import make_effect
-    from whill_mjx.presets import preset_params
-    from whill_mjx.specs import WHILL_CR
+    from whill_mjx.vehicle.config import VehicleConfig
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.specs import WHILL_CR
 
     t = np.arange(0.0, 1.2, 0.025)
     command = Command(np.array([0.0, 0.2]), np.array([speeds[0], 0.7]), np.array([speeds[1], -0.3]))

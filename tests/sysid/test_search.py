@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_objective, unicycle_plant, without_start_noise
 
-from sysid import gradient, tpe, uncertainty
-from sysid.fit import FitConfig
-from sysid.objective import Noise
-from sysid.rollout import Replay, make_batch, predictions
-from sysid.space import Space
-from sysid.valleys import gradient_search
+from sysid.errors.pose_objective import Noise
+from sysid.errors.space import Space
+from sysid.intervals import uncertainty
+from sysid.replay.rollout import Replay, make_batch, predictions
+from sysid.search import least_squares, tpe
+from sysid.search.settings import FitConfig
+from sysid.search.valleys import gradient_search
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -50,10 +51,10 @@ class TwoValleys:
 def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, cost, monkeypatch):
     valleys, start = TwoValleys(4.0), np.full((1, 2), 0.5)
     space = valleys.space
-    stuck = gradient.fit(valleys, space, starts=start, iterations=20)
+    stuck = least_squares.fit(valleys, space, starts=start, iterations=20)
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
-    monkeypatch.setattr("sysid.valleys.DEAR", dear)
-    monkeypatch.setattr("sysid.slopes.ROUNDS", 0)  # nor from close by
+    monkeypatch.setattr("sysid.search.valleys.DEAR", dear)
+    monkeypatch.setattr("sysid.search.slopes.ROUNDS", 0)  # nor from close by
     result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
     assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
@@ -86,9 +87,9 @@ class NeverMet:
 @pytest.mark.quick
 def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
     space, start = NeverMet.space, np.array([[0.5, 1.0]])
-    stuck = gradient.fit(NeverMet(), space, starts=start, iterations=20)
+    stuck = least_squares.fit(NeverMet(), space, starts=start, iterations=20)
     assert stuck.u[1] == 1.0 and stuck.cost > 1.0
-    costs, points = gradient.far_points(NeverMet(), stuck.u)
+    costs, points = least_squares.far_points(NeverMet(), stuck.u)
     assert points[0, 1] < 0.6 and len(costs) == 3  # the limit behind level ground, a smaller gain and a larger one
     result, _, _ = gradient_search(NeverMet(), space, start, 20, FitConfig(), None)
     np.testing.assert_allclose(result.u, [0.9, 0.37], atol=1e-3)
@@ -123,7 +124,7 @@ def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_l
     assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=1e-5)  # no fold beside it costs as little
     assert [one.u[0] for one in found] == pytest.approx([0.4, 0.4], abs=0.0155)
     np.testing.assert_array_equal(found[0].u, again[0].u)  # the same seed, the same points
-    monkeypatch.setattr("sysid.slopes.ROUNDS", 0)
+    monkeypatch.setattr("sysid.search.slopes.ROUNDS", 0)
     stuck = ends()
     assert min(one.cost for one in stuck) > 1.1 and abs(stuck[0].u[0] - stuck[1].u[0]) > 0.1
 
@@ -147,8 +148,8 @@ class Hidden(Folded):
 @pytest.mark.quick
 @pytest.mark.parametrize(("rounds", "end", "cost"), [(6, 1.0, 1.04), (0, 0.0, 2.6)])
 def test_ends_of_ranges_are_tried_again_from_the_floor_of_the_valley(rounds, end, cost, monkeypatch):
-    monkeypatch.setattr("sysid.valleys.DEAR", 0.01)  # far along the ranges lies nothing
-    monkeypatch.setattr("sysid.slopes.ROUNDS", rounds)
+    monkeypatch.setattr("sysid.search.valleys.DEAR", 0.01)  # far along the ranges lies nothing
+    monkeypatch.setattr("sysid.search.slopes.ROUNDS", rounds)
     found, _, _ = gradient_search(Hidden(), Hidden.space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
     assert found.u[2] == pytest.approx(end, abs=0.02)
     assert found.cost == pytest.approx(cost, rel=0.1)
@@ -180,7 +181,8 @@ def test_a_wrong_start_pose_is_absorbed_only_as_far_as_its_noise_allows(objectiv
 
 
 def test_lm_reaches_the_noise_floor_from_several_starts(objective):
-    result = gradient.fit(objective, objective.space, starts=gradient.random_starts(objective.space, 4, seed=1))
+    starts = least_squares.random_starts(objective.space, 4, seed=1)
+    result = least_squares.fit(objective, objective.space, starts=starts)
     assert np.ptp(result.start_costs) < 0.01 * result.cost
     assert 0.8 < result.cost < 1.2  # the residual is as large as the spread between replicates
     np.testing.assert_allclose(objective.space.to_values(result.u), TRUTH, rtol=0.05)
@@ -189,13 +191,13 @@ def test_lm_reaches_the_noise_floor_from_several_starts(objective):
 def test_lm_stays_inside_the_bounds_and_finds_a_minimum_on_one(objective):
     space = dataclasses.replace(objective.space, low=np.array([0.02, 0.02, 0.95]), initial=np.array([0.1, 0.1, 1.2]))
     bounded = dataclasses.replace(objective, space=space)
-    result = gradient.fit(bounded, space)
+    result = least_squares.fit(bounded, space)
     assert ((result.u >= 0) & (result.u <= 1)).all()
     assert space.to_values(result.u)[2] == pytest.approx(0.95)
 
 
 def test_frozen_parameters_keep_their_value(objective):
-    result = gradient.fit(objective, objective.space, frozen=("tau_v",), iterations=3)
+    result = least_squares.fit(objective, objective.space, frozen=("tau_v",), iterations=3)
     assert objective.space.to_values(result.u)[0] == pytest.approx(0.1)
     assert result.cost < result.initial_cost
 
@@ -204,7 +206,8 @@ def test_a_robust_fit_is_not_drawn_by_outliers(objective):
     pose, start = objective.measured.pose.copy(), np.array([[trial.start.yaw] for trial in objective.trials])
     pose[:, ::7, 2] += 0.5 * (pose[:, ::7, 2] - start)  # every seventh yaw is half as far again
     spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
-    errors = [np.abs(gradient.fit(spoiled, spoiled.space, robust=robust).u - U_TRUTH).max() for robust in (False, True)]
+    errors = [np.abs(least_squares.fit(spoiled, spoiled.space, robust=robust).u - U_TRUTH).max()
+              for robust in (False, True)]
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -213,7 +216,7 @@ def test_intervals_of_a_robust_fit_are_not_those_of_its_outliers(objective):
     pose = objective.measured.pose.copy()
     pose[:, ::17, 2] += np.where(np.arange(pose[:, ::17].shape[1]) % 2, 0.3, -0.3)
     spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
-    u = gradient.fit(spoiled, spoiled.space, robust=True).u
+    u = least_squares.fit(spoiled, spoiled.space, robust=True).u
 
     def widths(objective, robust):
         known = uncertainty.estimate(objective, u, robust=robust).estimates
@@ -233,7 +236,7 @@ def test_tpe_improves_on_the_initial_values(objective, cost):
 
 
 def test_the_papers_cost_is_the_sum_of_the_position_rmse(objective):
-    from sysid.metrics import score
+    from sysid.logs.metrics import score
 
     u = np.array([[0.3, 0.4, 0.5]])
     simulated = objective.simulate(u)
@@ -251,14 +254,14 @@ def test_the_papers_cost_is_the_same_where_an_accelerator_sums_it(objective, mon
 
     u = np.random.default_rng(0).uniform(0.2, 0.8, (4, 3))
     expected = objective.paper_cost(u)
-    monkeypatch.setattr("sysid.normal_equations.on_processor", lambda: False)
+    monkeypatch.setattr("sysid.errors.normal_equations.on_processor", lambda: False)
     np.testing.assert_allclose(objective.paper_cost(u), expected, rtol=1e-4)
     broken = dataclasses.replace(objective, replay=Broken()).paper_cost(u)
     assert broken[0] > 100 and broken[1:] == pytest.approx(expected[1:], rel=1e-4)
 
 
 def test_intervals_hold_the_truth_and_are_not_wide(objective):
-    result = gradient.fit(objective, objective.space)
+    result = least_squares.fit(objective, objective.space)
     known = uncertainty.estimate(objective, result.u)
     for estimate, truth in zip(known.estimates, TRUTH, strict=True):
         assert estimate.low - 0.02 * truth < truth < estimate.high + 0.02 * truth
@@ -276,7 +279,7 @@ def test_what_the_log_does_not_tell_is_named(objective):
         return values[:2].sum() * np.array([0.3, 0.2, 0.0]) + np.array([0.0, 0.0, 0.9])
 
     blind = dataclasses.replace(objective, replay=Replay(plant, batch, lags), space=space, measured=measured)
-    result = gradient.fit(blind, space, iterations=8)
+    result = least_squares.fit(blind, space, iterations=8)
     known = uncertainty.estimate(blind, result.u)
     assert [estimate.identifiable for estimate in known.estimates] == [False, False, False]
     weak = " / ".join(known.weak_combinations())
@@ -289,7 +292,7 @@ def test_a_delay_is_profiled_on_a_grid_and_the_others_follow(objective):
     renamed = dataclasses.replace(objective.space, names=("delay", "tau_omega", "turn"))
     behind = dataclasses.replace(objective, space=renamed)
     off = U_TRUTH + np.array([0.0, 0.1, 0.0])
-    (name, grid, costs, followed), = gradient.profile_delays(behind, renamed, off)
+    (name, grid, costs, followed), = least_squares.profile_delays(behind, renamed, off)
     assert name == "delay" and 16 < len(grid) == len(costs) == len(followed) <= 16 + 2 * 13
     near = np.sort(np.abs(grid - behind.space.to_values(off)[0]))
     assert 0 < near[near > 1e-9].min() < 0.001  # s: finer than a step of the controller's clock
@@ -315,7 +318,7 @@ def test_starts_that_have_converged_are_not_searched_further(objective):
             return objective.jacobian(u)
 
     starts = np.array([U_TRUTH, [0.9, 0.9, 0.1]])
-    result = gradient.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
+    result = least_squares.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
     assert calls[0] == 2 and calls[-1] == 1
     assert result.evaluations == sum(calls) + sum(tried)
 
@@ -335,16 +338,16 @@ def test_steps_that_bring_what_they_promise_are_followed_without_a_new_jacobian(
 
     space, start = objective.space, np.array([[0.2, 0.8, 0.7]])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gradient, "FOLLOWING", 0)
-        plain = gradient.fit(Counted(), space, starts=start, iterations=20)
+        patch.setattr(least_squares, "FOLLOWING", 0)
+        plain = least_squares.fit(Counted(), space, starts=start, iterations=20)
         needed, calls[:] = len(calls), []
         assert plain.evaluations == needed * 5
-    quick = gradient.fit(Counted(), space, starts=start, iterations=20)
+    quick = least_squares.fit(Counted(), space, starts=start, iterations=20)
     assert len(calls) < needed
     assert quick.cost == pytest.approx(plain.cost, rel=1e-4) and np.abs(quick.u - plain.u).max() < 0.01
     rng = np.random.default_rng(0)
     jacobian, change, move = rng.normal(size=(2, 3, 4, 5)), rng.normal(size=(2, 3, 4)), rng.normal(size=(2, 5))
-    learnt = gradient._learnt(jacobian, change, move)
+    learnt = least_squares._learnt(jacobian, change, move)
     np.testing.assert_allclose(np.einsum("nbkp,np->nbk", learnt, move), change, atol=1e-12)
     across = np.cross(move[0, :3], rng.normal(size=3))
     np.testing.assert_allclose(learnt[0, ..., :3] @ across, jacobian[0, ..., :3] @ across, atol=1e-12)

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 from cart import cart
 
-from sysid import gradient, searches
-from sysid.fit import FitConfig, make_problem
-from sysid.searches import Arguments, Judge, Recorder, Trace, arrivals, trace
-from sysid.studies import BATCH
+from sysid import searches
+from sysid.search import least_squares
+from sysid.search.comparison import METHODS, Judge, Recorder, arrivals, trace
+from sysid.search.fitting import make_problem
+from sysid.search.result import Trace
+from sysid.search.settings import FitConfig
+from sysid.search.studies import BATCH
+from sysid.searches import Arguments
 
 LAG = "(0.1, 0.02, 1.0)"
 MODEL = cart("tau_v", "tau_omega", f'{{"tau_v": {LAG}, "tau_omega": {LAG}, "turn": (1.0, 0.5, 1.5)}}')
@@ -30,7 +34,7 @@ def compared(unicycle_log, problem):
     """One run of each search."""
     judge = Judge(problem, unicycle_log)
     return [trace(problem, judge, 0.5, method, 0, evaluations=64, iterations=14, start_count=2)
-            for method in searches.METHODS]
+            for method in METHODS]
 
 
 def test_each_search_is_followed_to_its_end(compared, problem):
@@ -72,8 +76,8 @@ def test_a_derivative_counts_its_directions_and_recording_takes_no_time(problem)
 
 
 def test_a_recorded_search_is_the_search_itself(problem, compared):
-    points = gradient.random_starts(problem.space, 2, 0)
-    alone = gradient.fit(problem.objective, problem.space, starts=points, iterations=14)
+    points = least_squares.random_starts(problem.space, 2, 0)
+    alone = least_squares.fit(problem.objective, problem.space, starts=points, iterations=14)
     lm = next(one for one in compared if one.method == "lm")
     assert lm.cost[-1] == pytest.approx(alone.cost, rel=1e-3)
 

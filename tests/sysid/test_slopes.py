@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from test_intervals import DRIVES, SAMPLES, Linear, designs
 
-from sysid import gradient, slopes, uncertainty
+from sysid.intervals import uncertainty
+from sysid.search import least_squares, slopes
 
 pytestmark = pytest.mark.quick
 
@@ -75,7 +76,7 @@ def test_intervals_of_a_rippled_model_hold_the_truth_as_often_as_they_say():
     for _ in range(60):
         design, errors = designs(random), random.standard_normal((DRIVES, SAMPLES))
         rippled = Rippled(design, errors, height=0.05, length=0.05)
-        start = gradient.fit(rippled, rippled.space, iterations=10)
+        start = least_squares.fit(rippled, rippled.space, iterations=10)
         u = slopes.descend(rippled, start).u
         known = uncertainty.estimate(rippled, u)
         inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
@@ -88,10 +89,10 @@ def test_intervals_of_a_rippled_model_hold_the_truth_as_often_as_they_say():
 def test_a_descent_never_ends_higher_and_counts_what_it_replays():
     random = np.random.default_rng(3)
     rippled = Rippled(designs(random), random.standard_normal((DRIVES, SAMPLES)), height=0.25, length=0.3)
-    start = gradient.fit(rippled, rippled.space, iterations=10)
+    start = least_squares.fit(rippled, rippled.space, iterations=10)
     told = []
     end = slopes.descend(rippled, start, progress=lambda count, text: told.append(count))
     assert end.cost < start.cost and end.cost == pytest.approx(
-        gradient.costs_of(rippled, end.u[None])[0]) and (np.diff(end.history[len(start.history) :]) <= 0).all()
+        least_squares.costs_of(rippled, end.u[None])[0]) and (np.diff(end.history[len(start.history) :]) <= 0).all()
     assert sum(told) == len(end.history) - len(start.history)
     assert end.evaluations - start.evaluations >= len(told) * 6 * 3

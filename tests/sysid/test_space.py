@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.fit import fitted_plant
-from sysid.log import load_log
-from sysid.models import make_replay, measured_effects, with_effects
-from sysid.space import RATIO, Space, make_space, searched
-from sysid.synthetic import write_dataset
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import WARTHOG, WHILL_CR, find_spec, in_proportion
+from sysid.errors.space import RATIO, Space, make_space, searched
+from sysid.logs.log import load_log
+from sysid.logs.synthetic import write_dataset
+from sysid.replay.differences import make_replay
+from sysid.replay.models import measured_effects, with_effects
+from sysid.search.fitting import fitted_plant
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR, find_spec, in_proportion
 
 
 @pytest.mark.quick

@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
-from sysid import studies, tpe
-from sysid.studies import BATCH, SharedStudy, open_storage
+from sysid.search import studies, tpe
+from sysid.search.studies import BATCH, SharedStudy, open_storage
 
 NAMES = ("a", "b")
 GOAL = np.array([0.3, 0.8])
 WORKER = """
 import sys, time
 import numpy as np
-from sysid.studies import SharedStudy, open_storage
+from sysid.search.studies import SharedStudy, open_storage
 
 storage, evaluations, pause = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 

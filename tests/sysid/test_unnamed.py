@@ -6,22 +6,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.candidates import make_command
-from sysid.log import OdometryStream, PoseStream, Start, Trial
-from sysid.loop.features import BIN
-from sysid.loop.noise import Whitener
-from sysid.loop.page import wrench as wrench_section
-from sysid.loop.tables import Products, Table, few_terms, gains_without, shift
-from sysid.loop.terms import Term, columns_of, in_words
-from sysid.loop.unexplained import PHASES, align, wave_turns
-from sysid.loop.unnamed import Bench, as_report, describe_unnamed, fit_unnamed, tables, vehicle_of, with_start_angles
-from sysid.rollout import vehicle_plant
-from sysid.space import make_space
-from whill_mjx.config import VehicleConfig
+from sysid.errors.features import BIN
+from sysid.errors.noise import Whitener
+from sysid.errors.space import make_space
+from sysid.follow_up.tables import Products, Table, few_terms, gains_without, shift
+from sysid.follow_up.terms import Term, columns_of, in_words
+from sysid.follow_up.unnamed import Bench, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
+from sysid.logs.log import OdometryStream, PoseStream, Start, Trial
+from sysid.logs.manoeuvre_library import make_command
+from sysid.missing.unexplained import PHASES, align, wave_turns
+from sysid.pages.loop_page import describe_unnamed
+from sysid.pages.loop_page import wrench as wrench_section
+from sysid.replay.rollout import vehicle_plant
 from whill_mjx.effects.unnamed import KNOTS, MAP
-from whill_mjx.parameters import get_values
-from whill_mjx.presets import preset
-from whill_mjx.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import get_values
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 quick = pytest.mark.quick
 TIME = 9.0
@@ -114,8 +115,8 @@ def test_soft_places_in_the_room_are_fitted_on_a_map(bench, monkeypatch):
     assert {MAP, "x in the room", "y in the room"} <= {one.quantity for one in tables(bench.result)}
     soft = np.where(truth.knots.prod(-1) > 0, -60.0, 0.0)  # two corners: neither x nor y by itself tells them
     measure(bench, truth, np.concatenate([soft, np.zeros(KNOTS)]))
-    monkeypatch.setattr("sysid.loop.unnamed.tables", lambda _: [truth])  # five drives are too few to choose by,
-    monkeypatch.setattr("sysid.loop.tables.SMOOTHING", (0.01,))  # the smoothing too
+    monkeypatch.setattr("sysid.follow_up.unnamed.tables", lambda _: [truth])  # five drives are too few to choose by,
+    monkeypatch.setattr("sysid.follow_up.tables.SMOOTHING", (0.01,))  # the smoothing too
     found = fit_unnamed(bench)
     assert found.cost[1] < 1.1 < 1.3 < found.cost[0] and not found.terms
     assert found.wrench[:KNOTS][soft < 0].mean() < -20 < found.wrench[:KNOTS][soft == 0].mean()

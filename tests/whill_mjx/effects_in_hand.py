@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from whill_mjx.effects.base import place_of
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.types import Drive, Odometry, Yielding
-from whill_mjx.vehicle import measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import measure, nominal_world, place
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import Drive, Odometry, Yielding
 
 DT = 0.005  # s
 WEIGHT = 52 * 9.81  # N

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.augment import AugmentRanges, augment, draw_photometry, neutral
+from whill_mjx.world.photometric import AugmentRanges, augment, draw_photometry, neutral
 
 pytestmark = pytest.mark.quick
 KEY = jax.random.key(0)

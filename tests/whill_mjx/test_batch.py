@@ -15,8 +15,8 @@ import pytest
 
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, step
-from whill_mjx.task import ObstacleCourse
-from whill_mjx.training import functional_env
+from whill_mjx.learning.setup import functional_env
+from whill_mjx.tasks.tasks import ObstacleCourse
 
 ROOT = Path(__file__).parents[2]
 TWO_DEVICES = """
@@ -24,7 +24,7 @@ import json
 import jax, jax.numpy as jnp, numpy as np
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env
-from whill_mjx.task import ObstacleCourse
+from whill_mjx.tasks.tasks import ObstacleCourse
 env, params = make_env(ObstacleCourse(max_steps=1), height=16, width=16)
 told = {}
 def run(devices):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from whill_mjx.drive import DriveOptions, find_vehicle, main, parse_effect, with_effects
-from whill_mjx.manoeuvres import MANOEUVRES, Scenario, command_table
-from whill_mjx.sensors import Sensors
-from whill_mjx.vehicle_file import load_vehicle
+from whill_mjx.logs.manoeuvres import MANOEUVRES, Scenario, command_table
+from whill_mjx.logs.simulated_sensors import Sensors
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 SHORT = Scenario(v=0.5, omega=0.6, length=2.0)
 
@@ -84,7 +84,7 @@ def test_the_vehicle_that_was_driven_is_kept_and_can_be_driven_again(dataset):
 
 
 def test_the_dataset_is_read_by_the_fit(dataset):
-    from sysid.log import load_log
+    from sysid.logs.log import load_log
 
     log = load_log(dataset)
     assert [trial.name for trial in log.held_out] == ["circle_1", "circle_2"]
@@ -96,7 +96,7 @@ def test_sensors_report_at_their_rates_with_their_latencies(tmp_path):
 
     A fit reads it, and leaves the streams aside that it does not know.
     """
-    from sysid.log import load_log
+    from sysid.logs.log import load_log
 
     sensors = Sensors(
         odometry_rate=50.0, ground_truth_latency=0.1, imu_rate=104.0, encoder_rate=50.0, encoder_latency=0.01

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.config import VehicleConfig
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.vehicle import drive, place
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
 
 TWISTS = np.array([(0.0, 0.0)] * 2 + [(0.9, 0.6)] * 10 + [(0.0, 0.0)] * 12)  # every 0.1 s
 DELAYS = np.arange(0.0152, 0.0249, 0.0002)

@@ -9,7 +9,7 @@ import pytest
 from effects_in_hand import DT, motion_at, quick, run, signal, still, yielding
 
 from whill_mjx.effects import make_effect
-from whill_mjx.specs import HUSKY
+from whill_mjx.vehicle.specs import HUSKY
 
 
 def both(effect, force, motion=None):

@@ -13,8 +13,8 @@ from effects_in_hand import DT, WEIGHT, chair, motion_at, path, quick, reading, 
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.command_quantisation import MAKER
 from whill_mjx.effects.gyro_range import MAKER as GYRO
-from whill_mjx.types import Payload
-from whill_mjx.vehicle import add_payload, measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import add_payload, measure, nominal_world, place
+from whill_mjx.vehicle.types import Payload
 
 # Commands
 

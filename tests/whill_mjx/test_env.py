@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import Env, make_env, reset_state, step, step_state
-from whill_mjx.model import build_model
-from whill_mjx.task import ObstacleCourse
+from whill_mjx.tasks.tasks import ObstacleCourse
+from whill_mjx.vehicle.model import build_model
 
 
 @pytest.fixture(scope="module")

@@ -11,19 +11,19 @@ import marker_seeker
 import numpy as np
 import pytest
 
-from whill_mjx.conditions import nominal, seen_under
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.evaluate import EvaluateOptions, choose_task, main
-from whill_mjx.evaluation import Episodes, episode_figures, summarise
-from whill_mjx.intervals import bootstrap_interval, wilson_interval
-from whill_mjx.kinematics import camera_pose, rotation_from_quaternion
-from whill_mjx.network import Network
-from whill_mjx.policy_file import load_policy
-from whill_mjx.presets import preset
-from whill_mjx.report import episode_video
-from whill_mjx.rollouts import CHANNELS
-from whill_mjx.sweeps import parse_sweep, with_parameter
+from whill_mjx.evaluation.conditions import nominal, seen_under
+from whill_mjx.evaluation.episodes import Episodes, episode_figures, summarise
+from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
+from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.evaluation.pages import episode_video
+from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.evaluation.rollouts import CHANNELS
+from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
+from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
+from whill_mjx.vehicle.presets import preset
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.kinematics import body_twist, camera_pose, reference_pose, rotation_from_quaternion
-from whill_mjx.model import build_model, mujoco_model
-from whill_mjx.presets import preset
-from whill_mjx.vehicle import drive, mass_distribution, measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import drive, mass_distribution, measure, nominal_world, place
+from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose, rotation_from_quaternion
+from whill_mjx.vehicle.model import build_model, mujoco_model
+from whill_mjx.vehicle.presets import preset
 
 
 @lru_cache

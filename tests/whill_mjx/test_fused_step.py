@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from whill_mjx import rigid
-from whill_mjx.config import VehicleConfig
 from whill_mjx.effects import make_effect
-from whill_mjx.kinematics import rotation_from_quaternion
-from whill_mjx.model import VehicleModel, build_model, mujoco_model, wheel_bodies
-from whill_mjx.presets import preset
-from whill_mjx.scalars import apart, scan_apart
-from whill_mjx.vehicle import place, substeps
+from whill_mjx.vehicle import rigid
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import place, substeps
+from whill_mjx.vehicle.kinematics import rotation_from_quaternion
+from whill_mjx.vehicle.model import VehicleModel, build_model, mujoco_model, wheel_bodies
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.scalars import apart, scan_apart
 
 quick = pytest.mark.quick
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from whill_mjx.effects import make_effect
-from whill_mjx.kinematics import camera_pose
-from whill_mjx.model import build_model
-from whill_mjx.presets import preset
-from whill_mjx.types import parameters_of
-from whill_mjx.vehicle import drive, forces, measure, nominal_world, place
+from whill_mjx.vehicle.dynamics import drive, forces, measure, nominal_world, place
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import parameters_of
 
 quick = pytest.mark.quick
 SURFACES = {"incline": {"along_x": 0.08, "along_y": -0.05}, "ramp": {"rise": 0.1, "length": 1.5, "direction": 0.7},

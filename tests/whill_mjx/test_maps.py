@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.maps import (
+from whill_mjx.world.maps import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -21,7 +21,7 @@ from whill_mjx.maps import (
     nearest_walls,
     wall_segments,
 )
-from whill_mjx.scene import Footprint, collides
+from whill_mjx.world.scene import Footprint, collides
 
 pytestmark = pytest.mark.quick
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "maps"

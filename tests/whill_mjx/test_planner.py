@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, reset_state, step_state
-from whill_mjx.kinematics import body_twist, reference_pose
-from whill_mjx.planner import first_plan, for_task, plan_action, predicted_poses, predicted_return
-from whill_mjx.scene import no_boxes
-from whill_mjx.task import sample_world
-from whill_mjx.vehicle import drive, place
+from whill_mjx.evaluation.planner import first_plan, for_task, plan_action, predicted_poses, predicted_return
+from whill_mjx.tasks.tasks import sample_world
+from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.kinematics import body_twist, reference_pose
+from whill_mjx.world.scene import no_boxes
 
 
 def episode(env, params, key, steps):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from whill_mjx.ppo import (
+from whill_mjx.learning.ppo import (
     Network,
     PpoConfig,
     ReturnScale,
@@ -24,7 +24,7 @@ from whill_mjx.ppo import (
     push,
     track,
 )
-from whill_mjx.ppo_run import train_ppo
+from whill_mjx.learning.ppo_training import train_ppo
 
 TINY = PpoConfig(stack=2, width=32, channels=(8, 8, 8), rollout=16, epochs=4, minibatches=4, lr=3e-3)
 
@@ -136,7 +136,7 @@ def test_the_exported_step_sees_what_the_network_was_trained_on():
 
 def test_the_exported_network_acts_like_the_trained_one(tmp_path):
     from dreamer.export import PolicyContract, export_policy
-    from whill_mjx.policy_file import load_policy
+    from whill_mjx.evaluation.policy_file import load_policy
 
     params = Network(TINY, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 6), jnp.uint8))
     params["params"]["Dense_1"]["kernel"] *= 1e4  # a new network's actions are all near zero

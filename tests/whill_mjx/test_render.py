@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.render import FIRST_BOX, GROUND, MARKER, SKY, pinhole, render, render_frame
-from whill_mjx.render.visibility import reciprocal
-from whill_mjx.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
+from whill_mjx.world.render import FIRST_BOX, GROUND, MARKER, SKY, pinhole, render, render_frame
+from whill_mjx.world.render.visibility import reciprocal
+from whill_mjx.world.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 
 EYE = jnp.array([0.0, 0.0, 1.0])
 LEVEL = jnp.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along +x

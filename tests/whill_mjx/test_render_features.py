@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.augment import augment, neutral
-from whill_mjx.render import FIRST_BOX, Quality, camera_rotation, look_at, pinhole, render, render_frame
-from whill_mjx.render.camera import distort, undistort
-from whill_mjx.render.film import develop, motion_blur, plain_film
-from whill_mjx.render.soft import render_soft
-from whill_mjx.scene import Marker, Scene, box, default_looks, no_boxes, stack_boxes
-from whill_mjx.solids import Solids, person
+from whill_mjx.world.photometric import augment, neutral
+from whill_mjx.world.render import FIRST_BOX, Quality, camera_rotation, look_at, pinhole, render, render_frame
+from whill_mjx.world.render.camera import distort, undistort
+from whill_mjx.world.render.film import develop, motion_blur, plain_film
+from whill_mjx.world.render.soft import render_soft
+from whill_mjx.world.scene import Marker, Scene, box, default_looks, no_boxes, stack_boxes
+from whill_mjx.world.solids import Solids, person
 
 EYE = jnp.array([0.0, 0.0, 1.0])
 LEVEL = camera_rotation(0.0)

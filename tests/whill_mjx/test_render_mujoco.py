@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.render import FIRST_BOX, GROUND, SKY, camera_rotation, pinhole, render_frame
-from whill_mjx.scene import Boxes, Marker, Scene, default_looks
-from whill_mjx.solids import Blocks, Rounds, Solids
+from whill_mjx.world.render import FIRST_BOX, GROUND, SKY, camera_rotation, pinhole, render_frame
+from whill_mjx.world.scene import Boxes, Marker, Scene, default_looks
+from whill_mjx.world.solids import Blocks, Rounds, Solids
 
 SHEET = Path(os.environ.get("CONTACT_SHEET", Path(tempfile.gettempdir()) / "camera_against_mujoco.png"))
 SIZE = 160

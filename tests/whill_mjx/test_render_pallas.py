@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_mesh
 
-from whill_mjx.finish import label_count, make_atlas, plain_finish
-from whill_mjx.render import Quality, camera_rotation, pinhole, render
-from whill_mjx.render.pallas import Tiling, fast_level, fast_small, fast_whole, render_pallas
-from whill_mjx.scene import Boxes, Marker, Scene, default_looks
-from whill_mjx.solids import Solids, block, person, post, stack_rounds
+from whill_mjx.world.materials import label_count, make_atlas, plain_finish
+from whill_mjx.world.render import Quality, camera_rotation, pinhole, render
+from whill_mjx.world.render.pallas import Tiling, fast_level, fast_small, fast_whole, render_pallas
+from whill_mjx.world.scene import Boxes, Marker, Scene, default_looks
+from whill_mjx.world.solids import Solids, block, person, post, stack_rounds
 
 EYE, TURN = jnp.array([0.0, 0.1, 1.0]), camera_rotation(0.1, 0.15, 0.05)
 BEST = Quality(antialias=True, shadows=True)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.camera import BOXES, LENS, crowded_scene, map_scene
-from whill_mjx.render import render_frame
-from whill_mjx.render.visibility import FIRST_BOX
+from whill_mjx.world.render import render_frame
+from whill_mjx.world.render.visibility import FIRST_BOX
 
 
 def shown(make, labels, worlds):

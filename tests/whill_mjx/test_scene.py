@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.scene import Boxes, box, clearance, collides, footprint, no_boxes, overlaps, stack_boxes
-from whill_mjx.specs import WHILL_CR
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.world.scene import Boxes, box, clearance, collides, footprint, no_boxes, overlaps, stack_boxes
 
 pytestmark = pytest.mark.quick
 GREY = jnp.full(3, 0.5)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import first_outcome, make_env, reset_state
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.starts import anywhere
-from whill_mjx.task import make_task, sample_world
+from whill_mjx.tasks.starts import anywhere
+from whill_mjx.tasks.tasks import make_task, sample_world
+from whill_mjx.vehicle.specs import WHILL_CR
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def test_worlds_stay_the_same():
 def test_without_a_free_place_an_episode_begins_at_its_own_start(monkeypatch):
     task, key = make_task("obstacle_course"), jax.random.key(2)
     world = sample_world(task, key)
-    monkeypatch.setattr("whill_mjx.starts.CLEAR", 1e6)
+    monkeypatch.setattr("whill_mjx.tasks.starts.CLEAR", 1e6)
     np.testing.assert_array_equal(anywhere(task, WHILL_CR, world, key), world.start)
 
 

@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.randomize import randomize_looks, randomize_params
-from whill_mjx.scene import clearance, collides, footprint
-from whill_mjx.specs import WHILL_CR
-from whill_mjx.task import Corridor, ObstacleCourse, goal_position, make_task, reward_terms, sample_world, scale_action
-from whill_mjx.types import Body, VehicleParams
+from whill_mjx.tasks.tasks import (
+    Corridor,
+    ObstacleCourse,
+    goal_position,
+    make_task,
+    reward_terms,
+    sample_world,
+    scale_action,
+)
+from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.types import Body, VehicleParams
+from whill_mjx.world.randomize import randomize_looks, randomize_params
+from whill_mjx.world.scene import clearance, collides, footprint
 
 pytestmark = pytest.mark.quick
 YES, NO = jnp.array(True), jnp.array(False)

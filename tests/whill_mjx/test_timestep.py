@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.physics import timestep_errors
-from whill_mjx.config import VehicleConfig
-from whill_mjx.kinematics import reference_pose
-from whill_mjx.model import build_model
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset_params
-from whill_mjx.specs import HUSKY, WHILL_CR
-from whill_mjx.vehicle import drive, place
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
 
 
 def test_the_default_step_keeps_a_figure_eight_within_2_mm_and_2_mrad_of_one_eight_times_smaller():

@@ -16,13 +16,13 @@ from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluate import EvaluateOptions, choose_task
-from whill_mjx.inside import Stopper, keep_best, read_best
-from whill_mjx.intervals import wilson_interval
-from whill_mjx.policy_file import load_policy
-from whill_mjx.safe import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
-from whill_mjx.task import Corridor, ObstacleCourse, make_task
+from whill_mjx.evaluation.intervals import wilson_interval
+from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.learning.checks import Stopper, keep_best, read_best
+from whill_mjx.learning.setup import find_preset, functional_env, make_training_env, with_repeat
+from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
+from whill_mjx.tasks.tasks import Corridor, ObstacleCourse, make_task
 from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle
-from whill_mjx.training import find_preset, functional_env, make_training_env, with_repeat
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +78,7 @@ def test_the_exported_policy_runs_on_the_bridge_and_gives_commands_within_the_li
 
     options, _ = run
     policy = Policy.load(options.out / "policy")
+    assert policy.contract.camera["frame"] == "base_footprint"
     policy.reset()
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     for frame in frames:
@@ -87,7 +88,7 @@ def test_the_exported_policy_runs_on_the_bridge_and_gives_commands_within_the_li
 
 def test_the_exported_policy_keeps_to_the_limits_of_its_training_by_itself(run):
     """Commands of the file change by at most 0.5 m/s and 1 rad/s from one decision (0.5 s) to the next, from rest."""
-    from whill_mjx.policy_file import load_policy
+    from whill_mjx.evaluation.policy_file import load_policy
 
     policy = load_policy(run[0].out / "policy")
     assert "command" in policy.carry
@@ -267,8 +268,8 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
         tries.append(args[-1])
         return make_batch(*args)
 
-    monkeypatch.setattr("whill_mjx.training.make_batch", batched)
-    monkeypatch.setattr("whill_mjx.training.make_env", noted)
+    monkeypatch.setattr("whill_mjx.learning.setup.make_batch", batched)
+    monkeypatch.setattr("whill_mjx.learning.setup.make_env", noted)
     monkeypatch.setattr("whill_mjx.train.train", stop)
     monkeypatch.setattr("whill_mjx.train.train_ppo", stop)
     options = TrainOptions(out=tmp_path, vehicle=Path("whill_cr_ramp"), preset="smoke", exploring_starts=0.5,

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx import truth
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
-from whill_mjx.scene import box, footprint, no_boxes, stack_boxes
-from whill_mjx.training import TRUTH, functional_env, mirror_of
+from whill_mjx.learning import privileged
+from whill_mjx.learning.setup import TRUTH, functional_env, mirror_of
+from whill_mjx.world.scene import box, footprint, no_boxes, stack_boxes
 
 ENV, PARAMS = make_env("obstacle_course", "whill_cr", height=16, width=16)
 
@@ -34,9 +34,9 @@ def test_free_distances_are_those_of_a_walk_along_each_ray():
     boxes = stack_boxes([box(2.0, 0.3, 0.6, 0.4, 0.5, jnp.ones(3), 0.4), box(-0.5, 1.5, 0.2, 3.0, 0.5, jnp.ones(3)),
                          box(0.0, -1.0, 4.0, 0.1, 0.5, jnp.ones(3), mask=False)])  # fmt: skip
     body = footprint(ENV.model.spec, 0.1, -0.2, 0.7)
-    steps = np.linspace(0.0, truth.RANGE, 50001)
+    steps = np.linspace(0.0, privileged.RANGE, 50001)
     expected = []
-    for angle in truth.ANGLES + 0.7:
+    for angle in privileged.ANGLES + 0.7:
         dx = float(body.x) + steps * np.cos(angle) - np.asarray(boxes.centre[:, :1])
         dy = float(body.y) + steps * np.sin(angle) - np.asarray(boxes.centre[:, 1:2])
         c, s = np.cos(np.asarray(boxes.yaw))[:, None], np.sin(np.asarray(boxes.yaw))[:, None]
@@ -44,10 +44,10 @@ def test_free_distances_are_those_of_a_walk_along_each_ray():
         inside = (np.abs(dx * c + dy * s) <= half[:, :1]) & (np.abs(dy * c - dx * s) <= half[:, 1:2])
         inside &= np.asarray(boxes.mask)[:, None]
         met = inside.any(0)
-        expected.append(steps[met.argmax()] if met.any() else truth.RANGE)
-    assert 3 <= sum(value < truth.RANGE for value in expected) < truth.RAYS
-    np.testing.assert_allclose(truth.free_distances(body, boxes), expected, atol=2e-4)
-    np.testing.assert_array_equal(truth.free_distances(body, no_boxes(2)), truth.RANGE)
+        expected.append(steps[met.argmax()] if met.any() else privileged.RANGE)
+    assert 3 <= sum(value < privileged.RANGE for value in expected) < privileged.RAYS
+    np.testing.assert_allclose(privileged.free_distances(body, boxes), expected, atol=2e-4)
+    np.testing.assert_array_equal(privileged.free_distances(body, no_boxes(2)), privileged.RANGE)
 
 
 @pytest.mark.quick
@@ -57,7 +57,7 @@ def test_some_ray_meets_a_box_of_the_corridor_wherever_it_stands_ahead():
     for _ in range(50):
         far, aside, turned = rng.uniform(0.9, 2.9), rng.uniform(-0.5, 0.5), rng.uniform(-0.8, 0.8)
         boxes = stack_boxes([box(float(body.x) + far, aside, 0.4, 0.4, 0.45, jnp.ones(3), turned)])
-        assert float(truth.free_distances(body, boxes).min()) < far
+        assert float(privileged.free_distances(body, boxes).min()) < far
 
 
 def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
@@ -69,9 +69,9 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     for action in actions:
         state, outcome = drive(state, action)
         other, other_outcome = drive(other, mirror.action(action[None], 1)[0, 0])
-    known, other_known = (truth.truth(ENV, one) for one in (state, other))
-    assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], truth.mirrored(known)[4:], atol=0.1)
-    np.testing.assert_allclose(truth.mirrored(known), other_known, atol=2e-3)
+    known, other_known = (privileged.truth(ENV, one) for one in (state, other))
+    assert abs(float(known[1])) > 0.05 and not np.allclose(known[4:], privileged.mirrored(known)[4:], atol=0.1)
+    np.testing.assert_allclose(privileged.mirrored(known), other_known, atol=2e-3)
     assert float(outcome.reward) == pytest.approx(float(other_outcome.reward), abs=1e-3)
     plain = {"noise": jnp.zeros(()), "grain": jnp.zeros(()), "ground": jnp.full((2, 3), 0.4)}  # no tiles
     scenes = [dataclasses.replace(one.scene.looks, **plain) for one in (state, other)]
@@ -99,9 +99,9 @@ def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode
     assert np.abs(views[2] - views[1]).mean() < 12  # grey levels, of noise
     np.testing.assert_array_equal(mirror.action(jnp.array([[0.5, 0.25]]), 3)[:, 0, 1], [-0.25, 0.25, -0.25])
     assert mirror.worlds > 3
-    known = jax.random.uniform(jax.random.key(1), (2, truth.SIZE))
+    known = jax.random.uniform(jax.random.key(1), (2, privileged.SIZE))
     told = mirror.obs(state, {"camera": frame.obs, TRUTH: known}, 2)[TRUTH]
-    np.testing.assert_array_equal(told, [truth.mirrored(known), known])
+    np.testing.assert_array_equal(told, [privileged.mirrored(known), known])
     assert mirror_of(make_batch(ENV, PARAMS, 1)).worlds == 1
     one = jax.tree.map(lambda leaf: leaf[0], state)
     other = repainted(env, one.env, jax.random.key(7))
@@ -115,9 +115,9 @@ def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode
 def test_the_targets_stand_beside_the_camera_and_are_no_input():
     batch = make_batch(ENV, PARAMS, 2)
     env, plain = functional_env(batch, targets=True), functional_env(batch)
-    assert env.obs_shape == {"camera": (16, 16, 3), TRUTH: (truth.SIZE,)} and plain.obs_shape == (16, 16, 3)
+    assert env.obs_shape == {"camera": (16, 16, 3), TRUTH: (privileged.SIZE,)} and plain.obs_shape == (16, 16, 3)
     state, first = jax.jit(env.reset)(jax.random.key(0))
     np.testing.assert_array_equal(first.obs["camera"], jax.jit(plain.reset)(jax.random.key(0))[1].obs)
     _, after = jax.jit(env.step)(state, jnp.ones((2, 2)))
-    assert after.obs[TRUTH].shape == (2, truth.SIZE) and np.isfinite(after.obs[TRUTH]).all()
+    assert after.obs[TRUTH].shape == (2, privileged.SIZE) and np.isfinite(after.obs[TRUTH]).all()
     assert (np.abs(after.obs[TRUTH] - first.obs[TRUTH]) > 0).any()

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.model import build_model
-from whill_mjx.parameters import set_values
-from whill_mjx.presets import preset, preset_params
-from whill_mjx.specs import HUSKY
-from whill_mjx.types import VehicleParams
-from whill_mjx.vehicle import drive, forces, place
+from whill_mjx.vehicle.dynamics import drive, forces, place
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset, preset_params
+from whill_mjx.vehicle.specs import HUSKY
+from whill_mjx.vehicle.types import VehicleParams
 
 
 def roll(spec, params, commands):

@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from sysid.models import with_effects
-from whill_mjx.config import VehicleConfig
-from whill_mjx.kinematics import body_twist, reference_pose, rotation_from_quaternion
-from whill_mjx.model import box_inertia, build_model, mujoco_model
-from whill_mjx.parameters import describe, get_values, set_values
-from whill_mjx.presets import preset, preset_params
-from whill_mjx.specs import SPECS, WARTHOG, WHILL_CR, VehicleSpec, find_spec
-from whill_mjx.vehicle import drive, forces, measure, nominal_world, place, substep
+from sysid.replay.models import with_effects
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.dynamics import drive, forces, measure, nominal_world, place, substep
+from whill_mjx.vehicle.kinematics import body_twist, reference_pose, rotation_from_quaternion
+from whill_mjx.vehicle.model import box_inertia, build_model, mujoco_model
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.presets import preset, preset_params
+from whill_mjx.vehicle.specs import SPECS, WARTHOG, WHILL_CR, VehicleSpec, find_spec
 
 VEHICLES = ["whill_cr_ramp", "whill_cr_physical"]
 CHAIRS = ["whill_cr_paper", "whill_cr_ramp", "whill_cr_physical", "whill_cr_documented", "whill_cr_castored"]

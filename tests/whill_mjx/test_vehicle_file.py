@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import pytest
 
-from sysid.models import with_effects
-from whill_mjx.presets import preset
-from whill_mjx.vehicle_file import load_intervals, load_vehicle, save_vehicle
+from sysid.replay.models import with_effects
+from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
 pytestmark = pytest.mark.quick
 

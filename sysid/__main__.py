@@ -1,0 +1,25 @@
+"""Lists the commands of this package, a line each: `python -m sysid`."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report")
+
+
+def first_line(name: str) -> str:
+    """The first line of a command's docstring, without what follows a colon."""
+    source = (Path(__file__).parent / f"{name}.py").read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0].split(": `")[0].rstrip(".")
+
+
+def main() -> None:
+    """Print the list."""
+    for name in COMMANDS:
+        print(f"python -m sysid.{name:<12} {first_line(name)}")
+    print("Each has --help.")
+
+
+if __name__ == "__main__":
+    main()

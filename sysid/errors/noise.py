@@ -1,0 +1,161 @@
+"""What differs between two equal drives, and the filter that turns it into white noise.
+
+Residuals of drives are autocorrelated and their channels go together; tests that take them as independent find effects
+in nothing. A vector autoregression fitted to what replicates do not share whitens both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Trial
+from sysid.replay.arrays import added, namespace
+
+ORDER = 4  # bins of memory of the filter
+RIDGE = 2e-3  # of the regression, as a share of its data
+USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
+"""Noise of the features where there are no replicates [m/s, rad/s]."""
+FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """x_t = sum_j A_j x_(t-j) + L e_t with e white and of unit size."""
+
+    scale: np.ndarray  # (C,) standard deviation of each channel
+    coefficients: np.ndarray  # (ORDER, C, C), of scaled channels
+    inverse: np.ndarray  # (C, C) L^-1
+
+    def apply(self, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """White series (B, K, C, ...) of such series.
+
+        Args:
+            mask: (B, K, C) weights of the bins: 1 where the noise has its usual size, less where it is larger, 0 where
+                nothing was measured, which counts as no deviation.
+        """
+        extra = (1,) * (series.ndim - 3)
+        shown = mask.reshape(*mask.shape, *extra)
+        scaled = series / self.scale.reshape(-1, *extra) * shown
+        xp, white = namespace(series), scaled.copy()
+        for lag, matrix in enumerate(self.coefficients, start=1):
+            white = added(white, np.s_[:, lag:], -xp.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag]))
+        return xp.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
+
+    def scaled(self, factor: float) -> Whitener:
+        """The filter for noise that is larger by a factor."""
+        return Whitener(self.scale * factor, self.coefficients, self.inverse)
+
+
+def fit_whitener(series: np.ndarray, mask: np.ndarray, order: int = ORDER) -> Whitener:
+    """Whitener of noise series (B, K, C) by ridge regression of each bin on the `order` bins before it."""
+    count = np.maximum((mask > 0).sum((0, 1)), 1)
+    scale = np.sqrt(np.maximum(np.square(series * mask).sum((0, 1)) / count, 1e-12))
+    scaled = series / scale * mask
+    channels = series.shape[-1]
+    past = np.concatenate([scaled[:, order - lag : -lag] for lag in range(1, order + 1)], axis=-1)
+    now, weight = scaled[:, order:], mask[:, order:].prod(-1)
+    rows = weight.reshape(-1) > 0
+    x, y = past.reshape(-1, past.shape[-1])[rows], now.reshape(-1, channels)[rows]
+    if len(x) < 10 * x.shape[-1]:  # too short to tell a memory
+        return Whitener(scale, np.zeros((order, channels, channels)), np.eye(channels))
+    solution = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[-1]), x.T @ y)  # (order C, C)
+    left = y - x @ solution
+    covariance = left.T @ left / max(len(left) - x.shape[-1], 1) + FLOOR**2 * np.eye(channels)
+    coefficients = solution.reshape(order, channels, channels).swapaxes(1, 2)
+    return Whitener(scale, coefficients, np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+ROUGH = (0.1, 0.5, 1.5)
+"""Accelerations [m/s^2] between which a bin counts as ever rougher."""
+
+
+def roughness(simulated: np.ndarray, width: float, track: float) -> np.ndarray:
+    """(B, K) class of each bin, 0 to 3, by the largest acceleration of a wheel around it in simulated features.
+
+    Where wheels are pulled hard they slip, and there a model is least exact: its leftovers are counted as noise of
+    their own size, so that they neither hide what steady driving shows nor pass for an effect.
+    """
+    speeds = simulated[..., :2] * np.array([1.0, track / 2])
+    change = np.abs(np.diff(speeds, axis=1, prepend=speeds[:, :1])).sum(-1) / width
+    padded = np.pad(change, ((0, 0), (3, 1)))
+    most = np.max([padded[:, shift : shift + change.shape[1]] for shift in range(5)], axis=0)
+    return np.digitize(most, ROUGH)
+
+
+def fit_roughness(series: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """(4, C) size of the noise in each class beside that of the first, at least 1 and never falling."""
+    channels = series.shape[-1]
+    size = np.ones((len(ROUGH) + 1, channels))
+    for c in range(channels):
+        for k in range(len(ROUGH) + 1):
+            chosen = (level == k) & (mask[..., c] > 0)
+            size[k, c] = np.sqrt(np.mean(np.square(series[..., c][chosen]))) if chosen.sum() > 30 else np.nan
+    known = np.where(np.isfinite(size), size, np.inf).min(0)
+    first = np.where(np.isfinite(size[0]) & (size[0] > 0), size[0], np.where(np.isfinite(known), known, 1.0))
+    factors = np.where(np.isfinite(size), size, 0.0) / np.maximum(first, 1e-12)
+    return np.maximum(np.maximum.accumulate(factors, axis=0), 1.0)
+
+
+def replicate_groups(trials: tuple[Trial, ...]) -> list[list[int]]:
+    """Indices of trials that were given the same commands, in order of first appearance."""
+    groups: list[list[int]] = []
+    for i, trial in enumerate(trials):
+        for group in groups:
+            if same_commands(trials[group[0]], trial):
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return groups
+
+
+def same_commands(a: Trial, b: Trial) -> bool:
+    """Whether two trials are replicates."""
+    if a.manoeuvre != b.manoeuvre or len(a.command.t) != len(b.command.t):
+        return False
+    return all(np.allclose(getattr(a.command, name), getattr(b.command, name), atol=1e-6)
+               for name in ("t", "v", "omega"))
+
+
+def repeated(trials: Sequence[Trial]) -> bool:
+    """Whether any trials are replicates."""
+    return any(len(group) > 1 for group in replicate_groups(tuple(trials)))
+
+
+def deviations(series: np.ndarray, groups: list[list[int]]) -> np.ndarray:
+    """Series (B, K, C) less the mean of their replicates, scaled to the size of a single drive's noise; 0 where a
+    drive has no replicate."""
+    out = np.zeros_like(series)
+    for group in groups:
+        if len(group) > 1:
+            part = series[group]
+            out[group] = (part - part.mean(0)) * np.sqrt(len(group) / (len(group) - 1))
+    return out
+
+
+def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) -> Whitener:
+    """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
+    part = deviations(target, groups)
+    inside = [i for group in groups if len(group) > 1 for i in group]
+    scale = np.array(USUAL)
+    if len(inside) >= 3:
+        count = np.maximum(mask[inside].sum((0, 1)), 1)
+        found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)
+        scale = np.where(found > 0, found, scale)
+    channels = target.shape[-1]
+    return Whitener(scale, np.zeros((1, channels, channels)), np.eye(channels))
+
+
+def scatter(residual: np.ndarray, courses: np.ndarray) -> float:
+    """Excess of what replicates do not share: mean square, less 1, of white residuals (B, n) about their courses'
+    means; nan where no course (B,) was driven twice."""
+    square, count = 0.0, 0.0
+    for course in np.unique(courses):
+        mine = residual[courses == course]
+        measured = np.abs(mine).min(0) > 0
+        square += float(np.square(mine - mine.mean(0))[:, measured].sum())
+        count += (len(mine) - 1) * float(measured.sum())
+    return square / count - 1 if count else float("nan")

@@ -1,0 +1,156 @@
+"""Costs and normal equations of many parameter sets at once, computed where the replay runs.
+
+Residuals of thousands of replays are larger than what they are wanted for: a cost, a gradient and a Hessian for each
+set. On an accelerator they are whitened, differenced and summed there, in one compiled function with the replay, so
+that only those sums come back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.errors.robust import huber_weight, robust_cost
+from sysid.errors.space import STEP, Space
+from sysid.replay.cores import on_processor
+from sysid.replay.records import Simulated
+
+DRIVES = 32768
+"""Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
+0.33 s for these), and each number is compiled once."""
+STATES = 2**27
+"""States recorded by one call at most: 5 GB, several times as much with what is made of them."""
+SEARCHES, FEW = 32, 8
+"""Sets whose gradients and Hessians are made together: as many at least as a search has starts, and so few where no
+more of them go on, or where it has a single one."""
+_COMPILERS = ThreadPoolExecutor(10)  # as many functions as a search has
+
+
+class Traceable(Protocol):
+    """`sysid.errors.pose_objective.Objective` or `sysid.search.starts.FeatureObjective`."""
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def replay(self) -> Any: ...
+
+    @property
+    def arrays(self) -> Any:
+        """What objectives of the same replay differ in; with the same `kind` they share what is compiled."""
+
+    @property
+    def kind(self) -> Any: ...
+
+    def with_arrays(self, arrays: Any) -> Traceable: ...
+
+    def residuals(self, u: Any, simulated: Simulated | None = None) -> Any: ...
+
+    def bad(self, simulated: Simulated) -> Any: ...
+
+
+class Sums:
+    """Compiled sums over the residuals of an objective."""
+
+    def __init__(self, objective: Traceable):
+        def residual(u: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            """White residuals (B, K) of one set (P,), and the replays (B,) that diverged."""
+            one = objective.with_arrays(arrays)
+            with jax.default_matmul_precision("highest"):
+                simulated = one.replay.traced(one.space.to_values(u[None]))
+                return one.residuals(u[None], simulated)[0], one.bad(simulated)[0]
+
+        def cost(u: jax.Array, arrays: Any, robust: jax.Array) -> jax.Array:
+            return robust_cost(residual(u, arrays)[0], robust)
+
+        def quadratic(u: jax.Array, arrays: Any, robust: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            size = u.shape[0]
+            up, down = (jnp.clip(u + sign * STEP * jnp.eye(size), 0.0, 1.0) for sign in (1, -1))
+            white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], up, down]), arrays)
+            width = jnp.diagonal(up - down)
+            slope = (white[1 : 1 + size] - white[1 + size :]) / width[:, None, None]  # (P, B, K)
+            lost = bad[:1] | bad[1 : 1 + size] | bad[1 + size :]
+            slope = jnp.where(lost[..., None] | ~jnp.isfinite(slope), 0.0, slope)
+            weight = jnp.where(robust, huber_weight(white[0]), 1.0)
+            with jax.default_matmul_precision("highest"):
+                gradient = jnp.einsum("pbk,bk->p", slope, white[0] * weight)
+                hessian = jnp.einsum("pbk,qbk->pq", slope, slope * weight)
+            return robust_cost(white[0], robust), gradient, hessian
+
+        self._functions = {"cost": jax.jit(jax.vmap(cost, in_axes=(0, None, None))),
+                           "quadratic": jax.jit(jax.vmap(quadratic, in_axes=(0, None, None)))}
+        self.compiled: dict[Any, Future[Any]] = {}
+
+    def compile(self, name: str, size: int, parameters: int, arrays: Any) -> Future[Any]:
+        """The function for so many sets, compiled in a thread of its own."""
+        leaves, structure = jax.tree.flatten(arrays)
+        key = name, size, structure, tuple(leaf.shape for leaf in leaves)
+        if key not in self.compiled:
+            u = jax.ShapeDtypeStruct((size, parameters), jnp.result_type(float))
+            self.compiled[key] = _COMPILERS.submit(
+                lambda: self._functions[name].lower(u, arrays, np.bool_(False)).compile())
+        return self.compiled[key]
+
+
+class NormalEquations:
+    """Sums over the residuals of one objective."""
+
+    def __init__(self, objective: Traceable, at_once: int):
+        """`at_once` is the number of sets that are replayed together."""
+        compiled = objective.replay.compiled
+        if objective.kind not in compiled:
+            compiled[objective.kind] = Sums(objective)
+        self.sums: Sums = compiled[objective.kind]
+        self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
+        parameters = objective.space.size
+        many = max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))
+        self.sizes = {"cost": (at_once,), "quadratic": (min(FEW, many), many)}
+        # A search needs all of them: they are compiled side by side.
+        self._compiled = {(name, size): self.sums.compile(name, size, parameters, self._arrays)
+                          for name, sizes in self.sizes.items() for size in sizes}
+
+    def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray:
+        """Sum (N,) of squares, or of the Huber loss, at unit coordinates (N, P)."""
+        return self._call("cost", u, robust)
+
+    def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cost (N,), half its gradient (N, P) and half its Hessian (N, P, P) by Gauss and Newton, at u (N, P)."""
+        return self._call("quadratic", u, robust)
+
+    def _call(self, name: str, u: np.ndarray, robust: bool) -> Any:
+        """What a function gives for each of u (N, P), so many of them at a time; the last call is filled up."""
+        sizes = self.sizes[name]
+        size = next((size for size in sizes if size >= len(u)), sizes[-1])
+        function = self._compiled[name, size].result()
+        padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % size, axis=0)])
+        parts = [function(jnp.asarray(padded[i : i + size], jnp.result_type(float)), self._arrays, np.bool_(robust))
+                 for i in range(0, len(padded), size)]
+        return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf, float) for leaf in leaves])[: len(u)],
+                            *parts)
+
+
+def summed_there(replay: Any) -> bool:
+    """Whether an accelerator computes this replay and can sum what it gives, so that drives need not be fetched."""
+    return not on_processor() and hasattr(replay, "traced")
+
+
+def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
+    """Let an accelerator compile side by side what a search by these objectives will need, and what it fetches of a
+    replay with values (P,); a processor compiles in seconds what it comes to."""
+    if summed_there(replay):
+        _COMPILERS.submit(replay.simulate, values[None])
+        for objective in objectives:
+            _ = objective.equations
+
+
+def make_equations(objective: Traceable) -> NormalEquations | None:
+    """Those of an objective whose replay an accelerator computes; None on a processor, where residuals are at hand."""
+    replay = objective.replay
+    if not summed_there(replay):
+        return None
+    return NormalEquations(objective, max(min(DRIVES // replay.drives, STATES // replay.states), 1))

@@ -1,0 +1,336 @@
+"""What is minimised: the paper's J (sum of position RMSE), and a weighted least-squares residual over all channels.
+
+The residual of a channel is divided by its noise scale: the spread between replicates where the log has them, else a
+stated default that is replaced by the residual's own size after a first fit. The start pose of a trial is itself
+measured with noise; its three errors enter the residual linearly, so they are solved for in closed form with that
+noise as prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
+from sysid.errors.prior import Prior
+from sysid.errors.robust import huber_weight
+from sysid.errors.space import Space
+from sysid.logs.log import Trial
+from sysid.logs.metrics import replicate_noise
+from sysid.replay.arrays import added, namespace
+from sysid.replay.records import Measured, Simulated
+
+DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
+"""x, y [m], yaw [rad] and x, y, yaw, v [m/s], omega [rad/s]; only their ratio matters until they are re-estimated."""
+MIN_NOISE = 1e-3  # keeps a noiseless channel from dominating
+HUGE = 1e3  # residual, in noise scales, of a sample of a diverged simulation
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation per channel, and where it comes from."""
+
+    pose: np.ndarray  # (3,)
+    odometry: np.ndarray  # (5,)
+    source: str  # "replicates", "defaults" or "residuals"
+
+    def as_dict(self) -> dict[str, float]:
+        names = ["ground_truth.x", "ground_truth.y", "ground_truth.yaw",
+                 "odometry.x", "odometry.y", "odometry.yaw", "odometry.v", "odometry.omega"]
+        return {name: float(value) for name, value in zip(names, [*self.pose, *self.odometry], strict=True)}
+
+
+def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
+    """Noise from the replicates among `trials`; channels without replicates keep the defaults."""
+    found = replicate_noise(trials)
+    if found is None:
+        return Noise(DEFAULT_NOISE["ground_truth"], DEFAULT_NOISE["odometry"], "defaults")
+
+    def known(channel: str) -> np.ndarray:
+        return np.where(np.isfinite(found[channel]), np.maximum(found[channel], MIN_NOISE), DEFAULT_NOISE[channel])
+
+    pose, odometry = known("ground_truth"), known("odometry")
+    pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))  # along and across the start heading: a later turn swaps them
+    odometry[:2] = np.sqrt(np.mean(odometry[:2] ** 2))
+    return Noise(pose, odometry, "replicates")
+
+
+class Told(Protocol):
+    """`Objective`, or `sysid.errors.bin_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def trials(self) -> tuple[Trial, ...]: ...
+
+    @property
+    def prior(self) -> Prior | None: ...
+
+    @property
+    def counted(self) -> int: ...
+
+    def residuals(self, u: np.ndarray) -> np.ndarray: ...
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def renewed(self, u: np.ndarray) -> Any: ...
+
+    def pieces(self, count: int) -> np.ndarray: ...
+
+    def own_frame(self, residual: np.ndarray) -> np.ndarray: ...
+
+
+class Replays(Protocol):
+    """`sysid.replay.rollout.Replay`, or what stands in for it."""
+
+    def simulate(self, values: np.ndarray) -> Simulated: ...
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]: ...
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Errors of N parameter sets against B trials, in unit coordinates of `space`."""
+
+    replay: Replays
+    space: Space
+    trials: tuple[Trial, ...]
+    measured: Measured
+    noise: Noise
+    prior: Prior | None = None
+    """Its P residuals are the last ones of the first trial."""
+
+    @property
+    def counted(self) -> int:
+        """Number of measured values."""
+        return int(sum(mask.sum() for mask in self._masks))
+
+    @cached_property
+    def _masks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Masks of pose (B, M, 3) and odometry (B, L, 5) without what the start was averaged from: counted once."""
+        pose, odometry = self.measured.pose_mask.copy(), self.measured.odometry_mask.copy()
+        for i, trial in enumerate(self.trials):
+            for mask, stream, known in ((pose, trial.ground_truth, trial.start.position_sigma),
+                                        (odometry, trial.odometry, trial.start.odometry_position_sigma)):
+                if stream is not None and known > 0:
+                    mask[i, : int((stream.t <= trial.start.rest).sum()), :3] = 0.0
+        return pose, odometry
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What it may differ in from others of the same replay and `kind`."""
+        return self.noise.pose, self.noise.odometry, self.prior
+
+    @property
+    def kind(self) -> Any:
+        """As in `sysid.errors.normal_equations`."""
+        return Objective
+
+    def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
+        """The same with other `arrays`."""
+        noise = replace(self.noise, pose=arrays[0], odometry=arrays[1])
+        return replace(self, noise=noise, prior=arrays[2])
+
+    @cached_property
+    def equations(self) -> NormalEquations | None:
+        """What an accelerator computes of the residuals by itself."""
+        return make_equations(self)
+
+    def with_noise(self, noise: Noise) -> Objective:
+        return replace(self, noise=noise)
+
+    def simulate(self, u: np.ndarray) -> Simulated:
+        """Replay at unit coordinates (N, P)."""
+        return self.replay.simulate(self.space.to_values(u))
+
+    def paper_cost(self, u: np.ndarray) -> np.ndarray:
+        """J (N,) [m] = sum over trials of the position RMSE: of the outside pose, or of the odometry without one."""
+        if summed_there(self.replay):
+            return np.asarray(self._paper_cost_there(jnp.asarray(u, jnp.result_type(float))), float)
+        return np.asarray(self._paper_cost_of(self.simulate(u)))
+
+    @cached_property
+    def _paper_cost_there(self) -> Callable[[jax.Array], jax.Array]:
+        """J on an accelerator, where drives stay; compiled anew for each number of sets."""
+        replay: Any = self.replay
+        return jax.jit(lambda u: self._paper_cost_of(replay.traced(self.space.to_values(u))))
+
+    def _paper_cost_of(self, simulated: Simulated) -> Any:
+        xp, outside = namespace(simulated.pose), self.measured.pose_mask[..., 0].sum() > 0
+        values, target, mask = (
+            (simulated.pose, self.measured.pose, self.measured.pose_mask) if outside
+            else (simulated.odometry, self.measured.odometry, self.measured.odometry_mask))
+        error = xp.square(values[..., :2] - target[..., :2]).sum(-1) * mask[..., 0]
+        samples = np.maximum(mask[..., 0].sum(-1), 1)
+        cost = xp.sqrt(error.sum(-1) / samples).sum(-1)
+        return xp.where(self.bad(simulated).any(-1) | ~xp.isfinite(cost), HUGE, cost)
+
+    def weighted_cost(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
+        """Mean squared residual (N,), 1 at the noise level; `simulated` is what `simulate(u)` gave, if it is known."""
+        return np.square(self.residuals(u, simulated)).sum((-1, -2)) / self.counted
+
+    def residuals(self, u: np.ndarray, simulated: Simulated | None = None) -> np.ndarray:
+        """(N, B, K) whitened residuals; masked samples are 0. K counts pose, odometry and start-pose terms."""
+        residual, _ = self._whiten(self.simulate(u) if simulated is None else simulated, None)
+        return residual if self.prior is None else append_prior(residual, self.prior.residual(u))
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (N, B, K) and their derivatives by u (N, B, K, P)."""
+        simulated, derivative = self.replay.jacobian(self.space.to_values(u))
+        residual, jacobian = self._whiten(simulated, derivative)
+        assert jacobian is not None
+        jacobian = jacobian * self.space.slope(u)[:, None, None, :]
+        if self.prior is None:
+            return residual, jacobian
+        slope = np.tile(np.diag(self.prior.slope), (len(u), 1, 1))
+        return append_prior(residual, self.prior.residual(u)), append_prior(jacobian, slope)
+
+    def renewed(self, u: np.ndarray) -> Objective:
+        """The same with the noise that u (P,) leaves, where it was not known."""
+        return self.with_noise(self.residual_noise(u)) if self.noise.source == "defaults" else self
+
+    def pieces(self, count: int) -> np.ndarray:
+        """(K,) in which of so many pieces of its drive each residual is, errors of starts apart."""
+        tables = (self.measured.pose, self.measured.odometry)
+        piece = np.concatenate([np.repeat(np.arange(table.shape[1]) * count // max(table.shape[1], 1), table.shape[2])
+                                for table in tables])
+        return piece
+
+    def own_frame(self, residual: np.ndarray) -> np.ndarray:
+        """(B, K) residuals of pose and odometry; those of the outside position along and across the start's heading."""
+        tables = (self.measured.pose, self.measured.odometry)
+        sizes = [table[0].size for table in tables]
+        pose = residual[:, : sizes[0]].reshape(tables[0].shape)
+        yaw = np.array([trial.start.yaw for trial in self.trials])[:, None]
+        x, y = pose[..., 0], pose[..., 1]
+        turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
+        return np.concatenate([*turned, residual[:, sizes[0] : sum(sizes)]], axis=1)
+
+    def residual_noise(self, u: np.ndarray) -> Noise:
+        """Noise re-estimated as the size of the residual (robustly) at one point u (P,)."""
+        simulated = self.simulate(u[None])
+        scales = []
+        for values, target, mask in ((simulated.pose[0], self.measured.pose, self.measured.pose_mask),
+                                     (simulated.odometry[0], self.measured.odometry, self.measured.odometry_mask)):
+            error = np.abs(values - target)
+            known = [error[..., c][mask[..., c] > 0] for c in range(error.shape[-1])]
+            scales.append(np.array([1.4826 * np.median(one) if len(one) else np.nan for one in known]))
+        pose = np.where(np.isfinite(scales[0]), np.maximum(scales[0], MIN_NOISE), self.noise.pose)
+        odometry = np.where(np.isfinite(scales[1]), np.maximum(scales[1], MIN_NOISE), self.noise.odometry)
+        pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))
+        return Noise(pose, odometry, "residuals")
+
+    def channel_residuals(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """Whitened residual (B, M) of each channel at one point u (P,), nan where not measured."""
+        residual = self.residuals(u[None])[0]
+        pose_size = self.measured.pose[0].size
+        pose = residual[:, :pose_size].reshape(self.measured.pose.shape)
+        odometry_size = self.measured.odometry[0].size
+        odometry = residual[:, pose_size : pose_size + odometry_size].reshape(self.measured.odometry.shape)
+        columns = [*np.where(self._masks[0] > 0, pose, np.nan).transpose(2, 0, 1),
+                   *np.where(self._masks[1] > 0, odometry, np.nan).transpose(2, 0, 1)]
+        return dict(zip(self.noise.as_dict(), columns, strict=True))
+
+    def bad(self, simulated: Simulated) -> Any:
+        """(N, B) replays that diverged."""
+        xp = namespace(simulated.pose)
+        finite = xp.isfinite(simulated.pose).all((-1, -2)) & xp.isfinite(simulated.odometry).all((-1, -2))
+        return (simulated.diverged > 0.5) | ~finite
+
+    def _whiten(self, simulated: Simulated, derivative: Simulated | None) -> tuple[np.ndarray, np.ndarray | None]:
+        measured, noise, xp = self.measured, self.noise, namespace(simulated.pose)
+        count, trials = simulated.pose.shape[:2]
+        bad = self.bad(simulated)[:, :, None]
+        pose_weight, odometry_weight = (
+            mask / scale for mask, scale in zip(self._masks, (noise.pose, noise.odometry), strict=True))
+
+        def flat(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+            return xp.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
+                                   odometry.reshape(count, trials, -1, *odometry.shape[4:])], axis=2)
+
+        weights = flat(xp.broadcast_to(pose_weight, simulated.pose.shape),
+                       xp.broadcast_to(odometry_weight, simulated.odometry.shape)) > 0
+        residual = flat((simulated.pose - measured.pose) * pose_weight,
+                        (simulated.odometry - measured.odometry) * odometry_weight)
+        residual = xp.where(bad, HUGE * weights, residual)
+        jacobian = None
+        if derivative is not None:
+            jacobian = flat(derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None])
+            jacobian = np.where(bad[..., None] | ~np.isfinite(jacobian), 0.0, jacobian)
+        return self._solve_start(simulated, residual, jacobian)
+
+    def _solve_start(
+        self, simulated: Simulated, residual: np.ndarray, jacobian: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
+
+        A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
+        linear map of r that is applied to the Jacobian as well. Samples that are far off (`gradient.HUBER`) weigh less
+        in it: one start must not follow them, when all samples suffer from it. The odometry, which is counted from its
+        own standstill, has such an error of its own.
+        """
+        noise, starts = self.noise, [trial.start for trial in self.trials]
+        begin, xp = 0, namespace(simulated.pose)
+        for values, weight, origin, sigmas in (
+            (simulated.pose, self._masks[0] / noise.pose, [(one.x, one.y) for one in starts],
+             [(one.position_sigma, one.position_sigma, one.yaw_sigma) for one in starts]),
+            (simulated.odometry, self._masks[1] / noise.odometry, np.zeros((len(starts), 2)),
+             [(one.odometry_position_sigma, one.odometry_position_sigma, one.odometry_yaw_sigma) for one in starts]),
+        ):
+            part = slice(begin, begin + values[0, 0].size)
+            begin = part.stop
+            if not np.any(sigmas):
+                continue
+            sigma = np.maximum(sigmas, 1e-9)  # (B, 3)
+            design = _start_design(values, np.asarray(origin), weight)
+            gain = _start_gain(design, huber_weight(residual[:, :, part]), sigma)  # (N, B, 3, K)
+            error = xp.einsum("nbik,nbk->nbi", gain, residual[:, :, part])
+            residual = xp.concatenate([residual, error / sigma], axis=2)
+            residual = added(residual, (..., part), xp.einsum("nbki,nbi->nbk", design, error))
+            if jacobian is not None:
+                slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, part])
+                jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
+                jacobian[:, :, part] += np.einsum("nbki,nbip->nbkp", design, slope)
+        return residual, jacobian
+
+
+def _start_design(values: Any, origin: np.ndarray, weight: np.ndarray) -> Any:
+    """Whitened derivative (N, B, K, 3) of poses by an error of their start.
+
+    Args:
+        values: (N, B, M, C) of which the first three columns are x, y, yaw.
+        origin: (B, 2) where they start.
+        weight: (B, M, C) one over the noise, 0 where masked.
+    """
+    xp = namespace(values)
+    arm = xp.nan_to_num(values[..., :2] - origin[:, None, :])  # (N, B, M, 2)
+    turned = xp.stack([-arm[..., 1], arm[..., 0], xp.ones_like(arm[..., 0])], axis=-1)  # of x, y, yaw
+    turned = xp.concatenate([turned, xp.zeros_like(values[..., 3:])], axis=-1)
+    columns = [xp.broadcast_to(np.eye(values.shape[-1])[i], values.shape) for i in range(2)]
+    design = xp.stack([*columns, turned], axis=-1)
+    return (design * weight[..., None]).reshape(*values.shape[:2], -1, 3)
+
+
+def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
+    weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
+    return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
+
+
+def without_prior(objective: Told, table: np.ndarray) -> np.ndarray:
+    """Table (B, K, ...) of the measurements alone."""
+    return table if objective.prior is None else table[:, : -objective.space.size]
+
+
+def append_prior(table: np.ndarray, more: np.ndarray) -> np.ndarray:
+    """Table (N, B, K, ...) with more (N, P, ...) behind the columns of its first trial and zeros behind the others'."""
+    xp = namespace(table)
+    behind = added(xp.zeros((*table.shape[:2], *more.shape[1:])), (slice(None), 0), more)
+    return xp.concatenate([table, behind], axis=2)

@@ -1,0 +1,76 @@
+"""What is known of a vehicle before its log is fitted: the bounds of its parameters, or a vehicle file.
+
+A parameter of which a log says next to nothing would follow folds of the cost to an end of its range, and take along
+what the log tells only together with it. Bounds alone, as a normal distribution as wide as they are, hold it back; what
+a log tells they hardly move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from flax import struct
+
+from sysid.errors.space import Space
+
+SPREAD = 0.05
+"""Day-to-day standard deviation of a parameter, as a share of its value: an assumption, printed with the fit."""
+LEAST = 0.003  # of the range: what no parameter is known better than
+UNKNOWN = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known (uniform)
+QUANTILE = 1.645  # of the normal distribution, of the 90 % intervals in vehicle files
+
+
+@struct.dataclass
+class Prior:
+    """Normal distribution of the unit coordinates."""
+
+    mean: np.ndarray  # (P,)
+    sd: np.ndarray  # (P,)
+    share: float = 1.0
+    """Factor on its precision: residuals of drives are autocorrelated and count more often than they tell."""
+
+    def residual(self, u: np.ndarray) -> np.ndarray:
+        """(N, P) of unit coordinates (N, P), to be squared."""
+        return (u - self.mean) * self.slope
+
+    @property
+    def slope(self) -> np.ndarray:
+        """(P,) derivative of the residual."""
+        return self.share**0.5 / self.sd
+
+    @property
+    def precision(self) -> np.ndarray:
+        """(P, P), as it is weighed."""
+        return np.diag(self.slope**2)
+
+
+def bounds_alone(space: Space) -> Prior:
+    """Nothing but the bounds is known: as wide as a uniform distribution within them."""
+    return Prior(np.full(space.size, 0.5), np.full(space.size, UNKNOWN))
+
+
+def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], spread: float = SPREAD) -> Prior:
+    """Prior around the space's initial values.
+
+    A parameter with an interval is known that well, and may differ by `spread` of its value on another day. One
+    without was not told by its log, and only its bounds are known.
+    """
+    mean = space.to_unit(space.initial)
+    slope = np.maximum(space.slope(mean), 1e-12)
+    sd = np.full(space.size, UNKNOWN)
+    for i, name in enumerate(space.names):
+        if name in intervals:
+            low, high = intervals[name]
+            known = (high - low) / (2 * QUANTILE) / slope[i]
+            size = abs(space.initial[i]) if space.initial[i] else space.high[i] - space.low[i]
+            sd[i] = np.clip(np.hypot(known, spread * size / slope[i]), LEAST, UNKNOWN)
+    return Prior(mean, sd)
+
+
+def moved(prior: Prior, space: Space, u: np.ndarray) -> list[dict[str, Any]]:
+    """How far each parameter went from where it was, in standard deviations, and whether that is within 90 %."""
+    before, after, distance = space.to_values(prior.mean), space.to_values(u), (u - prior.mean) / prior.sd
+    return [{"name": name, "before": float(before[i]), "after": float(after[i]), "deviations": float(distance[i]),
+             "within": bool(abs(distance[i]) <= QUANTILE)} for i, name in enumerate(space.names)]

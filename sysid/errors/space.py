@@ -1,0 +1,221 @@
+"""Which parameters are searched, between which bounds, and on which scale.
+
+The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sysid.replay.arrays import namespace
+from whill_mjx.vehicle.specs import VehicleSpec
+
+STEP = 0.01
+"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+
+LOG_SPAN = 10.0
+# Parameters that no driving log tells, or that only act through another one; they keep their value unless named.
+FIXED = {
+    "air_drag.area": "acts only as a product with air_drag.c_d",
+    "pid_drive.integral_limit": "never reached in ordinary driving",
+    "rolling_contact.grip": "part of the model, not of the vehicle",
+    "body.mass": "acts only as a ratio to forces that are fitted; weigh the vehicle",
+    "body.com_z": "has next to no effect on level ground",
+}
+NUISANCE = {
+    "torque_drive.period": "it is fitted for what others go along with; the cost bends too little for an interval",
+}
+"""Searched, but never reported as told: what its curvature at one point says holds nowhere else."""
+BENT = ("body.com_z",)
+"""Of which a log tells the less or the more by their own value: the load that driving shifts goes with the height."""
+LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns tell how high the mass lies
+
+
+RATIO, YAW, ALONG = "wheel_inertia.ratio", "body.yaw_inertia", "body.com_x"
+TERMS = {RATIO: "drives tell the inertia that motors turn, of which that of the wheels is one of two terms"}
+"""Searched by their logarithm, but told as they are: intervals reach as far down as up."""
+PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torque_drive.kff", "wheel_damping.damping",
+               "rolling_resistance.mu_r", "yaw_scrub.torque", "lateral_damping.c_front")
+"""Torques and forces that drives tell per inertia that they speed up, wheels included."""
+
+
+@dataclass(frozen=True)
+class Turned:
+    """What one side's motor turns, from the nominal vehicle."""
+
+    mass: float
+    """Inertia of half of the vehicle, at the wheel [kg m^2]."""
+    wheel: float
+    """Nominal spin inertia of the wheels of one side [kg m^2]."""
+    yaw: float
+    """By how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]."""
+    driven: float
+    """Where the driven wheels are in the chassis frame [m]: centrifugal force tells how far before them the mass is."""
+
+    @classmethod
+    def of(cls, spec: VehicleSpec) -> Turned:
+        """That of a vehicle."""
+        yaw = spec.track**2 / 2 / spec.wheel_radius**2
+        return cls(spec.mass / 2 * spec.wheel_radius**2, spec.wheel_inertia, yaw, spec.reference_x)
+
+    @property
+    def besides(self) -> dict[str, tuple[float, float]]:
+        """What is told per inertia, as a constant and a share of the wheel's inertia that count besides its value."""
+        return {**dict.fromkeys(PER_INERTIA, (0.0, 0.0)), YAW: (0.0, self.yaw), ALONG: (-self.driven, 0.0)}
+
+
+@dataclass(frozen=True)
+class Space:
+    """P searched parameters."""
+
+    names: tuple[str, ...]
+    low: np.ndarray  # (P,)
+    high: np.ndarray  # (P,)
+    initial: np.ndarray  # (P,)
+    log: np.ndarray  # (P,) bool
+    fixed: tuple[tuple[str, str], ...] = ()
+    """Names that keep their value, each with the reason."""
+    turned: Turned | None = None
+    """Of the vehicle, where it is one."""
+
+    def __post_init__(self) -> None:
+        for name, low, high, value in zip(self.names, self.low, self.high, self.initial, strict=True):
+            if not low < high:
+                raise ValueError(f"{name}: bounds {low:g} to {high:g}; low must be below high.")
+            if not low <= value <= high:
+                raise ValueError(f"{name}: initial value {value:g} is outside {low:g} to {high:g}. Widen the bounds.")
+            if not np.isfinite([low, high, value]).all():
+                raise ValueError(f"{name}: bounds {low:g} to {high:g} and value {value:g} must be finite.")
+
+    @property
+    def size(self) -> int:
+        return len(self.names)
+
+    def to_values(self, u: Any) -> Any:
+        """Values (..., P) of unit coordinates (..., P), which are clipped to [0, 1]."""
+        xp = namespace(u)
+        u = xp.clip(u, 0.0, 1.0)
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        return xp.where(self.log, low * (high / low) ** u, self.low + u * (self.high - self.low))
+
+    def to_unit(self, values: np.ndarray) -> np.ndarray:
+        """Unit coordinates (..., P) of values (..., P)."""
+        return self._unit(np.clip(values, self.low, self.high))
+
+    def _unit(self, values: np.ndarray) -> np.ndarray:
+        """Those of values (..., P) that may lie outside the range."""
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        logarithm = np.log(np.maximum(np.where(self.log, values, 1.0) / low, 1e-300)) / np.log(high / low)
+        return np.where(self.log, logarithm, (values - self.low) / (self.high - self.low))
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """d value / d u (..., P)."""
+        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
+
+    def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Unit coordinates (N, P), which may lie outside the range, a step (N, P) from u (N, P): along the valley of
+        all that is told per inertia.
+
+        Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
+        wheels' is one of two terms: in these coordinates that valley is curved, the more so the lighter the vehicle,
+        and a straight step of one standard error leads far up its sides. To first order the step is as it is.
+        """
+        end = u + step
+        if self.turned is None or RATIO not in self.names:
+            return end
+        at, moves, ratio = self.to_values(u), self.slope(u) * step, self.names.index(RATIO)
+        wheel, later = (self.turned.wheel * self.to_values(x)[:, ratio] for x in (u, end))
+        heavier = self.turned.wheel * moves[:, ratio]
+        inertia, grown = self.turned.mass + wheel, self.turned.mass + later
+        besides, values = self.turned.besides, at.copy()
+        for i, name in enumerate(self.names):
+            if name in besides:
+                constant, share = besides[name]
+                told = (at[:, i] + constant + share * wheel) / inertia
+                move = (moves[:, i] + share * heavier - told * heavier) / inertia
+                told = told * np.exp(move / told) if self.log[i] else told + move
+                values[:, i] = told * grown - constant - share * later
+        return np.where([name in besides for name in self.names], self._unit(values), end)
+
+    def subset(self, keep: Sequence[str]) -> Space:
+        """The space of the named parameters only."""
+        index = [self.names.index(name) for name in keep]
+        return replace(self, names=tuple(keep), low=self.low[index], high=self.high[index],
+                       initial=self.initial[index], log=self.log[index])
+
+    def without(self, name: str, reason: str) -> Space:
+        """The space in which one parameter keeps its value."""
+        kept = self.subset([one for one in self.names if one != name])
+        return replace(kept, fixed=(*self.fixed, (name, reason)))
+
+
+# Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
+FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
+           "torque_drive.limit": (1 / 10, 30.0)}
+LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-forward make up for it
+
+
+def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
+    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track, and
+    a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
+    scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
+              for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
+    load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
+    middle, length, width = (spec.rear_x + spec.front_x) / 2, 0.45 * spec.wheelbase, 0.2 * spec.track
+    return {**scaled, "torque_drive.kff": (0.0, LOSS * load), "wheel_damping.damping": (0.0, LOSS * load),
+            "yaw_scrub.torque": (0.0, 9.81 * spec.mass * spec.track / 4),
+            "body.com_x": (middle - length, middle + length), "body.com_y": (-width, width),
+            "body.com_z": (-spec.wheel_radius, 1.5 * spec.track - spec.wheel_radius)}
+
+
+def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
+    """What a fit searches unless told otherwise: all but `FIXED`, and the height of the mass where wheels may skid.
+
+    Args:
+        asked: effects that were asked for; lateral damping of driven wheels, which slip besides, is searched only then.
+    """
+    from whill_mjx.vehicle.parameters import describe
+
+    about = describe(params)
+    left_out = set(FIXED)
+    if LOADED in about:
+        left_out.discard("body.com_z")
+        if "lateral_damping" not in asked:
+            left_out.add("lateral_damping.c_rear")
+    return [name for name in about if name not in left_out]
+
+
+def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
+    """Space of a vehicle's parameters, with their described bounds or those of `vehicle_bounds`.
+
+    Args:
+        params: `VehicleParams`; their values are where the search starts.
+        spec: its nominal geometry and mass.
+        names: what to search; by default everything but `FIXED`.
+    """
+    from whill_mjx.vehicle.parameters import describe, get_values
+
+    about = describe(params)
+    if names is None:
+        names = [name for name in about if name not in FIXED]
+    unknown = sorted(set(names) - set(about))
+    if unknown:
+        raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")
+    initial = np.asarray(get_values(params, names), float)
+    bounds = vehicle_bounds(names, initial, spec)
+    low = np.array([bounds.get(name, (about[name].low, 0))[0] for name in names], float)
+    high = np.array([bounds.get(name, (0, about[name].high))[1] for name in names], float)
+    low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range
+    log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
+    kept = [(name, FIXED.get(name, "not selected")) for name in about if name not in names]
+    return Space(tuple(names), low, high, initial, log, tuple(kept), Turned.of(spec))
+
+
+def is_delay(name: str) -> bool:
+    """Whether a parameter shifts time: its error landscape has steps, so it is profiled on a grid as well."""
+    return "delay" in name or "latency" in name

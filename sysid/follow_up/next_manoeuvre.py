@@ -1,0 +1,338 @@
+"""The next drive: the one that tells apart effects which these drives do not.
+
+Rivals are an accepted effect, the others of its class, and those whose refit came close to it. Each is simulated at its
+own fitted values on every drive of a library. From the difference of two, what base parameters within their day-to-day
+spread and the other's own coordinates can absorb is projected out; what is left, in standard deviations of the noise,
+is how well a drive tells them apart. The drive with the largest worst case is proposed. All drives last as long as the
+log's longest trial: they go through the replay that the search has compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
+from sysid.logs.metrics import ideal_replay
+from sysid.missing.catalogue import Hypothesis, base_values
+from sysid.missing.drives import Drives
+from sysid.missing.evidence import with_values
+from sysid.missing.joint_fit import Refit
+from sysid.missing.joint_fit import Start as FitStart
+from sysid.missing.refit import STEP_Q, Refitter
+from sysid.missing.signatures import base_columns
+from sysid.pages.loop_page import command_of
+from sysid.verdict.result import Result
+from sysid.verdict.vehicles import refitter_of
+from whill_mjx.effects import EFFECTS, card_of
+from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
+from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
+
+FILE = "next_command.csv"
+TIE = 0.2
+"""A refit whose gain falls short of the best one's by less than this share is a rival."""
+LEAST, ENOUGH = 3.0, 5.0
+"""Standard deviations from which a drive counts as telling two effects apart, and that repetitions should reach."""
+MOST_REPEATS = 9
+SIZES = (1.0, 0.5, 0.2)
+"""Shares of the log's largest speed and yaw rate that every manoeuvre is tried at."""
+HEADINGS = (0.0, 90.0, 180.0, 270.0)
+"""Start headings [degrees] that are tried where a rival is fixed in the room."""
+FRACTIONS = (1.0, 0.75, 0.5, 0.35, 0.2)  # of the time in motion, where the room is too small
+REFINED = 24  # drives for which the absorbed part is computed as well
+POLISH = 3  # iterations of the refit of a rival that the search has not refitted
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive of the library: a manoeuvre and how it is driven."""
+
+    manoeuvre: str
+    v: float
+    """Speed [m/s]."""
+    omega: float
+    """Yaw rate [rad/s]."""
+    seconds: float
+    """Time in motion [s]."""
+    start: tuple[float, float, float]
+    """x, y [m] and heading [rad] in the room."""
+    dt: float = 0.1
+    """Command period [s]."""
+
+    @property
+    def command(self) -> Command:
+        """The commands, with a second of standstill before and after."""
+        return make_command(self.manoeuvre, self.v, self.omega, self.seconds, self.dt)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One explanation of the drives."""
+
+    effect: str
+    fit: Refit
+
+
+def next_manoeuvre(result: Result) -> dict[str, Any] | None:
+    """The drive that best tells the rivals of a verdict apart; None where the verdict has none.
+
+    Returns:
+        `name`, `parameters` {v [m/s], omega [rad/s], seconds, dt [s]} and `start` {x, y [m], heading [rad]} of the
+        drive, `splits` (the effects that it tells apart), `expected_separation` (standard deviations, the worst pair of
+        these, one drive), `replicates` (drives after which that is `ENOUGH`), `file`, and `not_split`: pairs of effects
+        that no drive tells apart, with the best `separation` and the `sensor` that would. Where no drive tells
+        anything, name, parameters, start and file are None.
+    """
+    rounds = rivals_of(result)
+    if not rounds:
+        return None
+    refitter = refitter_of(result)
+    groups = [_refitted(result, refitter, number, each) for number, each in rounds]
+    pairs = [pair for group in groups for pair in combinations(group, 2)]
+    room_fixed = any(EFFECTS[one.effect].room_fixed for group in groups for one in group)
+    library = drive_library(result, HEADINGS if room_fixed else HEADINGS[:1])
+    separation, library = separations(result, refitter, groups, library)
+    return _proposal(pairs, separation, library)
+
+
+def rivals_of(result: Result) -> list[tuple[int, list[tuple[str, Refit | None]]]]:
+    """Accepted effects with rivals: number, and effects with their refits, the accepted one first."""
+    found = result.search
+    if found.verdict != "named":
+        return []
+    out = []
+    for number, (best, names) in enumerate(zip(found.accepted, found.classes, strict=True)):
+        its_round = next(each for each in found.rounds if any(one is best for one in each))  # some accept nothing
+        tried = {one.hypothesis.effect: one for one in its_round}
+        near = [name for name, one in tried.items() if one.gain > (1 - TIE) * best.gain]
+        every = dict.fromkeys([best.hypothesis.effect, *names, *near])
+        if len(every) > 1:
+            out.append((number, [(name, tried[name].refit if name in tried else None) for name in every]))
+    return out
+
+
+def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[tuple[str, Refit | None]]
+              ) -> list[Rival]:
+    """Rivals of accepted effect `number`; those that the search took for alike and did not refit are refitted now."""
+    found, starts = result.search, {}
+    chosen = found.accepted[number].refit
+    before = np.concatenate([[], *chosen.split[:-1]])
+    for effect in (name for name, fit in rivals if fit is None):
+        mine = [i for i, one in enumerate(result.hypotheses) if one.effect == effect]
+        best = max(mine, key=lambda i: found.scan.gain[i])
+        starts[effect] = FitStart((*chosen.hypotheses[:-1], result.hypotheses[best]), chosen.u,
+                                  np.concatenate([before, found.scan.q[best]]))
+    more = dict(zip(starts, refitter.fit_all(list(starts.values()), POLISH), strict=True)) if starts else {}
+    return [Rival(name, more[name] if fit is None else fit) for name, fit in rivals]
+
+
+def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[Drive]:
+    """The library: every manoeuvre at several sizes and start headings [degrees], within the speeds, the space and the
+    time that the training trials took up."""
+    trials = result.log.training
+    v = max(max(float(trial.command.v.max()) for trial in trials), 0.1)
+    omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(result.log.spec.omega_max, 0.5)
+    longest = max(trial.duration for trial in trials)
+    steps = np.concatenate([np.diff(trial.command.t) for trial in trials])
+    dt = round(float(np.clip(np.median(steps), 0.02, 0.2)), 3)
+    low, high = _space(trials)
+    found: dict[tuple[Any, ...], Drive] = {}
+    for name in (*MANOEUVRES, *OWN):
+        for size in SIZES if name != "standstill" else SIZES[:1]:
+            speed = min(size * v, -result.log.spec.v_min) if name in REVERSING else size * v
+            if speed < 0.02:
+                continue
+            for heading in headings:
+                drive = _fitting(name, speed, size * omega, longest - 2 * STANDSTILL, math.radians(heading), dt,
+                                 low, high, longest)
+                if drive is not None:
+                    command = drive.command
+                    found.setdefault((command.v.tobytes(), command.omega.tobytes(), heading), drive)
+    return list(found.values())
+
+
+def _space(trials: Sequence[Trial]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,), (2,) of the space that trials took up [m]: by the outside pose, else by their commands."""
+    paths = []
+    for trial in trials:
+        truth = trial.ground_truth or ideal_replay(_as_trial(trial.command, trial.start, trial.duration, 200, 200)
+                                                   ).ground_truth
+        assert truth is not None
+        paths.append(np.column_stack([truth.x, truth.y]))
+    points = np.concatenate(paths)
+    return points.min(0), points.max(0)
+
+
+def _fitting(name: str, v: float, omega: float, seconds: float, heading: float, dt: float, low: np.ndarray,
+             high: np.ndarray, longest: float) -> Drive | None:
+    """A manoeuvre as long as time and space allow, placed in the middle of the space; None where none fits."""
+    for fraction in FRACTIONS:
+        drive = Drive(name, v, omega, math.floor(10 * fraction * seconds + 1e-9) / 10, (0.0, 0.0, heading), dt)
+        command = drive.command
+        if command.t[-1] + dt > longest + 1e-9:
+            continue
+        ideal = ideal_replay(_as_trial(command, Start(yaw=heading), longest, 200, 200)).ground_truth
+        assert ideal is not None
+        path = np.column_stack([ideal.x, ideal.y])
+        if (np.ptp(path, axis=0) <= high - low + 1e-9).all():
+            x, y = (low + high) / 2 - (path.min(0) + path.max(0)) / 2
+            return replace(drive, start=(float(x), float(y), heading))
+    return None
+
+
+def _as_trial(command: Command, start: Start, duration: float, poses: int, readings: int) -> Trial:
+    """A trial yet to be measured, with so many samples of outside pose and odometry; none for 0."""
+    t, s = np.linspace(0.0, duration, max(poses, 2)), np.linspace(0.0, duration, max(readings, 2))
+    truth = PoseStream(t, 0 * t, 0 * t, 0 * t) if poses else None
+    odometry = OdometryStream(s, None, None, None, 0 * s, 0 * s) if readings else None
+    return Trial("next", "next", command, odometry, truth, start)
+
+
+def plan_drives(result: Result, drives: Drives, library: Sequence[Drive]) -> Drives:
+    """Drives of the library, sampled like the log's longest trial, through the same compiled replay."""
+    trials = result.log.training
+    longest = max(trial.duration for trial in trials)
+    rates = [max((len(stream.t) / trial.duration for trial in trials
+                  if (stream := getattr(trial, channel)) is not None), default=0.0)
+             for channel in ("ground_truth", "odometry")]
+    counts = [round(rate * longest) for rate in rates]
+    moving = any(trial.start.v or trial.start.omega for trial in trials)
+    planned = []
+    for one in library:
+        x, y, heading = one.start
+        # A replay that was compiled for trials that start in motion settles every trial: a start just off rest does so.
+        start = Start(x, y, heading, v=1e-9 if moving else 0.0)
+        planned.append(_as_trial(one.command, start, longest, *counts))
+    return drives.of(tuple(planned), result.plant.dt)
+
+
+def separations(
+    result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[Drive]
+) -> tuple[np.ndarray, list[Drive]]:
+    """Separation (D, pairs) of the most promising drives, and these drives; pairs as in `itertools.combinations` of
+    each group in turn."""
+    flat = [one for group in groups for one in group]
+    place = {id(one): i for i, one in enumerate(flat)}
+    pairs = [(place[id(a)], place[id(b)]) for group in groups for a, b in combinations(group, 2)]
+    seen, drives = _seen(result, refitter, flat, library)
+    raw = np.stack([np.linalg.norm(seen[i] - seen[j], axis=-1) for i, j in pairs], axis=-1)  # (D, pairs)
+    best = np.unique(np.argsort(-raw, axis=0)[: max(REFINED // len(pairs), 4)])  # each pair's own best
+    chosen = [library[i] for i in best]
+    seen, drives = _seen(result, refitter, flat, chosen)
+    base = _white(result, drives, base_columns(drives, result.reference, refitter.values, result.names))
+    columns = [np.concatenate([base, _own_columns(result, drives, one.fit, seen[i])], axis=-1)
+               for i, one in enumerate(flat)]
+    held = [_held(result, one.fit) for one in flat]
+    inflation = math.sqrt(1 + max(result.search.excess[1], 0.0))
+    out = np.zeros((len(chosen), len(pairs)))
+    for k, (i, j) in enumerate(pairs):
+        for d in range(len(chosen)):
+            difference = seen[i][d] - seen[j][d]
+            out[d, k] = min(absorbed(difference, columns[one][d], held[one]) for one in (i, j)) / inflation
+    return out, chosen
+
+
+def absorbed(difference: np.ndarray, columns: np.ndarray, held: np.ndarray) -> float:
+    """Length of what columns (n, P), held by the precision (P, P), cannot absorb of a white difference (n,)."""
+    moments = columns.T @ difference
+    matrix = columns.T @ columns + held
+    matrix[np.diag_indices(len(matrix))] += 1e-9 * max(float(np.diag(matrix).max()), 1e-12)
+    return math.sqrt(max(float(difference @ difference - moments @ np.linalg.solve(matrix, moments)), 0.0))
+
+
+def _seen(result: Result, refitter: Refitter, rivals: Sequence[Rival], library: Sequence[Drive]
+          ) -> tuple[np.ndarray, Drives]:
+    """White features (rivals, D, n) of each rival on each drive."""
+    drives = plan_drives(result, refitter.drives, library)
+    features = drives.simulate(np.stack([one.fit.values for one in rivals]))
+    drives = drives.weighted(features[0], result.reference.factors, result.log.spec.track)
+    return np.stack([_white(result, drives, one) for one in features]), drives
+
+
+def _white(result: Result, drives: Drives, series: np.ndarray) -> np.ndarray:
+    """(D, n, ...) white and flat, of (D, K, C, ...)."""
+    white = result.reference.whitener.apply(series, drives.mask)
+    return white.reshape(len(white), -1, *series.shape[3:])
+
+
+def _own_columns(result: Result, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
+    """(D, n, k) derivative of the white features by a rival's own coordinates, by differences."""
+    steps = STEP_Q * np.maximum(np.abs(fit.q), 1.0)
+    sets = [_values(result, fit.hypotheses, fit.u, fit.q + row) for row in np.diag(steps)]
+    seen = drives.simulate(np.stack(sets))
+    return np.stack([(_white(result, drives, one) - at) / steps[i] for i, one in enumerate(seen)], axis=-1)
+
+
+def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """All parameters of the vehicle at base coordinates u (P,) and the hypotheses' own q (k,)."""
+    base = base_values(result.full)
+    base.update(zip(result.reference.space.names, result.reference.space.to_values(u).tolist(), strict=True))
+    values = np.array([base[name] for name in result.names])
+    parts = np.split(q, np.cumsum([len(one.axes) for one in hypotheses])[:-1])
+    for one, part in zip(hypotheses, parts, strict=True):
+        values = with_values(values, result.names, one.values(part, base))
+    return values
+
+
+def _held(result: Result, fit: Refit) -> np.ndarray:
+    """(P + k, P + k) precision of a rival on a new day: base parameters by the spread, its coordinates by these drives
+    and by how far they seem to wander from day to day."""
+    size = len(fit.u)
+    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
+    matrix = flat.T @ flat
+    inside = matrix[:size, :size] + result.evidence.precision
+    cross = matrix[:size, size:]
+    out = np.zeros_like(matrix)
+    out[:size, :size] = result.evidence.precision
+    told = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
+    covariance, start = np.linalg.inv(told + 1e-9 * np.eye(len(told))), 0
+    for one, q in zip(fit.hypotheses, fit.split, strict=True):
+        part = slice(start, start + len(q))
+        covariance[part, part] += result.prepared.wander.at(
+            result.evidence.columns, result.hypotheses.index(one), q)
+        start += len(q)
+    out[size:, size:] = np.linalg.inv(covariance)
+    return out
+
+
+def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, library: Sequence[Drive]) -> dict[str, Any]:
+    """The drive with the largest worst case over the pairs that any drive tells apart."""
+    reach = separation.max(0)
+    told = reach >= LEAST
+    missing = [{"effects": [a.effect, b.effect], "separation": float(reach[k]),
+                "sensor": sensor_for(a.effect, b.effect)} for k, (a, b) in enumerate(pairs) if not told[k]]
+    if not told.any():
+        return {"name": None, "parameters": None, "start": None, "splits": [], "file": None,
+                "expected_separation": float(reach.min()), "replicates": None, "not_split": missing}
+    worst = separation[:, told].min(1)
+    best = int(np.argmax(worst))
+    drive, least = library[best], float(worst[best])
+    splits = [one.effect for k, pair in enumerate(pairs) if told[k] for one in pair]
+    repeats = min(math.ceil((ENOUGH / max(least, 1e-6)) ** 2), MOST_REPEATS)
+    x, y, heading = drive.start
+    return {"name": drive.manoeuvre,
+            "parameters": {"v": drive.v, "omega": drive.omega, "seconds": drive.seconds, "dt": drive.dt},
+            "start": {"x": x, "y": y, "heading": heading}, "splits": list(dict.fromkeys(splits)),
+            "expected_separation": least, "replicates": repeats, "file": FILE, "not_split": missing}
+
+
+def sensor_for(a: str, b: str) -> str:
+    """What separates two effects that no drive separates: a sensor that measures one of them by itself."""
+    return card_of(a).sensor or card_of(b).sensor or "motor currents, which tell how much force the drives need"
+
+
+def write_next_command(out: Path, proposal: dict[str, Any] | None) -> Path | None:
+    """Write the commands of a proposal into a run folder, in a dataset's format; None where there is no drive."""
+    if proposal is None or proposal["file"] is None:
+        return None
+    command = command_of(proposal)
+    path = Path(out) / proposal["file"]
+    write_csv(path, COMMAND_HEADER, np.column_stack([command.t, command.v, command.omega]))
+    return path

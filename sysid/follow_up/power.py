@@ -1,0 +1,112 @@
+"""What these very drives can show: how often they raise a false alarm, and how surely an effect is noticed.
+
+Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
+Linear, like the scan: `--refit-nulls` tells the false alarms of the whole procedure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.intervals.statistics import upper_rate
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Columns, Evidence, Solver
+from sysid.verdict.found import Scan, family, tail
+from sysid.verdict.scan import look, null_moments
+
+DRAWS = 200
+SEED = 3  # beside that of the scan's nulls
+POWER = 0.8
+REACH, HALVINGS = 8.0, 7  # range of factors around a first guess, and how often it is halved
+FACTORS = (0.25, 0.5, 1.0, 2.0)
+"""Sizes of a named effect, over the fitted one, whose power is told."""
+
+
+Effect = tuple[Columns, np.ndarray]
+"""Columns of a hypothesis and its coordinates (k,)."""
+
+
+@dataclass(frozen=True)
+class Days:
+    """Simulated days on which nothing is missing, seen through the columns of the scan."""
+
+    evidence: Evidence
+    hypotheses: Sequence[Hypothesis]
+    wander: Wander
+    scan: Scan
+    moments: np.ndarray  # (N, P + S)
+    share: np.ndarray  # (N, D) in which the reference days' apparent effects are in them
+
+    def p(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """(E, N) p-values of "nothing is missing", with one of the effects in every day; (1, N) of the days alone."""
+        products, draws = self.evidence.products.sum(0), len(self.moments)
+        added = np.stack([products[:, list(columns.index)] @ q for columns, q in effects]) if effects else np.zeros(
+            (1, len(products)))
+        moments = (added[:, None] + self.moments).reshape(-1, len(products))
+        solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
+        for number, (one, covariance) in enumerate(zip(self.evidence.columns, self.wander.covariance, strict=True)):
+            away = np.tile(self.wander.away(number, self.share), (len(added), 1))
+            found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
+            worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
+        each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
+        return np.array([family(self.scan.smallest, float(one)) for one in each.min(1)]).reshape(-1, draws)
+
+    def noticed(self, alpha: float, effects: Sequence[Effect]) -> list[float]:
+        """Of each effect the share of days on which something counts as missing."""
+        return [float(np.mean(p < alpha)) for p in self.p(effects)] if effects else []
+
+    def nearest(self, hypothesis: int, size: float) -> Columns:
+        """The columns of a hypothesis that were simulated nearest to a size."""
+        mine = [one for one in self.evidence.columns if one.hypothesis == hypothesis]
+        return min(mine, key=lambda one: abs(one.level - size))
+
+
+def simulated_days(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, scan: Scan,
+    draws: int = DRAWS, seed: int = 0,
+) -> Days:
+    """Draw days anew.
+
+    Args:
+        evidence: that the scan was run on.
+        spread: (P, P) day-to-day covariance of the base parameters.
+    """
+    rng = np.random.default_rng((seed, SEED))
+    moments = null_moments(evidence, spread, draws, rng)
+    share = wander.draw_shares(draws, rng)
+    return Days(evidence, hypotheses, wander, scan, moments, share)
+
+
+def false_alarms(days: Days, alpha: float) -> dict[str, float]:
+    """`count` of days, `alarms` among them, their `rate` and its `upper` 95 % bound."""
+    [p] = days.p()
+    alarms = int((p < alpha).sum())
+    return {"count": len(p), "alarms": alarms, "rate": alarms / len(p), "upper": upper_rate(alarms, len(p))}
+
+
+def power_curve(days: Days, hypothesis: int, q: np.ndarray, alpha: float) -> list[dict[str, float]]:
+    """`noticed`: share of days on which an effect would be missed from the model, at each `factor` on its size."""
+    columns = days.nearest(hypothesis, float(np.abs(q).max()))
+    noticed = days.noticed(alpha, [(columns, factor * q) for factor in FACTORS])
+    return [{"factor": factor, "noticed": share} for factor, share in zip(FACTORS, noticed, strict=True)]
+
+
+def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[float, float]]:
+    """Of each effect the factor on its size at which it is noticed with 80 % power, by bisection, and its power there.
+
+    Args:
+        effects: at sizes near which that is expected; factors from 1 / `REACH` to `REACH` are looked at.
+    """
+    low, high = np.full(len(effects), 1 / REACH), np.full(len(effects), REACH)
+    power = np.ones(len(effects))
+    for number in range(HALVINGS + 1):
+        factor = high if number == HALVINGS else np.sqrt(low * high)
+        sized = [(columns, k * q) for k, (columns, q) in zip(factor, effects, strict=True)]
+        power = np.array(days.noticed(alpha, sized))
+        if number < HALVINGS:
+            low, high = np.where(power < POWER, factor, low), np.where(power < POWER, high, factor)
+    return [(float(factor), float(share)) for factor, share in zip(high, power, strict=True)]

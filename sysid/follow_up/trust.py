@@ -1,0 +1,133 @@
+"""How far a name and its size may be trusted: warnings, what speaks against it, and intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.missing.joint_fit import Refit, Start
+from sysid.missing.unexplained import held_back_gains
+from sysid.verdict.agreement import with_prior
+from sysid.verdict.result import Result
+
+CONFIDENCE = 0.95
+FOLLOWED = 0.9
+"""Largest share of a direction that one manoeuvre tells with which what it leaves is made larger."""
+NEARLY = 0.9
+"""Share of the largest size that is looked for from which a size is at its end."""
+MOVED = 0.01
+"""p-value of how far base parameters went, below which they went further than from day to day."""
+LAW = ("speed", "yaw rate", "size of the step")
+"""Quantities by which effects that act at the same times have different laws."""
+UNDONE = 0.5
+"""What two effects change together, as a share of what each does by itself, below which one may stand for both."""
+
+
+def contradicted(result: Result) -> list[str]:
+    """What speaks against effects that would else have been named."""
+    if result.search.verdict == "named":
+        return []
+    return [each for one in result.stood for each in one.against(result.config.thresholds)]
+
+
+def warnings(result: Result) -> list[str]:
+    """What speaks against taking the names as certain."""
+    found, alpha = result.search, result.config.thresholds.alpha
+    if found.verdict != "named":
+        return []
+    said = [f"{', '.join(found.crowd)} cannot be told from it either: more than a class may have for a name to be "
+            "worth much"] if found.crowd else []
+    said += [f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
+             "catalogue does not have may do what is left of both"
+             for first, second, left in undone(found.final) if left < UNDONE]
+    said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
+             for name in at_the_end(result)]
+    named = {one.hypothesis.effect for one in found.accepted}
+    said += [f"these drives do not tell whether {one.effect} {each.falsifier.says}: an effect of another law may do it"
+             for one in result.stood if one.effect in named for each in one.falsifiers
+             if each.falsifier.by in LAW and each.outcome == "untold"]
+    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
+    quantity = max(gains, key=lambda name: gains[name])
+    if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
+        said.append(f"what is left is a smooth function of {quantity} more than on reference days: the form is another "
+                    "one, or another effect")
+    if found.excess[1] > result.prepared.wander.excess_limit(alpha):
+        names = " and ".join(one.hypothesis.effect for one in found.accepted)
+        said.append(f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has "
+                    "another form here than in the catalogue, or is imitated by an effect that the catalogue does not "
+                    "have")
+    return said
+
+
+def undone(final: Refit) -> list[tuple[str, str, float]]:
+    """Of every two effects of a joint fit: what both change in the features together, squared, over the sum of what
+    each does by itself. Two effects that have nothing to do with one another leave about 1."""
+    columns = final.jacobian[..., len(final.u) :]
+    changes = [columns[..., part] @ q for part, q in zip(final.parts, final.split, strict=True)]
+    out = []
+    for j, second in enumerate(changes):
+        for i, first in enumerate(changes[:j]):
+            alone = float(np.square(first).sum() + np.square(second).sum())
+            out.append((final.hypotheses[i].effect, final.hypotheses[j].effect,
+                        float(np.square(first + second).sum()) / max(alone, 1e-12)))
+    return out
+
+
+def at_the_end(result: Result) -> list[str]:
+    """Parameters of the final fit that are nearly as large as they may be."""
+    final = result.search.final
+    axes = [axis for one in final.hypotheses for axis in one.axes]
+    return [axis.parameter for axis, q in zip(axes, final.q, strict=True)
+            if not axis.dependent and abs(q) >= NEARLY * axis.limit]
+
+
+def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
+    """The final effects fitted beside base parameters that hardly move; nothing where these moved as days do.
+
+    Where the form is not quite right, base parameters go further than from day to day to mend it, and take a part of
+    the effect along or give it one. How much lies between this fit and the final one.
+    """
+    from scipy import stats
+
+    from sysid.verdict.vehicles import refitter_of
+
+    final, reference = result.search.final, result.reference
+    away = final.u - reference.u
+    if not reference.known or away @ result.evidence.precision @ away < stats.chi2.isf(MOVED, len(away)):
+        return []
+    refitter = refitter_of(result).stiffened()
+    return refitter.fit_all([Start(final.hypotheses, reference.u, final.q)], iterations)
+
+
+def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (k,), (k,) of the coordinates' confidence intervals."""
+    from scipy import stats
+
+    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(result.evidence.groups) - 1, 1))
+    reach = quantile * deviations(final, result)
+    axes = [axis for one in final.hypotheses for axis in one.axes]
+    ends = np.stack([final.q - reach, final.q + reach])
+    factors = np.array([[axis.open[end] for axis in axes] for end in (0, 1)]).reshape(2, -1)
+    every = np.concatenate([ends, *(ends[i] * factors for i in (0, 1))])  # what one size could be taken for
+    return every.min(0), every.max(0)
+
+
+def deviations(final: Refit, result: Result) -> np.ndarray:
+    """(k,) standard errors of the coordinates: from whole manoeuvres, which a wrong form pulls each its own way, and
+    what the coordinates seem to be on days without the effect.
+
+    What a manoeuvre leaves is smaller than its error by what the fit followed it: the more, the more of a direction it
+    tells (bias-reduced linearisation, Bell and McCaffrey 2002). Where it tells nearly all, none can contradict it.
+    """
+    groups = result.evidence.groups
+    matrix, size = with_prior(final, result.evidence.precision), len(final.u)
+    root = np.linalg.inv(np.linalg.cholesky(matrix))
+    moved = []
+    for group in groups:
+        flat = final.jacobian[list(group)].reshape(-1, len(matrix))
+        told, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
+        score = along.T @ (root @ (flat.T @ final.residual[list(group)].reshape(-1)))
+        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(told, 0.0, FOLLOWED)))))
+    variance = np.maximum(np.diag(root.T @ root), np.square(moved).sum(0))[size:]
+    wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
+              for one, q in zip(final.hypotheses, final.split, strict=True)]
+    return np.asarray(np.sqrt(variance + np.concatenate([[], *wander])))

@@ -1,0 +1,340 @@
+"""A wrench without a name for what the catalogue does not have.
+
+A force along the vehicle and a torque about it, as tables over one quantity of the motion, are fitted to what the base
+model leaves. Each knot of a table is switched on by itself at a small size; what that changes in the features is its
+column. The table is a linear regression of the white residual on these columns beside those of the base parameters.
+Which quantity, how smooth, and which sum of few terms stands for the table: manoeuvres that were held back decide. The
+winner is then replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.follow_up.tables import (
+    Products,
+    Table,
+    few_terms,
+    from_first_wave,
+    held_back,
+    multiplied,
+    penalties,
+    turned,
+)
+from sysid.follow_up.terms import Term, columns_of, in_words
+from sysid.logs.log import Prediction, Trial
+from sysid.missing.drives import RECORD_DT, Drives, make_drives
+from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.records import Plant
+from sysid.replay.rollout import Replay, make_batch, predictions
+from sysid.verdict.result import Result
+from sysid.verdict.vehicles import fitted_before, refit_poses
+from whill_mjx.effects import make_effect
+from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.types import VehicleParams
+
+KINDS = ("push", "brake")
+"""A wrench whatever the motion, or one that turns with its direction."""
+ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
+"""Quantities that only an outside pose tells; replicates, which start elsewhere, differ in them."""
+REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
+FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
+LEAST = 0.1
+"""Least share of the excess residual that a table must predict on held-back manoeuvres."""
+LEAST_GAIN = 25.0
+"""Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
+COMPACT = 0.75
+"""Share of the table's held-back gain that few terms must reach to stand for it."""
+STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried
+ROUNDS = 3  # Gauss-Newton steps
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A table fitted to all trials by regression."""
+
+    table: Table
+    gains: np.ndarray  # (G,) on each manoeuvre, held back
+    smoothing: float
+    products: Products
+    columns: np.ndarray  # (B, n, 2 KNOTS), turned
+    phases: np.ndarray  # (B,) each trial's turn
+
+
+@dataclass(frozen=True)
+class Unnamed:
+    """A fitted wrench."""
+
+    table: Table
+    wrench: np.ndarray  # (2 KNOTS,) forces [N], then torques [N m]
+    terms: tuple[Term, ...]
+    """The sum that stands for the tables; none where no compact one does."""
+    coefficients: tuple[np.ndarray, ...]
+    """Of each term, for force [N] and torque [N m]."""
+    vehicle: VehicleParams
+    """The base model refitted beside it, with the effect."""
+    gain: float
+    """Share of the excess residual that it predicts on held-back manoeuvres (of the training trials)."""
+    by_manoeuvre: dict[str, float]
+    """Lowering of the squared white residual of each manoeuvre, held back."""
+    cost: tuple[float, float]
+    """Squared white residual of the training trials per sample, replayed before and after."""
+    tried: tuple[tuple[str, str, float], ...]
+    """Quantity, kind and held-back gain of every table that was fitted."""
+    angles: np.ndarray  # (B,) rad, of the wheels at the start of each trial
+    kept: bool
+
+
+class Bench:
+    """Replays of the base model with the effect `unnamed` in it."""
+
+    def __init__(self, result: Result):
+        reference, base = result.reference, result.search.base
+        self.result, self.base_names = result, list(reference.space.names)
+        self.params = VehicleParams(reference.params.body, (*reference.params.effects, make_effect("unnamed")))
+        self.names = [name for name in describe(self.params) if name.startswith("unnamed.")] + self.base_names
+        self.neutral = np.asarray(get_values(self.params, self.names), float)
+        self.u = base.u
+        drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width)
+        self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
+        weight = 0.01 * result.log.spec.mass * 9.81
+        self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m
+        self.target = self.white(self.drives, reference.target_of(self.drives))
+        self.target_shape = self.drives.target.shape
+
+    def values(self, u: np.ndarray, table: Table | None = None, wrench: np.ndarray | None = None, start: float = 0.0
+               ) -> np.ndarray:
+        """All replayed parameters at base coordinates and a table."""
+        out = self.neutral.copy()
+        out[len(out) - len(u) :] = self.result.reference.space.to_values(u)
+        if table is not None and wrench is not None:
+            for name, value in table.parameters(wrench, start).items():
+                out[self.names.index(f"unnamed.{name}")] = value
+        return out
+
+    def white(self, drives: Drives, series: np.ndarray) -> np.ndarray:
+        """(B, n, ...) white and flat, of (B, K, C, ...)."""
+        white = self.result.reference.whitener.apply(series, drives.mask)
+        return white.reshape(len(white), -1, *series.shape[3:])
+
+    def residual(self, points: Sequence[tuple[np.ndarray, np.ndarray]], table: Table, phases: np.ndarray) -> np.ndarray:
+        """(N, B, n) white residual of all training trials at base coordinates and wrenches, with each trial's turn."""
+        turns = sorted(set(phases.tolist()))
+        sets = [self.values(u, table, wrench, float(PHASES[turn])) for u, wrench in points for turn in turns]
+        seen = self.drives.simulate(np.stack(sets)).reshape(len(points), len(turns), *self.target_shape)
+        chosen = seen[:, [turns.index(turn) for turn in phases.tolist()], np.arange(len(phases))]
+        return np.stack([self.target - self.white(self.drives, one) for one in chosen])
+
+    def part(self, trials: Sequence[int]) -> Drives:
+        """Some of the trials."""
+        chosen = self.drives.of(tuple(self.drives.trials[i] for i in trials), self.result.plant.dt)
+        bins = chosen.features.mask.shape[1]
+        return replace(chosen, weight=self.drives.mask[list(trials), :bins])
+
+    def columns(self, table: Table, trials: Sequence[int]) -> np.ndarray:
+        """(b, n, 2 KNOTS) change of the white features by each knot, per N and N m."""
+        drives = self.part(trials)
+        sets = [self.values(self.u, table, row) for row in np.diag(self.sizes)]
+        seen = drives.simulate(np.stack([self.values(self.u), *sets]))
+        full = np.zeros((len(trials), *self.drives.mask.shape[1:], 2 * KNOTS))
+        for k in range(2 * KNOTS):
+            full[:, : seen.shape[2], :, k] = (seen[k + 1] - seen[0]) / self.sizes[k]
+        whole = replace(self.drives, weight=self.drives.mask[list(trials)])
+        return self.white(whole, full)
+
+
+def find_unnamed(result: Result) -> Unnamed | None:
+    """The wrench over one quantity that best predicts held-back manoeuvres; None unless something is unexplained.
+
+    Where the base model is refitted to whole poses, so is it with the wrench that is kept.
+    """
+
+    if result.search.verdict != "unexplained":
+        return None
+    found = fit_unnamed(Bench(result))
+    if not found.kept or not result.config.poses:
+        return found
+    if found.table.quantity in WHEELS:
+        trials = result.log.training
+        if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
+            names = list(result.reference.space.names)
+            return replace(found, vehicle=set_values(found.vehicle, names, get_values(fitted_before(result), names)))
+        plant = with_start_angles(result.plant, trials, found.angles)
+        result = replace(result, prepared=replace(result.prepared, plant=plant))
+    return replace(found, vehicle=refit_poses(result, found.vehicle))
+
+
+def with_start_angles(plant: Plant, trials: Sequence[Trial], angles: np.ndarray) -> Plant:
+    """A plant that places the wheels at each trial's own angle (B,), which it knows by where the trial starts."""
+    starts = jnp.array([[one.start.x, one.start.y, one.start.yaw] for one in trials])
+    turned = jnp.asarray(angles, starts.dtype)
+
+    def place(params: Any, start: jnp.ndarray) -> Any:
+        state = plant.place(params, start)
+        mine = turned[jnp.square(starts - start[:3]).sum(-1).argmin()]
+        memory, index = list(state.memory), [effect.name for effect in params.effects].index("unnamed")
+        memory[index] = replace(memory[index], angle=mine + jnp.zeros(2))
+        return replace(state, memory=tuple(memory))
+
+    return replace(plant, place=place)
+
+
+def fit_unnamed(bench: Bench) -> Unnamed:
+    """The same of any residual, before that refit."""
+    result = bench.result
+    groups = [list(group) for group in result.evidence.groups]
+    if len(groups) < 3:  # too few manoeuvres to hold one back: trials are
+        groups = [[i] for i in range(len(result.log.training))]
+    residual, jacobian = result.search.base.residual, result.search.base.jacobian
+    firsts = [group[0] for group in groups]
+    screened = []
+    for table in tables(result):
+        chosen = firsts if table.quantity not in ROOM else sum(groups, [])
+        split = [[i] for i in range(len(firsts))] if chosen is firsts else _positions(groups)
+        columns, _ = turned(table, bench.columns(table, chosen), residual[chosen])
+        products = multiplied(residual[chosen], jacobian[chosen], columns, split)
+        gains, _ = held_back(products, result.evidence.precision, table)
+        gains = gains - price(table, split)
+        screened.append((float(gains.sum()) * len(residual) / len(chosen), table))
+    screened.sort(key=lambda one: -one[0])
+    fitted = []
+    for _, table in screened[:FINALISTS]:
+        columns, phases = turned(table, bench.columns(table, range(len(residual))), residual)
+        products = multiplied(residual, jacobian, columns, groups)
+        gains, smoothing = held_back(products, result.evidence.precision, table)
+        gains = gains - price(table, groups)
+        fitted.append(Fit(table, gains, smoothing, products, columns, phases))
+    best = max(fitted, key=lambda one: float(one.gains.sum()))
+    excess = max(result.search.excess[0], 1e-9) * float((bench.drives.mask > 0).sum())
+    tried = [(one.table.quantity, one.table.kind, float(one.gains.sum()) / excess) for one in fitted]
+    tried += [(table.quantity, table.kind, gain / excess) for gain, table in screened[FINALISTS:]]
+    return _replayed(bench, best, groups, excess, tuple(sorted(tried, key=lambda one: -one[2])))
+
+
+def tables(result: Result) -> list[Table]:
+    """All wrenches that are tried, with the range that the drives cover."""
+    trials = result.log.training
+    speeds = [trial.odometry.v if trial.odometry is not None else trial.command.v for trial in trials]
+    rates = [trial.odometry.omega if trial.odometry is not None else trial.command.omega for trial in trials]
+    ranges: dict[str, tuple[float, ...]] = {"time in the drive": (0.0, max(trial.duration for trial in trials))}
+    for name, series in (("speed", speeds), ("yaw rate", rates)):
+        ranges[name] = _range(np.concatenate(series))
+    ranges |= {name: (0.0, end) for name, end in REST_RANGE.items()}
+    seen = [trial.ground_truth for trial in trials if trial.ground_truth is not None]
+    places = [_range(np.concatenate([getattr(one, name) for one in seen])) for name in "xy"] if seen else []
+    if seen:
+        ranges |= {"x in the room": places[0], "y in the room": places[1], MAP: (*places[0], *places[1])}
+    found = [name for name in QUANTITIES if name not in ROOM or seen]
+    return [Table(name, kind, *ranges.get(name, (0.0, 1.0))) for name in found for kind in KINDS]
+
+
+def _range(series: np.ndarray) -> tuple[float, float]:
+    """What nearly all of a quantity's values lie in."""
+    low, high = np.quantile(series, [0.002, 0.998])
+    return float(low), float(max(high, low + 0.05))
+
+
+def price(table: Table, groups: Sequence[Sequence[int]]) -> np.ndarray:
+    """(G,) what the trials of each group gain by a start angle of their own even where there is nothing."""
+    return np.array([ANGLE_PRICE * len(group) for group in groups]) * (table.quantity in WHEELS)
+
+
+def _positions(groups: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Positions of each group's trials in the groups one after the other."""
+    ends = np.cumsum([len(group) for group in groups])
+    return [list(range(end - len(group), end)) for end, group in zip(ends, groups, strict=True)]
+
+
+def _replayed(
+    bench: Bench, best: Fit, groups: Sequence[Sequence[int]], excess: float, tried: tuple[tuple[str, str, float], ...]
+) -> Unnamed:
+    """The best table, or the few terms that stand for it, brought to its optimum by replays."""
+    result, precision, table = bench.result, bench.result.evidence.precision, best.table
+    size, gains = len(precision), best.gains
+    penalty, basis = penalties(best.products, precision, best.smoothing, table), np.eye(2 * KNOTS)
+    chosen: tuple[Term, ...] = ()
+    short = few_terms(best.products, precision, table)
+    less = short[0] - price(table, groups)
+    if less.sum() >= COMPACT * gains.sum():
+        gains, chosen = less, short[1]
+        basis, parts = columns_of(chosen, table.knots)
+        penalty = np.zeros((size + basis.shape[1], size + basis.shape[1]))
+        penalty[:size, :size] = precision
+    columns = best.columns @ basis
+    u, wrench, now = bench.u.copy(), np.zeros(basis.shape[1]), result.search.base.residual
+    cost = before = float(np.square(now).sum())
+    for _ in range(ROUNDS):
+        here = multiplied(now, result.search.base.jacobian, columns, groups)
+        at = np.concatenate([u - bench.u, wrench])
+        pulled = replace(here, moments=here.moments - penalty @ at / len(here.moments))
+        step = pulled.solve(penalty)
+        tries = [(np.clip(u + share * step[:size], 0.0, 1.0), wrench + share * step[size:]) for share in STEPS]
+        left = bench.residual([(one, basis @ each) for one, each in tries], table, best.phases)
+        costs = np.square(left).sum((1, 2))
+        index = int(np.nanargmin(costs))
+        if not costs[index] < cost * (1 - 1e-3):
+            break
+        (u, wrench), now, cost = tries[index], left[index], float(costs[index])
+    coefficients = tuple(wrench[part] for part in parts) if chosen else ()
+    more = 0.0
+    if table.quantity in WHEELS:
+        coefficients, more = from_first_wave(chosen, coefficients)
+    full = columns_of(chosen, table.knots)[0] @ np.concatenate(coefficients) if chosen else basis @ wrench
+    values = bench.values(u, table, full)
+    vehicle = set_values(bench.params, bench.names, jnp.asarray(values, jnp.result_type(float)))
+    count = float((bench.drives.mask > 0).sum())
+    by_manoeuvre: dict[str, float] = {}
+    for group, each in zip(groups, gains, strict=True):
+        name = result.log.training[group[0]].manoeuvre
+        by_manoeuvre[name] = by_manoeuvre.get(name, 0.0) + float(each)
+    gain = float(gains.sum()) / excess
+    kept = gain >= LEAST and gains.sum() >= LEAST_GAIN and before - cost > 0.5 * float(gains.sum())
+    return Unnamed(table, full, chosen, coefficients, vehicle, gain, by_manoeuvre, (before / count, cost / count),
+                   tried, PHASES[best.phases] + more, bool(kept))
+
+
+def as_report(found: Unnamed) -> dict[str, Any]:
+    """The fitted wrench for report.json: `quantity` and `kind` ("push", or "brake": it turns with the motion), `knots`,
+    `values` and `units`, `symbolic` (sums of few terms in z, null where none is as good), `gain` on held-back
+    manoeuvres, `cost` before and after, what else was `tried`, whether it is `kept`, and all `parameters` with it."""
+    table, names = found.table, list(describe(found.vehicle))
+    symbolic = {"force": in_words(found.terms, found.coefficients, 0),
+                "torque": in_words(found.terms, found.coefficients, 1)} if found.terms else None
+    return {
+        "quantity": table.quantity, "kind": table.kind, "periodic": table.quantity in PERIODIC,
+        "knots": table.knots.tolist(),
+        "values": {"force": found.wrench[:KNOTS].tolist(), "torque": found.wrench[KNOTS:].tolist()},
+        "units": {"quantity": QUANTITIES[table.quantity], "force": "N", "torque": "N m"}, "symbolic": symbolic,
+        "gain": {"held_back": found.gain, "by_manoeuvre": found.by_manoeuvre},
+        "cost": {"before": found.cost[0], "after": found.cost[1]},
+        "tried": [{"quantity": quantity, "kind": kind, "gain": gain} for quantity, kind, gain in found.tried],
+        "kept": found.kept,
+        "parameters": dict(zip(names, np.asarray(get_values(found.vehicle, names), float).tolist(), strict=True)),
+    }
+
+
+def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
+    """The base model with the effect `unnamed`, at these values."""
+    params = result.reference.params
+    full = VehicleParams(params.body, (*params.effects, make_effect("unnamed")))
+    return set_values(full, list(parameters), jnp.asarray(list(parameters.values()), jnp.result_type(float)))
+
+
+def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
+    """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
+    held-out ones too: nothing else tells it."""
+    batch, measured = make_batch(trials, result.plant.dt, RECORD_DT)
+    replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
+    seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])
+    error = np.square((np.asarray(seen.odometry) - measured.odometry) * measured.odometry_mask)[..., 3:]
+    away = (error.sum(2) / np.maximum(np.square(result.reference.whitener.scale[:2]), 1e-12)).sum(-1)  # (G, B)
+    best = away.argmin(0)
+    row = np.arange(len(trials))
+    return predictions(trials, type(seen)(*(np.asarray(leaf)[best, row] for leaf in (
+        seen.pose, seen.odometry, seen.diverged))))

@@ -1,0 +1,1 @@
+"""How far a fitted parameter may be trusted: variances of correlated errors, intervals, profiles."""

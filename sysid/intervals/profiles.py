@@ -1,0 +1,142 @@
+"""Profile likelihoods: how well a log knows one parameter when all others make the best of each of its values.
+
+An interval from curvature at the fitted point is a parabola's; a profile follows walls, valleys and saturation, may be
+one-sided, and shows where a parameter is free of the data. Squares of autocorrelated residuals count more often than
+they tell, so that their increase is divided by as much as the sandwich variance of the parameter exceeds that of
+independent residuals: near its minimum the profile then agrees with the intervals of `sysid.intervals.uncertainty`.
+Source of the scaling: Rotnitzky and Jewell (1990).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.errors.pose_objective import Told
+from sysid.errors.robust import robust_cost
+from sysid.errors.space import Space
+from sysid.intervals.uncertainty import Uncertainty
+from sysid.search import least_squares
+from sysid.search.result import Progress
+
+POINTS = 9
+ITERATIONS = 4
+BETTER = 0.02  # of the threshold by which another point must be better to be told
+REACH = 2.0
+"""How far the grid reaches, in half-widths of the interval from curvature."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The profile likelihood of one parameter."""
+
+    name: str
+    values: np.ndarray  # (G,) ascending
+    cost: np.ndarray  # (G,) mean squared residual, the other parameters at their best
+    statistic: np.ndarray  # (G,) 0 at the best; twice the loss of log likelihood
+    threshold: float
+    """Of the statistic at the confidence level."""
+    interval: tuple[float | None, float | None]
+    """Where the statistic crosses the threshold; None where it does not within the grid."""
+    others: np.ndarray  # (G, P) values of all parameters
+    fitted: float
+    """Value where the fit had ended."""
+
+    def remark(self, space: Space) -> str:
+        """Which ends of the interval are open, and whether the profile found a better point than the fit."""
+        index = space.names.index(self.name)
+        ends = []
+        best = self.statistic.argmin()
+        if self.statistic[np.abs(self.values - self.fitted).argmin()] > BETTER * self.threshold:
+            ends.append(f"better at {self.values[best]:.4g} than where the fit ended")
+        for end, edge, bound in ((self.interval[0], self.values[0], space.low[index]),
+                                 (self.interval[1], self.values[-1], space.high[index])):
+            side = "below" if bound == space.low[index] else "above"
+            if end is None:
+                at_bound = abs(edge - bound) < 1e-6 * (space.high[index] - space.low[index])
+                ends.append(f"open {side}{': even its bound is allowed' if at_bound else ''}")
+        return ", ".join(ends)
+
+
+def profile(
+    objective: Told, u: np.ndarray, known: Uncertainty, names: Sequence[str], *, points: int = POINTS,
+    iterations: int = ITERATIONS, robust: bool = False, progress: Progress | None = None,
+) -> list[Profile]:
+    """Profile likelihoods at the fitted point u (P,), all points of a grid searched together.
+
+    Args:
+        known: intervals at u, which set the grid's reach; a parameter that is not told gets its whole range.
+        names: which parameters.
+        points: of the grid, besides u itself.
+        robust: u minimises the Huber loss.
+
+    Raises:
+        ValueError: a name is not searched.
+    """
+    space = objective.space
+    check_names(space, names)
+    sd = np.maximum(known.deviation, 1e-8)
+    scale = _scale(objective, u, known, sd)
+    best = float(robust_cost(objective.residuals(u[None]), robust)[0]) / objective.counted
+    found = []
+    for name in names:
+        index = space.names.index(name)
+        quantile = float(known.quantile[index])
+        reach = REACH * quantile * sd[index] if known.estimates[index].identifiable else 1.0
+        low, high = max(u[index] - reach, 0.0), min(u[index] + reach, 1.0)
+        grid = np.unique(np.round(np.append(np.linspace(low, high, points), u[index]), 9))
+        # Along the valley: what the others do when this one is moved, to first order.
+        slope = known.covariance[:, index] / max(known.covariance[index, index], 1e-16)
+        starts = np.clip(space.moved(np.tile(u, (len(grid), 1)), (grid - u[index])[:, None] * slope), 0.0, 1.0)
+        starts[:, index] = grid
+        result = least_squares.fit(objective, space, starts=starts, iterations=iterations, robust=robust,
+                                   frozen=(name,), progress=progress)
+        order = np.argsort(result.starts[:, index])
+        cost = np.minimum(result.start_costs[order], np.where(np.isclose(grid, u[index], atol=1e-9), best, np.inf))
+        statistic = (cost - cost.min()) * objective.counted / scale[index]
+        values = space.to_values(result.starts[order])
+        interval = crossings(values[:, index], statistic, quantile**2)
+        found.append(Profile(name, values[:, index], cost, statistic, quantile**2, interval, values,
+                             float(space.to_values(u)[index])))
+    return found
+
+
+def check_names(space: Space, names: Sequence[str]) -> None:
+    """ValueError where a parameter to be profiled is not searched."""
+    for name in names:
+        if name not in space.names:
+            raise ValueError(f"profile of {name!r}: it is not among the fitted parameters ({', '.join(space.names)}). "
+                             "Correct the name, or fit it as well (--parameters).")
+
+
+def crossings(values: np.ndarray, statistic: np.ndarray, threshold: float) -> tuple[float | None, float | None]:
+    """Where the statistic (G,) first exceeds the threshold on either side of its least value; None where it never does.
+
+    Its root is interpolated: it is linear where the profile is a parabola.
+    """
+    root, level, middle = np.sqrt(statistic), np.sqrt(threshold), int(statistic.argmin())
+
+    def cross(indices: range) -> float | None:
+        before = middle
+        for i in indices:
+            if root[i] > level:
+                share = (level - root[before]) / (root[i] - root[before])
+                return float(values[before] + share * (values[i] - values[before]))
+            before = i
+        return None
+
+    return cross(range(middle - 1, -1, -1)), cross(range(middle + 1, len(values)))
+
+
+def _scale(objective: Told, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -> np.ndarray:
+    """(P,) by how much squares over-count: sandwich variance over that of independent residuals of variance 1."""
+    _, jacobian = (array[0] for array in objective.jacobian(u[None]))
+    hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
+    ridge = 1e-9 * max(float(np.diag(hessian).max()), 1e-12)
+    naive = np.diag(np.linalg.inv(hessian + ridge * np.eye(len(u))))
+    ratio = np.maximum(sd**2 / naive, 1e-12)
+    told = np.array([one.identifiable for one in known.estimates])
+    usual = float(np.median(ratio[told])) if told.any() else float(np.median(ratio))
+    return np.where(told, ratio, usual)

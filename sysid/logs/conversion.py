@@ -1,0 +1,304 @@
+"""Recordings to driving-log datasets: drives are cut out of bags and written as trials."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sysid.logs.log import Log, Trial, load_log
+from sysid.logs.rosbag import Bag, find_bags, read_bag, stream_times
+from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
+from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
+
+HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER}
+STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow
+MOVING = {"v": 0.02, "omega": 0.03}  # m/s, rad/s of the odometry above which the vehicle counts as moving
+LEAD = 2.0  # s of standstill kept before and after a drive
+SHORTEST = 1.0  # s of motion below which a drive is left out
+
+
+@dataclass(frozen=True)
+class ConvertConfig:
+    """Options of the command."""
+
+    source: Path
+    """ROS bag, folder of bags, or a measured set."""
+    out: Path = Path("runs/dataset")
+    """Dataset folder; made where it does not exist, else the trials are added."""
+    vehicle: str = "whill_cr"
+    """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
+    wheel_radius: float | None = None
+    """Nominal wheel radius [m], where it is not the vehicle's."""
+    track: float | None = None
+    """Nominal track [m], where it is not the vehicle's."""
+    mass: float | None = None
+    """Mass [kg], where it is not the vehicle's."""
+    command_topic: str | None = None
+    """Twist or TwistStamped sent to the vehicle."""
+    odometry_topic: str | None = None
+    """The vehicle's own Odometry; '' goes without."""
+    truth_topic: str | None = None
+    """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
+    truth_ahead: float = 0.0
+    """How far the tracked point lies ahead of the drive-axle centre [m]."""
+    stamp: Literal["receive", "header"] = "receive"
+    """Time of receipt (one clock for all), or the header's (when measured)."""
+    split: Literal["bag", "standstill"] = "bag"
+    """One trial per bag, or one per drive between standstills."""
+    pause: float = 2.0
+    """Least standstill between two drives [s]."""
+    held_out: tuple[str, ...] = ()
+    """Trials that are never to be fitted."""
+    select: tuple[str, ...] = ()
+    """Part of a measured set: RUN, GROUP or robotN."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One trial to be written: tables with t [s] from its own origin in the first column."""
+
+    name: str
+    command: np.ndarray  # (T, 3)
+    odometry: np.ndarray | None  # (T, 6)
+    ground_truth: np.ndarray | None  # (T, 4)
+
+
+def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
+    """Write the dataset and load it again.
+
+    Returns:
+        The dataset as the fit will see it, and notes on what was chosen and left out.
+
+    Raises:
+        ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
+    """
+    if not config.source.exists():
+        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a folder of bags or a measured set.")
+    bags = find_bags(config.source)
+    notes: list[str] = []
+    if bags:
+        spec = _spec(config)
+        drives = []
+        for path in bags:
+            found, more = bag_drives(path, config)
+            drives += found
+            notes += [f"{path.name}: {note}" for note in more]
+    else:
+        from sysid.logs.inspection import load_whole
+
+        log = load_whole(config.source, config.select)
+        spec, notes = log.spec, list(log.notes)
+        drives = [trial_drive(trial) for trial in log.trials]
+        if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
+            notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
+    if not drives:
+        raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
+                         "--split bag.")
+    unknown = sorted(set(config.held_out) - {drive.name for drive in drives})
+    if unknown:
+        raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
+                         f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
+    write_dataset(config.out, spec, drives, config.held_out)
+    return load_log(config.out), notes
+
+
+def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str]]:
+    """Trials of one bag, and notes."""
+    asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
+    bag = read_bag(path, {name: topic for name, topic in asked.items() if topic is not None})
+    times = stream_times(bag, config.stamp)
+    notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
+                           for name, stream in bag.streams.items())]
+    if config.stamp == "header" and not np.isfinite(bag.streams["command"].stamped).all():
+        notes.append("commands have no header: their time is that of receipt, the other streams' that of their header")
+    tables = {}
+    for name, t in times.items():
+        keep, dropped = _increasing(t)
+        if dropped:
+            notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
+        tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
+    stem = re.sub(r"[^\w.-]+", "_", path.stem if path.is_file() else path.name)
+    if config.split == "bag":
+        spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),
+                  min(table[-1, 0] for name, table in tables.items() if name != "command"))]
+    else:
+        spans = drive_spans(tables, config.pause)
+        notes.append(f"{len(spans)} drives between standstills of {config.pause:g} s")
+    drives = []
+    for number, span in enumerate(spans, start=1):
+        name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
+        drives.append(cut(name, tables, span, config.truth_ahead, bag))
+    return drives, notes
+
+
+def cut(
+    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], truth_ahead: float, bag: Bag
+) -> Drive:
+    """The part of a recording between two times [s] as a trial that counts from its start.
+
+    The command in force at the start becomes its first row. Odometry is moved to start at the origin with heading 0.
+    """
+    begin, end = span
+    found: dict[str, np.ndarray] = {}
+    for stream, table in tables.items():
+        inside = table[(table[:, 0] >= begin - 1e-9) & (table[:, 0] <= end + 1e-9)].copy()
+        if stream == "command":
+            before = table[table[:, 0] < begin - 1e-9]
+            first = before[-1, 1:] if len(before) else np.zeros(2)
+            inside = np.vstack([[begin, *first], inside[inside[:, 0] > begin + 1e-6]])
+        if len(inside) < 2:
+            raise ValueError(f"{bag.path}: topic {bag.streams[stream].topic} has {len(inside)} messages in the drive "
+                             f"from {begin - _origin(tables):.1f} to {end - _origin(tables):.1f} s; at least 2 are "
+                             "needed. Use --split bag, or leave the topic out.")
+        inside[:, 0] -= begin
+        found[stream] = inside
+    if "odometry" in found:
+        found["odometry"][:, 3] = np.unwrap(found["odometry"][:, 3])
+        found["odometry"][:, 1:4] = _from_start(found["odometry"][:, 1:4])
+    if "ground_truth" in found:
+        pose = found["ground_truth"]
+        pose[:, 1] -= truth_ahead * np.cos(pose[:, 3])
+        pose[:, 2] -= truth_ahead * np.sin(pose[:, 3])
+        pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
+    return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"))
+
+
+def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float, float]]:
+    """Begin and end [s] of each drive: motion, told or measured, with up to LEAD seconds of standstill around it."""
+    t, moving = _motion(tables)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], moving, [False]]).astype(int)))
+    runs = [(t[a], t[min(b, len(t) - 1)]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    merged: list[tuple[float, float]] = []
+    for begin, end in runs:
+        if merged and begin - merged[-1][1] < pause:
+            merged[-1] = merged[-1][0], end
+        else:
+            merged.append((begin, end))
+    merged = [(begin, end) for begin, end in merged if end - begin >= SHORTEST]
+    measured = [table for name, table in tables.items() if name != "command"]
+    first, last = max(table[0, 0] for table in measured), min(table[-1, 0] for table in measured)
+    spans = []
+    for k, (begin, end) in enumerate(merged):
+        low = (merged[k - 1][1] + begin) / 2 if k else first
+        high = (end + merged[k + 1][0]) / 2 if k + 1 < len(merged) else last
+        span = max(begin - LEAD, low, first), min(end + LEAD, high, last)
+        if span[1] - span[0] >= SHORTEST:
+            spans.append(span)
+    return spans
+
+
+def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (G,) [s] every 20 ms, and where the command or the odometry moves (G,) bool."""
+    begin, end = min(table[0, 0] for table in tables.values()), max(table[-1, 0] for table in tables.values())
+    t = np.arange(begin, end, 0.02)
+    command = tables["command"]
+    held = np.searchsorted(command[:, 0], t, side="right") - 1
+    told = np.where(held[:, None] >= 0, command[np.maximum(held, 0), 1:], 0.0)
+    moving = (np.abs(told[:, 0]) > STILL) | (np.abs(told[:, 1]) > STILL)
+    if "odometry" in tables:
+        v, omega = (np.interp(t, tables["odometry"][:, 0], tables["odometry"][:, k]) for k in (4, 5))
+        moving |= (np.abs(v) > MOVING["v"]) | (np.abs(omega) > MOVING["omega"])
+    return t, moving
+
+
+def trial_drive(trial: Trial) -> Drive:
+    """A trial in memory as tables; a window that starts in motion keeps its start pose as its first pose."""
+    command = np.column_stack([trial.command.t, trial.command.v, trial.command.omega])
+    odometry = pose = None
+    if trial.odometry is not None:
+        source = trial.odometry
+        x, y, yaw = (source.x, source.y, source.yaw)
+        if x is None or y is None or yaw is None:
+            x, y, yaw = _integrate(source.t, source.v, source.omega)
+        odometry = np.column_stack([source.t, x, y, yaw, source.v, source.omega])
+    if trial.ground_truth is not None:
+        truth = trial.ground_truth
+        pose = np.column_stack([truth.t, truth.x, truth.y, truth.yaw])
+        if pose[0, 0] > 1e-6:
+            pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
+        pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
+    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), command, odometry, pose)
+
+
+def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = ()) -> None:
+    """Write trials into a dataset folder, all or none; an existing dataset keeps its fields and trials.
+
+    Raises:
+        ValueError: a trial exists already, or two have one name.
+    """
+    names = [drive.name for drive in drives]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{folder}: two trials would be named {twice[0]!r}. Rename one of the bags.")
+    for name in names:
+        if (folder / "trials" / name).exists():
+            raise ValueError(f"{folder / 'trials' / name}: exists already; a conversion never replaces a trial. Choose "
+                             "another --out, or remove the trial.")
+    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    try:
+        for drive in drives:
+            for stream in HEADERS:
+                table = getattr(drive, stream)
+                if table is not None:
+                    write_csv(partial / "trials" / drive.name / f"{stream}.csv", HEADERS[stream], table)
+        (folder / "trials").mkdir(parents=True, exist_ok=True)
+        if not (folder / "dataset.toml").exists():
+            write_fields(folder, spec, held_out)
+        elif held_out:
+            raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
+                             "trials to its held_out by hand.")
+        for name in names:
+            os.replace(partial / "trials" / name, folder / "trials" / name)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _spec(config: ConvertConfig) -> VehicleSpec:
+    changes = {key: value for key in ("wheel_radius", "track", "mass")
+               if (value := getattr(config, key)) is not None}
+    if config.vehicle in SPECS:
+        return replace(find_spec(config.vehicle), **changes)
+    missing = [key for key in ("wheel_radius", "track") if key not in changes]
+    if missing:
+        raise ValueError(f"--vehicle {config.vehicle}: not built in (known: {', '.join(SPECS)}), and no "
+                         f"--{missing[0].replace('_', '-')}. Give --wheel-radius and --track as measured.")
+    return replace(find_spec("whill_cr"), name=config.vehicle, **changes)
+
+
+def _increasing(t: np.ndarray) -> tuple[np.ndarray, int]:
+    """Indices of the times that are later than all before, by a microsecond at least, and how many are not."""
+    keep, latest = [], -np.inf
+    for i, value in enumerate(t):
+        if value >= latest + 1e-6:
+            keep.append(i)
+            latest = value
+    return np.array(keep, int), len(t) - len(keep)
+
+
+def _from_start(pose: np.ndarray) -> np.ndarray:
+    """Poses (T, 3) seen from the first."""
+    x0, y0, yaw0 = pose[0]
+    dx, dy = pose[:, 0] - x0, pose[:, 1] - y0
+    cos, sin = np.cos(yaw0), np.sin(yaw0)
+    return np.column_stack([cos * dx + sin * dy, -sin * dx + cos * dy, pose[:, 2] - yaw0])
+
+
+def _integrate(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dead reckoning of speeds: what an odometry would report that only logged its wheels."""
+    dt = np.diff(t)
+    turn = (omega[1:] + omega[:-1]) / 2 * dt
+    yaw = np.concatenate([[0.0], np.cumsum(turn)])
+    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
+    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
+            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
+
+
+def _origin(tables: dict[str, np.ndarray]) -> float:
+    return min(float(table[0, 0]) for table in tables.values())

@@ -1,0 +1,242 @@
+"""What a log excites, how well its drives repeat, and what therefore no fit can tell from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Log, Trial, command_in_force
+from sysid.logs.lost_pose import LOST, lost
+from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
+from sysid.logs.streams import speeds, standstill
+
+STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
+SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
+SLOW_SECONDS = 1.0  # s of such commands that are enough
+SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What one trial asks of the vehicle. Commands, except where measured is said."""
+
+    v: tuple[float, float]
+    """Least and greatest speed [m/s]."""
+    omega: tuple[float, float]
+    """Least and greatest yaw rate [rad/s]."""
+    reversals: int
+    """Changes of the driving direction."""
+    turn_changes: int
+    """Changes of the turning direction."""
+    slow_seconds: float
+    """Time at speeds or yaw rates so low that a dead zone shows, without the other channel moving faster [s]."""
+    steps: int
+    """Changes of the command."""
+    step_sizes: int
+    """Distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s."""
+    acceleration: float
+    """Greatest measured acceleration, over 0.2 s [m/s^2]."""
+    distance: float
+    """Path that the commands ask for [m]."""
+    turn: float
+    """Sum of turning, whatever direction [rad]."""
+    heading: float
+    """Start heading in the room [rad]; nan without outside pose."""
+    headings: float
+    """Share of the circle of headings that is visited, in 30 degree sectors; nan without outside pose."""
+    standstill: tuple[float, float]
+    """Seconds of standstill before and after the drive."""
+
+
+def excitation(trial: Trial) -> Excitation:
+    """What one trial asks of the vehicle."""
+    command = trial.command
+    hold = np.maximum(np.diff(np.append(command.t, max(trial.duration, command.t[-1]))), 0.0)
+    slow = ((np.abs(command.v) > 1e-6) & (np.abs(command.v) < SLOW["v"]) & (np.abs(command.omega) < SLOW["omega"])) | (
+        (np.abs(command.omega) > 1e-6) & (np.abs(command.omega) < SLOW["omega"]) & (np.abs(command.v) < SLOW["v"]))
+    changes = np.abs(np.column_stack([np.diff(command.v), np.diff(command.omega)]))
+    changed = changes[(changes > 1e-3).any(axis=1)]
+    heading = headings = float("nan")
+    if trial.ground_truth is not None:
+        heading = float(np.angle(np.exp(1j * trial.start.yaw)))
+        sectors = np.floor(np.mod(trial.ground_truth.yaw, 2 * np.pi) / (np.pi / 6)).astype(int) % 12
+        headings = len(np.unique(sectors)) / 12
+    return Excitation(
+        (float(command.v.min()), float(command.v.max())), (float(command.omega.min()), float(command.omega.max())),
+        sign_changes(command.v, STILL["v"]), sign_changes(command.omega, STILL["omega"]), float(hold[slow].sum()),
+        len(changed), len(np.unique(np.round(changed, 1), axis=0)), _peak_acceleration(trial),
+        float((np.abs(command.v) * hold).sum()), float((np.abs(command.omega) * hold).sum()), heading, headings,
+        standstill(command, trial.duration))
+
+
+def sign_changes(values: np.ndarray, dead: float) -> int:
+    """How often values (T,) go from above `dead` to below -dead or back."""
+    signs = np.sign(values[np.abs(values) > dead])
+    return int((np.diff(signs) != 0).sum())
+
+
+def _peak_acceleration(trial: Trial) -> float:
+    found = [speeds(trial, channel, smooth=True) for channel in CHANNELS]
+    rates = [np.abs(np.gradient(one[1], one[0])) for one in found if one is not None and len(one[0]) > 10]
+    # The outside pose, differenced twice, is noise; the odometry is preferred where there is one.
+    return float(np.percentile(rates[-1], 99)) if rates else float("nan")
+
+
+@dataclass(frozen=True)
+class ReplicateGroup:
+    """How well the drives of one manoeuvre repeat."""
+
+    trials: tuple[str, ...]
+    spread: dict[str, float]
+    """Standard deviation between drives by channel, like "ground_truth.x" [m], in the frame of each start."""
+
+
+def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
+    """Spread of each group of replicates."""
+    groups = []
+    for group in replicate_groups(trials):
+        noise = replicate_noise(tuple(group)) or {}
+        spread = {f"{channel}.{name}": float(value) for channel, values in noise.items()
+                  for name, value in zip(SPREAD_NAMES[channel], values, strict=True) if np.isfinite(value)}
+        groups.append(ReplicateGroup(tuple(trial.name for trial in group), spread))
+    return groups
+
+
+def sanity(log: Log) -> list[str]:
+    """Signs that a column has another unit, sign or origin than it should, as sentences."""
+    trials, skid = log.trials, log.spec.drive == "skid"
+    found = []
+    for channel in CHANNELS:
+        for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
+            gains = [gain for trial in trials if (gain := _gain(trial, channel, index)) is not None]
+            if not gains:
+                continue
+            gain = float(np.median(gains))
+            where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(gains)} trials)"
+            if gain < 0:
+                found.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
+                             f"and yaw; negate it.")
+            elif not (0.1 if skid and name == "omega" else 0.4) < gain < 2.0:  # a skid drive scrubs most of its turn
+                found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
+                             "were computed with.")
+        lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
+        ratios = [ours / told for ours, told in lengths if told > 1.0 and np.isfinite(ours)]
+        if ratios and not 0.3 < np.median(ratios) < 3.0:
+            found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
+                         "y must be in metres, of the reference point.")
+    gone = lost(log)
+    if gone:
+        found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "
+                     f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
+                     "against it tell little of a model; a fit leaves such trials out.")
+    return found
+
+
+def _gain(trial: Trial, channel: str, index: int) -> float | None:
+    """Regression of the measured speed (1) or yaw rate (2) on the command, where that varies."""
+    rates = speeds(trial, channel)
+    if rates is None:
+        return None
+    held = command_in_force(trial.command, rates[0] - 0.3)  # the response takes a while; only the rough size counts
+    told = np.where(held >= 0, (trial.command.v, trial.command.omega)[index - 1][np.maximum(held, 0)], 0.0)
+    if told.std() < 0.05:
+        return None
+    centred = told - told.mean()
+    return float(centred @ rates[index] / (centred @ centred))
+
+
+def _length(trial: Trial, channel: str) -> float:
+    stream = trial.ground_truth if channel == "ground_truth" else trial.odometry
+    if stream is None or stream.x is None or stream.y is None:
+        return float("nan")
+    every = max(round(0.5 / max(float(np.median(np.diff(stream.t))), 1e-3)), 1) if len(stream.t) > 1 else 1
+    return float(np.hypot(np.diff(stream.x[::every]), np.diff(stream.y[::every])).sum())
+
+
+def _length_told(trial: Trial) -> float:
+    ideal = ideal_replay(trial)
+    stream = ideal.ground_truth or ideal.odometry
+    if stream is None or stream.x is None or stream.y is None:
+        return 0.0
+    return float(np.hypot(np.diff(stream.x), np.diff(stream.y)).sum())
+
+
+@dataclass(frozen=True)
+class Blind:
+    """One thing that the log cannot tell."""
+
+    cause: str
+    hidden: str
+    """What stays unknown for that reason."""
+    remedy: str
+
+
+def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
+    """What no fit can tell from the training trials of a log, with the drive or sensor that would tell it."""
+    trials = log.training or log.trials
+    found = [excitations[trial.name] for trial in trials]
+    rules: list[tuple[bool, str, str, str]] = [
+        (not any(t.ground_truth is not None for t in trials), "no outside pose",
+         "slip, effective wheel radius and track, lateral damping, odometry scale: odometry shows no motion of its own "
+         "wheels against the ground", "measure the pose from outside: motion capture, lidar, or marks on the floor"),
+        (not any(t.odometry is not None for t in trials), "no odometry",
+         "wheel speeds apart from slip, odometry filter and scale", "log the wheel encoders"),
+        (not any(e.reversals for e in found), "no reversal",
+         "backlash, caster or omni-wheel swing, friction at a change of direction, differences forward and back",
+         "drive forward, back, forward (manoeuvre reversal)"),
+        (sum(e.slow_seconds for e in found) < SLOW_SECONDS, "no slow crossing of zero",
+         "dead zone of the command, static and Stribeck friction",
+         "cross zero slowly in speed and in yaw rate (manoeuvre slow_sine)"),
+        (not any(e.turn_changes for e in found) and not _both_ways(found), "turns to one side only",
+         "track apart from a difference of the wheel radii, from an offset of the centre of mass and from gyro scale",
+         "drive every turn to both sides"),
+        (not any(abs(bound) > 0.1 for e in found for bound in e.omega), "no turn", "track, yaw inertia, scrub",
+         "turn on the spot and drive circles to both sides"),
+        (not any(abs(bound) > 0.05 for e in found for bound in e.v), "no straight motion",
+         "rolling resistance, forward slip, wheel radius", "drive straight at two speeds"),
+        (_few(found, "v", 0.1), "one speed", "resistance that grows with speed, air drag; acceleration limit apart "
+         "from delay and lag", "drive the same manoeuvre at half and at full speed"),
+        (max((e.step_sizes for e in found), default=0) < 3, "steps of hardly any different size",
+         "delay, lag and acceleration limit apart from one another: only their scaling with the step tells them apart",
+         "add random steps (manoeuvre random_steps) or a sweep of step sizes"),
+        (_one_heading(found), "one heading of the room",
+         "slope and side force apart from a difference of the wheel radii: they act along fixed directions of the room",
+         "start the same drive at four headings, or drive a square"),
+        (sum(sum(e.standstill) for e in found) < 5.0, "hardly any standstill",
+         "gyro bias and drift; the noise of the sensors apart from motion", "stand 5 s before and after the drive"),
+        (max((e.standstill[0] for e in found), default=0) < 0.5, "no standstill before the first command",
+         "the start pose, except from its first sample; drives that begin in motion need the wheel speeds",
+         "stand one second before each drive"),
+        (not replicate_groups(tuple(trials)), "no replicates",
+         "the noise floor, and so whether anything is missing in a model",
+         "repeat each manoeuvre two or three times with the same commands (circle_1, circle_2, ...)"),
+        (not log.held_out, "nothing held out", "how well the fit predicts", "name a manoeuvre in held_out"),
+        (not any(e.acceleration > 2.0 for e in found), "no hard acceleration",
+         "torque limit and friction limit: they only bound what is seen",
+         "brake and start at the full command, on the surface in question"),
+    ]
+    always = Blind("velocities and poses only", "mass, motor gain and battery voltage apart from one another: they act "
+                   "as ratios", "weigh the vehicle, add a known mass, or log the motor current")
+    return [Blind(cause, hidden, remedy) for holds, cause, hidden, remedy in rules if holds] + [always]
+
+
+def _both_ways(found: Sequence[Excitation]) -> bool:
+    return any(e.omega[0] < -0.1 for e in found) and any(e.omega[1] > 0.1 for e in found)
+
+
+def _few(found: Sequence[Excitation], name: str, width: float) -> bool:
+    """Whether the trials' greatest speeds, where they move at all, differ by less than `width`."""
+    greatest = [max(abs(bound) for bound in getattr(e, name)) for e in found]
+    moving = [value for value in greatest if value > 0.05]
+    return bool(moving) and max(moving) - min(moving) < width and all(e.step_sizes < 3 for e in found)
+
+
+def _one_heading(found: Sequence[Excitation]) -> bool:
+    """Whether the headings of all trials together cover less than half the circle."""
+    known = [e for e in found if np.isfinite(e.heading)]
+    if not known or max(e.headings for e in known) > 0.5:
+        return False
+    starts = np.exp(1j * np.array([e.heading for e in known]))
+    return bool(abs(starts.mean()) > 0.7)

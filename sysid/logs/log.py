@@ -1,0 +1,394 @@
+"""Measured driving logs in memory, and the loader of the driving-log dataset (docs/log_format.md).
+
+Every stream keeps its own clock, as real logs do. All quantities are SI, yaw is unwrapped on loading. Poses are of the
+reference point: the centre of the driven axle (the vehicle's centre for skid drive).
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
+
+SCHEMA = 1
+STANDSTILL = 1.0
+"""Longest part of a trial's start that is used to find its start pose [s]."""
+START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
+MAX_SPEED = 20.0  # m/s; more is km/h or mm/s
+MAX_YAW_RATE = 20.0  # rad/s; more is deg/s
+MAX_TIME = 1e7  # s; more is a Unix time stamp or milliseconds
+
+COMMAND_COLUMNS = ("t", "v", "omega")
+ODOMETRY_COLUMNS = ("t", "x", "y", "yaw", "v", "omega")
+POSE_COLUMNS = ("t", "x", "y", "yaw")
+FIELDS = {
+    "schema", "vehicle", "drive", "driven_axle", "wheel_radius", "track", "wheelbase", "mass", "command_limits",
+    "reference_point", "odometry", "ground_truth", "held_out",
+}
+REFERENCE_POINTS = ("drive axle centre", "vehicle centre")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Commanded velocities; each holds until the next."""
+
+    t: np.ndarray  # (T,) s
+    v: np.ndarray  # (T,) m/s
+    omega: np.ndarray  # (T,) rad/s
+
+
+@dataclass(frozen=True)
+class OdometryStream:
+    """What the vehicle's own odometry reported; channels that were not logged are None."""
+
+    t: np.ndarray  # (T,) s
+    x: np.ndarray | None  # (T,) m, from the trial's start
+    y: np.ndarray | None
+    yaw: np.ndarray | None  # (T,) rad, unwrapped
+    v: np.ndarray  # (T,) m/s
+    omega: np.ndarray  # (T,) rad/s
+
+
+@dataclass(frozen=True)
+class PoseStream:
+    """Outside measurement of the reference point in a fixed room frame."""
+
+    t: np.ndarray  # (T,) s
+    x: np.ndarray  # (T,) m
+    y: np.ndarray
+    yaw: np.ndarray  # (T,) rad, unwrapped
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where and how fast the vehicle starts: room frame, reference point."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    v: float = 0.0
+    omega: float = 0.0
+    position_sigma: float = 0.0
+    """Standard error of x and y [m]."""
+    yaw_sigma: float = 0.0
+    """Standard error of yaw [rad]."""
+    odometry_position_sigma: float = 0.0
+    """Standard error of the origin from which the odometry counts x and y [m]."""
+    odometry_yaw_sigma: float = 0.0
+    """Standard error of the heading from which it counts yaw, and along which x points [rad]."""
+    measured: bool = False
+    """Whether the pose is the outside measurement at t = 0 itself."""
+    rest: float = 0.0
+    """Until when poses were averaged for it [s]."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One drive (or one window of a longer one)."""
+
+    name: str
+    manoeuvre: str
+    """Trials of one manoeuvre with equal commands are replicates."""
+    command: Command
+    odometry: OdometryStream | None
+    ground_truth: PoseStream | None
+    start: Start
+    held_out: bool = False
+    group: str = ""
+    """Terrain or robot; part of a selection."""
+    breaks: tuple[tuple[float, float], ...] = ()
+    """Times between which the outside pose moved by an unknown amount [s]."""
+
+    @property
+    def duration(self) -> float:
+        """Time of the last measurement [s]; the trial starts at 0."""
+        return max(float(s.t[-1]) for s in (self.odometry, self.ground_truth) if s is not None)
+
+
+@dataclass(frozen=True)
+class Log:
+    """All trials of one vehicle."""
+
+    name: str
+    spec: VehicleSpec
+    trials: tuple[Trial, ...]
+    sha256: str
+    notes: tuple[str, ...] = ()
+    fields: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def training(self) -> tuple[Trial, ...]:
+        return tuple(trial for trial in self.trials if not trial.held_out)
+
+    @property
+    def held_out(self) -> tuple[Trial, ...]:
+        return tuple(trial for trial in self.trials if trial.held_out)
+
+    def select(self, keep: Callable[[Trial], bool]) -> Log:
+        """The same log with only the trials that `keep` accepts."""
+        return replace(self, trials=tuple(trial for trial in self.trials if keep(trial)))
+
+
+def load_log(folder: str | Path) -> Log:
+    """Load a driving-log dataset.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file, the value, the rule and the remedy.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder. Give the folder that holds dataset.toml and trials/.")
+    fields = _read_fields(folder / "dataset.toml")
+    spec, notes = spec_from_fields(folder / "dataset.toml", fields)
+    held_out = fields.get("held_out", [])
+    trial_folders = sorted(path for path in (folder / "trials").glob("*") if path.is_dir())
+    if not trial_folders:
+        raise ValueError(f"{folder / 'trials'}: no trial in it. Each trial is a folder trials/NAME with command.csv.")
+    unknown = sorted(set(held_out) - {path.name for path in trial_folders})
+    if unknown:
+        raise ValueError(f"{folder / 'dataset.toml'}: held_out names {unknown}, which are not under trials/. "
+                         "Correct the names, or nothing is really held out.")
+    trials = tuple(load_trial(path, path.name in held_out) for path in trial_folders)
+    return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
+
+
+def load_trial(folder: Path, held_out: bool = False) -> Trial:
+    """Load and check one trial folder."""
+    command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
+    command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
+    odometry = ground_truth = None
+    if (folder / "odometry.csv").exists():
+        columns = read_csv(folder / "odometry.csv", ODOMETRY_COLUMNS)
+        odometry = OdometryStream(**{name: columns[name] for name in ODOMETRY_COLUMNS})
+    if (folder / "ground_truth.csv").exists():
+        columns = read_csv(folder / "ground_truth.csv", POSE_COLUMNS)
+        ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
+    if odometry is None and ground_truth is None:
+        raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them.")
+    for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
+        if stream is not None:
+            _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
+    if odometry is not None and odometry.yaw is not None:
+        odometry = replace(odometry, yaw=np.unwrap(odometry.yaw))
+    if ground_truth is not None:
+        ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
+    return make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
+
+
+def make_trial(
+    name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
+    held_out: bool = False, group: str = "",
+) -> Trial:
+    """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
+    the odometry is counted from there.
+
+    A trial whose first command already moves starts in motion, at the speeds that the odometry then reports, or at
+    those commanded where there is no odometry. Such a start is known from its first sample alone.
+    """
+    still = standstill_end(command)
+    v, omega = _start_speeds(command, odometry)
+    start = Start(v=v, omega=omega, rest=still)
+    if ground_truth is not None:
+        rest = _rest(ground_truth.t, still)
+        x, y, yaw = ground_truth.x[rest], ground_truth.y[rest], ground_truth.yaw[rest]
+        position_sigma, yaw_sigma = _standard_errors(x, y, yaw)
+        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()), v, omega, position_sigma, yaw_sigma,
+                      rest=still)
+    if odometry is not None and odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
+        rest = _rest(odometry.t, still)
+        position_sigma, yaw_sigma = _standard_errors(odometry.x[rest], odometry.y[rest], odometry.yaw[rest])
+        start = replace(start, odometry_position_sigma=position_sigma, odometry_yaw_sigma=yaw_sigma)
+        x, y = odometry.x - odometry.x[rest].mean(), odometry.y - odometry.y[rest].mean()
+        yaw0 = odometry.yaw[rest].mean()
+        cos, sin = np.cos(yaw0), np.sin(yaw0)
+        odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
+    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out, group)
+
+
+def manoeuvre_of(trial_name: str) -> str:
+    """Name without its replicate number: circle_2 -> circle."""
+    return re.sub(r"_\d+$", "", trial_name)
+
+
+def standstill_end(command: Command) -> float:
+    """Time of the first command to move, at most one second after the first command [s]."""
+    moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
+    first = command.t[moving[0]] if len(moving) else np.inf
+    return float(min(first, command.t[0] + STANDSTILL))
+
+
+def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Columns of a CSV file as float arrays, checked for presence, numbers, time order and range."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: missing. A trial needs it with the columns {', '.join(columns)}.")
+    with open(path, newline="") as file:
+        rows = list(csv.reader(file))
+    header = [name.strip() for name in rows[0]] if rows else []
+    for name in columns:
+        if name not in header:
+            raise ValueError(f"{path}: no column {name!r} (found {header}). It needs {', '.join(columns)} in SI units; "
+                             "see docs/log_format.md.")
+    if len(rows) < 3:
+        raise ValueError(f"{path}: {max(len(rows) - 1, 0)} rows of data; at least 2 are needed. "
+                         "Delete the empty trial or record it again.")
+    table = np.empty((len(rows) - 1, len(columns)))
+    for i, row in enumerate(rows[1:]):
+        for j, name in enumerate(columns):
+            k = header.index(name)
+            try:
+                table[i, j] = float(row[k])
+            except (ValueError, IndexError):
+                value = row[k] if k < len(row) else ""
+                raise ValueError(f"{path}, line {i + 2}: {name} is {value!r}; it must be a number. "
+                                 "Leave a missing sample's row out.") from None
+            if not np.isfinite(table[i, j]):
+                raise ValueError(f"{path}, line {i + 2}: {name} is {row[k]}; it must be finite. "
+                                 "Leave a missing sample's row out.")
+    data = {name: table[:, j] for j, name in enumerate(columns)}
+    _check_time(path, data["t"])
+    for name, limit, hint in (("v", MAX_SPEED, "m/s: is it in km/h or mm/s?"),
+                              ("omega", MAX_YAW_RATE, "rad/s: is it in deg/s?")):
+        if name in data and np.abs(data[name]).max() > limit:
+            worst = int(np.abs(data[name]).argmax())
+            raise ValueError(f"{path}, line {worst + 2}: {name} is {data[name][worst]:g}; at most {limit:g} is "
+                             f"plausible. Convert it to {hint}")
+    return data
+
+
+def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, list[str]]:
+    """Vehicle spec from the fields of dataset.toml, and notes on what had to be assumed."""
+    name = fields["vehicle"]
+    sizes: dict[str, Any] = {}  # m, kg
+    for key, limit in (("wheel_radius", 2.0), ("track", 5.0), ("wheelbase", 10.0), ("mass", 1e4)):
+        if key not in fields:
+            if key in ("wheel_radius", "track") and name not in SPECS:
+                raise ValueError(f"{path}: no {key}. Add {key} = VALUE in metres, measured on the vehicle.")
+            continue
+        value = fields[key]
+        if not isinstance(value, int | float) or not value > 0:
+            raise ValueError(f"{path}: {key} is {value!r}; it must be a positive number (m, kg).")
+        if value > limit:
+            raise ValueError(f"{path}: {key} is {value:g}; at most {limit:g} is plausible. Use m and kg.")
+        sizes[key] = float(value)
+    changes: dict[str, Any] = {key: fields[key] for key in ("drive", "driven_axle") if key in fields}
+    if name in SPECS:
+        base, source = replace(SPECS[name], **sizes), f"that of {name}"
+    else:
+        like = HUSKY if fields.get("drive") == "skid" else WHILL_CR
+        base, source = in_proportion(like, name, **sizes), f"in proportion to {like.name}"
+    notes = [f"{key} is not in dataset.toml: {getattr(base, key):.3g} is assumed, {source}"
+             for key in ("wheel_radius", "track", "wheelbase", "mass") if key not in sizes]
+    if "command_limits" in fields:
+        limits = fields["command_limits"]
+        if not (isinstance(limits, list) and len(limits) == 2 and all(value > 0 for value in limits)):
+            raise ValueError(f"{path}: command_limits is {limits!r}; it must be [v, omega], both positive, "
+                             "in m/s and rad/s.")
+        changes.update(v_min=-float(limits[0]), v_max=float(limits[0]), omega_max=float(limits[1]))
+    try:
+        return replace(base, **changes), notes
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def hash_files(folder: Path) -> str:
+    """SHA-256 over names and contents of all data files of a dataset."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.suffix in (".toml", ".csv", ".npz", ".gz"):
+            digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _read_fields(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: missing. A dataset needs it to name the vehicle, its geometry and the "
+                                "held-out trials; see docs/log_format.md.")
+    try:
+        fields = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML ({error}). Strings need quotes, decimals a point.") from None
+    unknown = sorted(set(fields) - FIELDS)
+    if unknown:
+        raise ValueError(f"{path}: unknown field {unknown[0]!r} (known: {', '.join(sorted(FIELDS))}). "
+                         "Correct its spelling or remove it.")
+    if fields.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: schema is {fields.get('schema')!r}; this program reads schema {SCHEMA}. "
+                         "Write schema = 1 and follow docs/log_format.md.")
+    if not isinstance(fields.get("vehicle"), str) or not fields["vehicle"]:
+        raise ValueError(f"{path}: vehicle is {fields.get('vehicle')!r}; it must be a name or short description.")
+    point = fields.get("reference_point", REFERENCE_POINTS[0])
+    if point not in REFERENCE_POINTS:
+        raise ValueError(f"{path}: reference_point is {point!r} (known: {', '.join(REFERENCE_POINTS)}). "
+                         "Move the measured poses to one of them before writing the log.")
+    return fields
+
+
+def _check_time(path: Path, t: np.ndarray) -> None:
+    if np.abs(t).max() > MAX_TIME:
+        raise ValueError(f"{path}: t reaches {np.abs(t).max():g}; it must be in seconds from the trial's start. "
+                         "Subtract the first time stamp, and divide milli- or nanoseconds.")
+    steps = np.diff(t)
+    if (steps <= 0).any():
+        line = int(np.flatnonzero(steps <= 0)[0])
+        raise ValueError(f"{path}, line {line + 3}: t goes from {t[line]:g} to {t[line + 1]:g}; it must increase. "
+                         "Sort the rows, drop duplicates, and split the trial where its clock was set back.")
+
+
+def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Command) -> None:
+    """Distance and turn must be possible under the commands: this finds degrees, millimetres and wrong trials."""
+    if stream.t[-1] < command.t[0] or stream.t[0] > command.t[-1] + 60:
+        raise ValueError(f"{path}: covers {stream.t[0]:g} to {stream.t[-1]:g} s but the commands cover "
+                         f"{command.t[0]:g} to {command.t[-1]:g} s. All streams of a trial count from one origin.")
+    hold = np.diff(np.append(command.t, max(stream.t[-1], command.t[-1])))
+    distance = 5.0 + 3.0 * float((np.abs(command.v) * hold).sum())
+    turn = 2 * np.pi + 3.0 * float((np.abs(command.omega) * hold).sum())
+    for name, limit, hint in (("x", distance, "metres"), ("y", distance, "metres"), ("yaw", turn, "radians")):
+        values = getattr(stream, name)
+        if values is not None and np.ptp(values) > limit:
+            raise ValueError(f"{path}: {name} spans {np.ptp(values):g}, though the commands allow {limit:.3g} at most. "
+                             f"Convert it to {hint}, or correct the commands.")
+
+
+def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[float, float]:
+    """Speed [m/s] and yaw rate [rad/s] at the start; exactly 0 at rest, whatever the sensors' noise."""
+    told = float(command.v[0]), float(command.omega[0])
+    if command.t[0] > 0 or max(abs(told[0]), abs(told[1])) < 1e-6:
+        return 0.0, 0.0
+    speeds = told if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
+    return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
+
+
+def _rest(t: np.ndarray, still: float) -> np.ndarray:
+    """Indices of the samples before the vehicle moves; the first sample where there is none."""
+    indices = np.flatnonzero(t <= still)
+    return indices if len(indices) else np.array([0])
+
+
+def _standard_errors(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[float, float]:
+    """Of the mean position, per axis, and of the mean yaw over samples (M,) at rest; 0 of a single sample."""
+    if len(x) < 2:
+        return 0.0, 0.0
+    position = np.sqrt((x.var(ddof=1) + y.var(ddof=1)) / 2 / len(x))
+    return float(position), float(np.sqrt(yaw.var(ddof=1) / len(x)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A simulated trial at the times of the measurements."""
+
+    ground_truth: PoseStream | None
+    odometry: OdometryStream | None
+
+
+def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
+    """Index of the command that holds at times t (T,); -1 before the first."""
+    return np.searchsorted(command.t, t + 1e-9, side="right") - 1

@@ -1,0 +1,371 @@
+"""Loaders of two published measured datasets, in their original form, into the same in-memory log.
+
+`drive_norlab`: commanded wheel speeds against lidar ICP motion of skid-steered robots (Baril et al., "DRIVE", ICRA
+2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping,
+Dataset 6 (Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
+
+Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
+both systems repeat the last value between updates.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
+from sysid.logs.lost_pose import without_lost
+from sysid.logs.streams import without_held
+from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
+
+DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
+DRIVE_ROWS = 40  # samples of one window (2 s)
+DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
+MOVING = 0.05  # m of track or wheel travel below which a window tells nothing
+# The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
+GYRO_SIGN = {"warthog_gravel": -1.0}
+MRCLAM_WINDOW = 15.0  # s
+MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
+MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
+
+
+def detect_format(path: str | Path) -> str:
+    """"dataset", "drive_norlab" or "mrclam", by the files in the folder; ValueError when it is none of them."""
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder. Give the folder of a dataset.")
+    if (path / "dataset.toml").exists() or (path / "trials").exists():
+        return "dataset"
+    if any(path.glob("MRCLAM_*_Odometry.dat.gz")):
+        return "mrclam"
+    if any(path.glob("*.npz")):
+        return "drive_norlab"
+    raise ValueError(f"{path}: no dataset.toml, no *.npz and no MRCLAM_*_Odometry.dat.gz in it. Name the folder that "
+                     "holds one of them; the formats are in docs/log_format.md.")
+
+
+def drive_spec(run: str) -> VehicleSpec:
+    """Nominal geometry of the robot that drove `run` (the constants and their sources are in
+    whill_mjx.vehicle.specs)."""
+    return HUSKY if run.startswith("husky") else WARTHOG
+
+
+def drive_group(run: str) -> str:
+    """Terrain of a run: warthog_sand_1 -> sand; the run's own name where the terrain is not stated."""
+    for terrain in ("asphalt", "gravel", "sand", "grass"):
+        if terrain in run:
+            return terrain
+    return run
+
+
+def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
+    """Load DRIVE runs of one robot.
+
+    Args:
+        folder: folder with the .npz and .csv.gz files.
+        runs: file stems, e.g. ("warthog_sand_1",).
+        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the note on
+            the log states how often and by how much.
+
+    Returns:
+        One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
+        `fields["yaw_rate"]` all of it: times [s] and rates [rad/s].
+        `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
+    """
+    folder = Path(folder)
+    specs = {drive_spec(run) for run in runs}
+    if len(specs) != 1:
+        raise ValueError(f"{folder}: runs {runs} are of {len(specs)} different robots; fit one robot at a time.")
+    trials: list[Trial] = []
+    notes = []
+    gyro: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for run in runs:
+        found = sorted(folder.glob(f"{run}.*"))
+        if not found:
+            known = sorted(path.name.split(".")[0] for path in folder.glob("warthog*")) + ["husky_steps_000_133"]
+            raise FileNotFoundError(f"{folder}: no run {run!r} (known: {', '.join(known)}).")
+        if found[0].suffix == ".npz":
+            run_trials, note, run_gyro = _drive_windows(found[0], run, chained)
+            gyro.update(run_gyro)
+        else:
+            run_trials, note = _drive_continuous(found[0], run, 6.0 if chained else 2.0)
+        trials += run_trials
+        notes.append(note)
+    return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes),
+               {"gyro": {name: float(rate.mean()) for name, (_, rate) in gyro.items()}, "yaw_rate": gyro,
+                "pose_stamps": "receipt"})
+
+
+def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
+    """Load MRCLAM robots as consecutive windows in which the robot was told to move."""
+    folder = Path(folder)
+    trials: list[Trial] = []
+    notes = []
+    for robot in robots:
+        robot_trials, note = _mrclam_robot(folder, robot, window)
+        trials += robot_trials
+        notes.append(note)
+    return Log("mrclam", CREATE, tuple(trials), hash_files(folder), tuple(notes))
+
+
+def only_changes(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> PoseStream:
+    """The samples at which the pose differs from the one before (yaw unwrapped); the first sample is the start."""
+    yaw = np.unwrap(yaw)
+    changed = np.flatnonzero((np.diff(x) != 0) | (np.diff(y) != 0) | (np.diff(yaw) != 0)) + 1
+    return PoseStream(t[changed], x[changed], y[changed], yaw[changed])
+
+
+def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(v [m/s], omega [rad/s]) of an ideal differential drive from wheel speeds [rad/s]."""
+    return spec.wheel_radius * (left + right) / 2, spec.wheel_radius * (right - left) / spec.track
+
+
+def _drive_windows(path: Path, run: str, chained: bool
+                   ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    with np.load(path, allow_pickle=False) as file:
+        missing = {"data", "columns"} - set(file.files)
+        if missing:
+            raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
+        data, columns = file["data"], [str(name) for name in file["columns"]]
+    index = {name: i for i, name in enumerate(columns)}
+
+    def block(name: str) -> np.ndarray:
+        try:
+            return data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
+        except KeyError as error:
+            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
+
+    spec = drive_spec(run)
+    command_v, command_omega = twist_from_wheels(spec, block("cmd_left"), block("cmd_right"))
+    wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
+    x, y, yaw = block("icp_x"), block("icp_y"), np.unwrap(block("icp_yaw"), axis=1)
+    gyro = GYRO_SIGN.get(run, 1.0) * block("imu_yaw")
+    if not np.isfinite(data[:, [index[f"icp_x_{i}"] for i in range(DRIVE_ROWS)]]).all():
+        raise ValueError(f"{path}: icp_x is not finite. Convert the original again and leave out incomplete windows.")
+    length = DRIVE_STEP_ROWS if chained else 1
+    t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
+    trials, missed = [], []
+    rates = {}
+    for row in range(0, len(data) - length + 1, length):
+        rows = slice(row, row + length)
+        step, window = divmod(row, DRIVE_STEP_ROWS)
+        name = f"{run}/{step:03d}.{window}"
+        pose = (x[row], y[row], yaw[row])
+        breaks: list[tuple[float, float]] = []
+        for k in range(row + 1, row + length):
+            pose, gap, between = _chain(pose, (x[k], y[k], yaw[k]))
+            missed.append(gap)
+            if gap > 0:
+                breaks.append((between[0] * DRIVE_DT, between[1] * DRIVE_DT))
+        command = Command(t, command_v[rows].ravel(), command_omega[rows].ravel())
+        odometry = OdometryStream(t, None, None, None, wheel_v[rows].ravel(), wheel_omega[rows].ravel())
+        start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]), measured=True)
+        truth = only_changes(t, *pose)
+        if len(truth.t) == 0 or DRIVE_DT * np.abs(wheel_v[rows]).sum() + spec.track / 2 * DRIVE_DT * np.abs(
+                wheel_omega[rows]).sum() < MOVING:
+            continue
+        trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
+                            breaks=tuple(breaks)))
+        rates[name] = t, gyro[rows].ravel()
+    note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
+    if chained:
+        late = np.array([gap for gap in missed if gap > 0] or [0.0])
+        note += (f", chained by the last pose of each 2 s window: {np.mean(np.array(missed) > 0):.0%} of the joints "
+                 f"miss an ICP update; those are off by {np.median(late):.2f} m (median), {late.max():.2f} m at most")
+    return trials, note, rates
+
+
+def _chain(
+    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, tuple[int, int]]:
+    """Both windows in the frame of the first, the motion that the joint misses [m] (0 where it misses none), and the
+    samples between which it does.
+
+    The second window's frame is that of its own first sample. An ICP update between the last sample of the first
+    window and the first sample of the second is lost; then the time since the last change is over 1.5 update periods.
+    """
+    x0, y0, yaw0 = (float(values[-1]) for values in first)
+    cos, sin = np.cos(yaw0), np.sin(yaw0)
+    x, y, yaw = second
+    joined = (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
+              np.concatenate([first[2], yaw0 + yaw]))
+    n = len(first[0])
+    changes = np.flatnonzero(np.diff(joined[0]) != 0) + 1
+    before, after = changes[changes < n], changes[changes > n]
+    if len(before) < 2 or len(after) < 2:
+        return joined, 0.0, (n, n)
+    period = float(np.median(np.diff(changes)))
+    if after[0] - before[-1] <= 1.5 * period:
+        return joined, 0.0, (n, n)
+    speed = np.hypot(joined[0][after[-1]] - joined[0][after[0]], joined[1][after[-1]] - joined[1][after[0]])
+    return joined, float(speed / max(after[-1] - after[0], 1) * period), (int(before[-1]), int(after[0]))
+
+
+def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
+    """Windows of the continuous log during its calibration phases (elsewhere a joystick drove and was not logged)."""
+    with gzip.open(path, "rt") as file:
+        rows = list(csv.DictReader(file))[1:]  # the first row is filler
+
+    def column(name: str) -> np.ndarray:
+        if name not in rows[0]:
+            raise ValueError(f"{path}: no column {name!r} (found {sorted(rows[0])}). Convert the original again.")
+        return np.array([float(row[name] or "nan") for row in rows])
+
+    spec = drive_spec(run)
+    time = np.array([int(float(row["ros_time"])) if "e" in row["ros_time"] else int(row["ros_time"].split(".")[0])
+                     for row in rows])
+    t = (time - time[0]) * 1e-9
+    calibrating = np.array([row["calib_state"] == "calib" for row in rows])
+    qx, qy, qz, qw = (column(f"icp_quat_{axis}") for axis in "xyzw")
+    yaw = np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
+    x, y = column("icp_pos_x"), column("icp_pos_y")
+    wheel_v, wheel_omega = twist_from_wheels(spec, column("meas_left_vel"), column("meas_right_vel"))
+    command_v, command_omega = column("cmd_vel_x"), column("cmd_vel_omega")
+    trials = []
+    for number, begin in enumerate(np.arange(0.0, t[-1] - window, window)):
+        inside = np.flatnonzero((t >= begin) & (t < begin + window))
+        if len(inside) < 10 or not calibrating[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
+            continue
+        first = inside[0]
+        now = t[inside] - t[first]
+        cos, sin = np.cos(yaw[first]), np.sin(yaw[first])
+        dx, dy = x[inside] - x[first], y[inside] - y[first]
+        truth = only_changes(now, cos * dx + sin * dy, -sin * dx + cos * dy, yaw[inside] - yaw[first])
+        if len(truth.t) == 0 or np.abs(wheel_v[inside]).max() + np.abs(wheel_omega[inside]).max() < MOVING:
+            continue
+        command = Command(now, command_v[inside], command_omega[inside])
+        odometry = OdometryStream(now, None, None, None, wheel_v[inside], wheel_omega[inside])
+        start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
+        trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run)))
+    return trials, f"{run}: {len(trials)} windows of {window:g} s during calibration phases"
+
+
+def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
+    command = _read_gz(folder, robot, "Odometry", 3)
+    truth = _read_gz(folder, robot, "Groundtruth", 4)
+    yaw = np.unwrap(truth[:, 3])
+    begin, end = max(command[0, 0], truth[0, 0]), min(command[-1, 0], truth[-1, 0])
+    trials = []
+    for number, start_time in enumerate(np.arange(begin, end - window, window)):
+        inside = np.flatnonzero((truth[:, 0] >= start_time) & (truth[:, 0] < start_time + window))
+        if len(inside) < 10 or np.diff(truth[inside, 0]).max() > MAX_GAP:
+            continue
+        first = inside[0]
+        t0 = truth[first, 0]
+        held = max(int(np.searchsorted(command[:, 0], t0, side="right")) - 1, 0)
+        last = int(np.searchsorted(command[:, 0], truth[inside[-1], 0], side="right"))
+        t = np.maximum(command[held:last, 0] - t0, 0.0)
+        v, omega = command[held:last, 1], command[held:last, 2]
+        keep = np.append(np.diff(t) > 0, True)
+        if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
+            continue
+        pose = only_changes(truth[inside, 0] - t0, truth[inside, 1], truth[inside, 2], yaw[inside])
+        trials.append(Trial(
+            f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
+            thin(pose, MRCLAM_SPACING),
+            Start(float(truth[first, 1]), float(truth[first, 2]), float(yaw[first]), float(v[0]), float(omega[0]),
+                  measured=True),
+            group=f"robot{robot}"))
+    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are the commands in force"
+
+
+def thin(pose: PoseStream, spacing: float) -> PoseStream:
+    """The stream with samples at least `spacing` seconds apart."""
+    keep, last = [], -np.inf
+    for i, t in enumerate(pose.t):
+        if t - last >= spacing:
+            keep.append(i)
+            last = t
+    return PoseStream(pose.t[keep], pose.x[keep], pose.y[keep], pose.yaw[keep])
+
+
+def _read_gz(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
+    path = folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz"
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: missing. Robots are 1 to 5; get the files from "
+                                "asrl.utias.utoronto.ca/datasets/mrclam and compress them with gzip.")
+    table = np.loadtxt(path)
+    if table.ndim != 2 or table.shape[1] != columns:
+        raise ValueError(f"{path}: {table.shape} values; {columns} columns are needed. Use the original file.")
+    if (np.diff(table[:, 0]) < 0).any():
+        raise ValueError(f"{path}: time runs backwards. Use the original file.")
+    return table
+
+
+def split(log: Log, train: tuple[str, ...], held_out: tuple[str, ...]) -> Log:
+    """Log with only the selected trials, marked as training or held-out.
+
+    A selection is GROUP, RUN, or RUN:FROM-TO with shares of the run's time, e.g. "warthog_asphalt_a:0-0.667".
+    """
+    chosen: dict[str, bool] = {}
+    for selections, is_held_out in ((train, False), (held_out, True)):
+        for selection in selections:
+            names = _selected(log, selection)
+            for name in names:
+                if chosen.get(name, is_held_out) != is_held_out:
+                    raise ValueError(f"trial {name} is selected for training and as held out; "
+                                     "make the selections disjoint.")
+                chosen[name] = is_held_out
+    return replace(log, trials=tuple(replace(trial, held_out=chosen[trial.name])
+                                     for trial in log.trials if trial.name in chosen))
+
+
+def _selected(log: Log, selection: str) -> list[str]:
+    key, _, share = selection.partition(":")
+    names = [trial.name for trial in log.trials if key in (trial.name.split("/")[0], trial.group, trial.name)]
+    if not names:
+        known = sorted({trial.name.split("/")[0] for trial in log.trials} | {trial.group for trial in log.trials})
+        raise ValueError(f"selection {selection!r} matches no trial (known: {', '.join(known)}).")
+    if not share:
+        return names
+    try:
+        low, high = (float(value) for value in share.split("-"))
+    except ValueError:
+        raise ValueError(f"selection {selection!r}: {share!r} must be FROM-TO, shares of the run, e.g. 0-0.667."
+                         ) from None
+    return [name for i, name in enumerate(names) if low <= i / len(names) < high]
+
+
+def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), held_out: tuple[str, ...] = (),
+             chained: bool = False) -> Log:
+    """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
+
+    Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.lost_pose`), and so are a
+    dataset's rows that were held between updates (`sysid.logs.streams.without_held`); a note says either.
+    """
+    from sysid.logs.log import load_log
+
+    form = detect_format(path) if form == "auto" else form
+    if form == "dataset":
+        log: Log = _without_held(load_log(path))
+        return split(log, train, held_out) if train else log
+    if not train:
+        raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
+                         + ("warthog_sand_1" if form == "drive_norlab" else "robot1 robot2 robot3")
+                         + ", and --held-out.")
+    keys: list[Any] = [selection.partition(":")[0] for selection in (*train, *held_out)]
+    if form == "drive_norlab":
+        return without_lost(split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out))
+    if form == "mrclam":
+        robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
+        return split(load_mrclam(path, robots), train, held_out)
+    raise ValueError(f"unknown format {form!r} (known: auto, dataset, drive_norlab, mrclam).")
+
+
+def _without_held(log: Log) -> Log:
+    """The log without held rows, and a note where there were any."""
+    def rows(trial: Trial) -> int:
+        return sum(len(stream.t) for stream in (trial.odometry, trial.ground_truth) if stream is not None)
+
+    trials = tuple(without_held(trial) for trial in log.trials)
+    before, after = sum(map(rows, log.trials)), sum(map(rows, trials))
+    if after == before:
+        return log
+    return replace(log, trials=trials, notes=(*log.notes,
+        f"{before - after} of {before} rows of odometry and outside pose repeat the row before while the vehicle "
+        "moves: they were held between updates and are not scored again"))

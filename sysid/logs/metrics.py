@@ -1,0 +1,196 @@
+"""Errors between a simulated and a measured trial: the paper's four numbers, per channel.
+
+Frames: the simulation starts at the measured start pose in the room frame, which comes from the standstill second alone
+(`sysid.logs.log.make_trial`); nothing else is aligned. Odometry counts from that start. Odometry and outside pose
+are scored apart: a vehicle whose wheels slip has two different motions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, command_in_force, manoeuvre_of
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Root mean square errors of one trial and channel; None where the channel was not measured."""
+
+    trajectory: float | None  # m, distance between positions
+    velocity: float | None  # m/s
+    angular_velocity: float | None  # rad/s
+    yaw: float | None  # rad
+
+    def as_dict(self) -> dict[str, float | None]:
+        return {"trajectory": self.trajectory, "velocity": self.velocity,
+                "angular_velocity": self.angular_velocity, "yaw": self.yaw}
+
+
+METRICS = ("trajectory", "velocity", "angular_velocity", "yaw")
+UNITS = {"trajectory": "m", "velocity": "m/s", "angular_velocity": "rad/s", "yaw": "rad"}
+CHANNELS = ("ground_truth", "odometry")
+
+
+def rmse(error: np.ndarray) -> float:
+    """Root mean square of (T,)."""
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+def wrap(angle: np.ndarray) -> np.ndarray:
+    """Angle in (-pi, pi]: a difference of headings, whatever full turns either side counted."""
+    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
+
+
+def score(trial: Trial, prediction: Prediction) -> dict[str, Errors]:
+    """Errors per channel ("ground_truth", "odometry") of those that were measured."""
+    scores = {}
+    if trial.ground_truth is not None and prediction.ground_truth is not None:
+        measured, simulated = trial.ground_truth, prediction.ground_truth
+        scores["ground_truth"] = Errors(
+            rmse(np.hypot(simulated.x - measured.x, simulated.y - measured.y)), None, None,
+            rmse(simulated.yaw - measured.yaw))
+    if trial.odometry is not None and prediction.odometry is not None:
+        odometry, simulation = trial.odometry, prediction.odometry
+        trajectory = yaw = None
+        if odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
+            assert simulation.x is not None and simulation.y is not None and simulation.yaw is not None
+            trajectory = rmse(np.hypot(simulation.x - odometry.x, simulation.y - odometry.y))
+            yaw = rmse(simulation.yaw - odometry.yaw)
+        scores["odometry"] = Errors(trajectory, rmse(simulation.v - odometry.v),
+                                    rmse(simulation.omega - odometry.omega), yaw)
+    return scores
+
+
+def ideal_replay(trial: Trial) -> Prediction:
+    """What a vehicle would do that follows its commands at once and without slip: the baseline of every table."""
+    truth = odometry = None
+    if trial.ground_truth is not None:
+        x, y, yaw = integrate(trial.command, trial.start, trial.ground_truth.t)
+        truth = PoseStream(trial.ground_truth.t, x, y, yaw)
+    if trial.odometry is not None:
+        t = trial.odometry.t
+        x, y, yaw = integrate(trial.command, Start(), t)
+        held = command_in_force(trial.command, t)
+        moving = held >= 0
+        odometry = OdometryStream(t, x, y, yaw, np.where(moving, trial.command.v[held], trial.start.v),
+                                  np.where(moving, trial.command.omega[held], trial.start.omega))
+    return Prediction(truth, odometry)
+
+
+def integrate(command: Command, start: Start, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exact pose (x, y, yaw) at times t of a unicycle that obeys each command at once, from `start` at 0."""
+    times = np.concatenate([[0.0], np.maximum(command.t, 0.0)])
+    v = np.concatenate([[start.v], command.v])
+    omega = np.concatenate([[start.omega], command.omega])
+    hold = np.diff(times)
+    yaw = start.yaw + np.concatenate([[0.0], np.cumsum(omega[:-1] * hold)])
+    dx, dy = _arc(v[:-1], omega[:-1], yaw[:-1], hold)
+    x = start.x + np.concatenate([[0.0], np.cumsum(dx)])
+    y = start.y + np.concatenate([[0.0], np.cumsum(dy)])
+    k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
+    rest = np.maximum(t - times[k], 0.0)
+    dx, dy = _arc(v[k], omega[k], yaw[k], rest)
+    return x[k] + dx, y[k] + dy, yaw[k] + omega[k] * rest
+
+
+def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:
+    """(T, 3) pose in the frame of the trial's start."""
+    cos, sin = np.cos(start.yaw), np.sin(start.yaw)
+    dx, dy = stream.x - start.x, stream.y - start.y
+    return np.stack([cos * dx + sin * dy, -sin * dx + cos * dy, stream.yaw - start.yaw], axis=-1)
+
+
+def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
+    """Trials that are true replicates: of one manoeuvre with equal commands, two at least."""
+    groups: dict[tuple[str, bytes, bytes], list[Trial]] = {}
+    for trial in trials:
+        if trial.name == trial.manoeuvre or manoeuvre_of(trial.name) != trial.manoeuvre:
+            continue  # not a numbered repetition
+        key = (trial.manoeuvre, trial.command.v.tobytes(), trial.command.omega.tobytes())
+        groups.setdefault(key, []).append(trial)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
+    """Pooled standard deviation between replicates, which no model of the mean motion can beat.
+
+    Returns:
+        "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each
+        trial's start; channels without data are nan. None when there are no replicates.
+    """
+    groups = replicate_groups(trials)
+    if not groups:
+        return None
+    sums = {"ground_truth": np.zeros(3), "odometry": np.zeros(5)}
+    counts = {"ground_truth": 0.0, "odometry": 0.0}
+    for group in groups:
+        for channel in CHANNELS:
+            streams = [_relative(trial, channel) for trial in group]
+            if any(stream is None for stream in streams):
+                continue
+            known = [stream for stream in streams if stream is not None]
+            begin, end = max(t[0] for t, _ in known), min(t[-1] for t, _ in known)
+            t = known[0][0][(known[0][0] >= begin) & (known[0][0] <= end)]
+            values = np.stack([np.stack([np.interp(t, time, column) for column in table.T], axis=-1)
+                               for time, table in known])
+            sums[channel] += values.var(axis=0, ddof=1).sum(axis=0)
+            counts[channel] += len(t)
+    return {channel: np.sqrt(sums[channel] / counts[channel]) if counts[channel]
+            else np.full(len(sums[channel]), np.nan) for channel in CHANNELS}
+
+
+def noise_floor(trials: tuple[Trial, ...]) -> dict[str, dict[str, float | None]] | None:
+    """The four errors that a perfect model of the mean motion would still have, per channel, from replicates."""
+    noise = replicate_noise(trials)
+    if noise is None:
+        return None
+
+    def finite(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    truth, odometry = noise["ground_truth"], noise["odometry"]
+    return {
+        "ground_truth": {"trajectory": finite(np.hypot(truth[0], truth[1])), "velocity": None,
+                         "angular_velocity": None, "yaw": finite(truth[2])},
+        "odometry": {"trajectory": finite(np.hypot(odometry[0], odometry[1])), "velocity": finite(odometry[3]),
+                     "angular_velocity": finite(odometry[4]), "yaw": finite(odometry[2])},
+    }
+
+
+def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
+    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
+
+    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
+    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
+    """
+    manoeuvres = [one.manoeuvre for one in trials if one.held_out is held_out]
+    each = {name: noise_floor(tuple(one for one in trials if one.manoeuvre == name)) for name in set(manoeuvres)}
+    floors = [floor for name in manoeuvres if (floor := each[name])]
+    out: dict[str, dict[str, float | None]] = {}
+    for channel in floors[0] if floors else ():
+        out[channel] = {}
+        for metric in floors[0][channel]:
+            values = [value for floor in floors if (value := floor[channel][metric]) is not None]
+            out[channel][metric] = float(np.mean(values)) if values else None
+    return out
+
+
+def _relative(trial: Trial, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
+    if channel == "ground_truth":
+        if trial.ground_truth is None:
+            return None
+        return trial.ground_truth.t, relative_pose(trial.ground_truth, trial.start)
+    odometry = trial.odometry
+    if odometry is None:
+        return None
+    absent = np.full(len(odometry.t), np.nan)
+    columns = [absent if values is None else values for values in (odometry.x, odometry.y, odometry.yaw)]
+    return odometry.t, np.stack([*columns, odometry.v, odometry.omega], axis=-1)
+
+
+def _arc(v: np.ndarray, omega: np.ndarray, yaw: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of constant v and omega over dt: a chord of length v dt sinc(omega dt / 2) at the mean heading."""
+    chord = v * dt * np.sinc(omega * dt / (2 * np.pi))
+    return chord * np.cos(yaw + omega * dt / 2), chord * np.sin(yaw + omega * dt / 2)

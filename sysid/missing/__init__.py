@@ -1,0 +1,1 @@
+"""What may be missing: effects as hypotheses, their signatures in drives, reference days, and refits."""

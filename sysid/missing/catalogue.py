@@ -1,0 +1,138 @@
+"""The hypotheses of the closed loop: which parameters each effect frees, and how large it may be.
+
+They are made from the cards of the effects (`whill_mjx.effects.card`). Every hypothesis has coordinates q: q = 0
+without the effect, and |q| = 1 at a size that is small but noticeable on a vehicle of this mass and track. The same
+coordinates serve effects that vanish at 0, at 1 and at infinity, and base parameters outside their day-to-day spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from whill_mjx.effects import EFFECTS, Effect, make_effects
+from whill_mjx.effects.base import place_of
+from whill_mjx.effects.card import Axis, Falsifier, Scale
+from whill_mjx.vehicle.parameters import describe, get_values
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams
+
+OUTSIDE = "outside"
+"""Place of the effects on a pose that is measured from outside."""
+LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Sizes at which one-sided effects are tried; smooth two-sided ones are tried at -1 and 1."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One effect with some of its parameters freed."""
+
+    effect: str
+    """Canonical name."""
+    axes: tuple[Axis, ...]
+    variant: str = ""
+    """Distinguishes the hypotheses of one effect."""
+    kind: str = "effect"
+    """"parameter_shift" where the axes are base parameters of the vehicle."""
+    constants: tuple[tuple[str, float], ...] = ()
+    """Other parameters and the values they take."""
+    @property
+    def key(self) -> str:
+        return f"{self.effect}/{self.variant}" if self.variant else self.effect
+
+    @property
+    def signed(self) -> bool:
+        return all(axis.signed for axis in self.axes)
+
+    @property
+    def main(self) -> list[int]:
+        """Axes that do something by themselves."""
+        return [i for i, axis in enumerate(self.axes) if not axis.dependent]
+
+    def values(self, q: np.ndarray, base: Mapping[str, float]) -> dict[str, float]:
+        """Parameter values at coordinates q (k,), given the base values of all parameters."""
+        found = dict(self.constants)
+        for axis, size in zip(self.axes, np.asarray(q, float), strict=True):
+            start = base[axis.parameter]
+            if axis.form == "inverse":
+                found[axis.parameter] = axis.unit / size if size > 1e-6 else float("inf")
+            elif axis.form == "factor":
+                found[axis.parameter] = start * float(np.exp(axis.unit * size))
+            elif axis.form == "moment":
+                mass = max(found[self.axes[0].parameter], 1e-3)
+                found[axis.parameter] = float(np.clip(axis.unit * size / mass, -0.6, 0.6))
+            elif axis.form == "along":
+                found[axis.parameter] = start + axis.unit * size * float(q[0])
+            else:
+                found[axis.parameter] = start + axis.unit * size
+        return found
+
+
+def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ...]:
+    """All hypotheses for a vehicle, from the cards of the effects that act in a simulated drive.
+
+    Args:
+        spec: sizes scale with its weight, track and speed.
+        params: the base model; hypotheses about parameters it does not have are left out.
+    """
+    have = frozenset(describe(params))
+    kinds = [kind for kind in in_order() if place_of(kind) != OUTSIDE]
+    return tuple(one for kind in kinds for one in of_card(kind, Scale(spec, have)))
+
+
+def outside_hypotheses(spec: VehicleSpec, params: VehicleParams, fitted: Collection[str]) -> tuple[Hypothesis, ...]:
+    """Hypotheses about the pose that is measured from outside.
+
+    Args:
+        fitted: parameters that the base fit has freed; a hypothesis about one is two-sided around the fitted value.
+    """
+    scale = Scale(spec, frozenset(describe(params)))
+    found = [one for kind in in_order() if place_of(kind) == OUTSIDE for one in of_card(kind, scale)]
+    return tuple(_around_fit(one) if {axis.parameter for axis in one.axes} <= set(fitted) else one for one in found)
+
+
+def in_order() -> list[type[Effect]]:
+    """All effects in the order of their hypotheses, on which the random draws of the search depend."""
+    return sorted(EFFECTS.values(), key=lambda kind: kind.card.order)
+
+
+def of_card(kind: type[Effect], scale: Scale) -> list[Hypothesis]:
+    """The hypotheses of one effect for a vehicle, without those about parameters that its base model lacks."""
+    found = []
+    for variant in kind.card.variants_of(scale):
+        axes = tuple(replace(axis, parameter=_dotted(kind, axis.parameter)) for axis in variant.axes)
+        constants = tuple((_dotted(kind, name), value) for name, value in variant.constants)
+        one = Hypothesis(kind.name, axes, variant.name, variant.kind, constants)
+        if one.kind == "effect" or all(one.axes[i].parameter in scale.parameters for i in one.main):
+            found.append(one)
+    return found
+
+
+def falsifiers() -> dict[str, tuple[Falsifier, ...]]:
+    """What the law of each effect forbids, by its name, in the order of the hypotheses."""
+    return {kind.name: kind.card.forbids for kind in in_order() if kind.card.forbids}
+
+
+def _dotted(kind: type[Effect], parameter: str) -> str:
+    """The full name of a parameter on an effect's card."""
+    return parameter if "." in parameter else f"{kind.name}.{parameter}"
+
+
+def _around_fit(one: Hypothesis) -> Hypothesis:
+    """The hypothesis that a fitted value of the base model is wrong in either direction."""
+    return replace(one, kind="parameter_shift", axes=tuple(replace(axis, signed=True) for axis in one.axes))
+
+
+def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> VehicleParams:
+    """The vehicle with every effect of the hypotheses at its neutral values, which do not change its motion."""
+    have = {effect.name for effect in params.effects}
+    added = {axis.parameter.partition(".")[0] for one in found for axis in one.axes} - have - {"body"}
+    return VehicleParams(params.body, (*params.effects, *make_effects(added)))
+
+
+def base_values(params: VehicleParams) -> dict[str, float]:
+    """Every parameter of a vehicle by name."""
+    names = list(describe(params))
+    return dict(zip(names, np.asarray(get_values(params, names), float).tolist(), strict=True))

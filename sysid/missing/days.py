@@ -1,0 +1,213 @@
+"""What is known of a vehicle from other days: its reference, and how far effects seem to wander."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import Any, Protocol
+
+import numpy as np
+
+from sysid.errors.noise import Whitener, replicate_groups, scatter
+from sysid.errors.space import Space
+from sysid.logs.log import Trial
+from sysid.missing.evidence import Columns
+
+ASSUMED_DAYS = 4.0
+"""How many days the mean over all hypotheses counts as, beside what the days tell of one."""
+EXCESS = 0.06
+"""Standard deviation of a day's excess where reference days do not tell."""
+
+EVEN = 0.97  # least correlation of two commands for their drives to be compared bin by bin
+
+
+class Binned(Protocol):
+    """Drives in bins: `sysid.missing.drives.Drives`."""
+
+    @property
+    def trials(self) -> tuple[Trial, ...]: ...
+
+    @property
+    def target(self) -> np.ndarray:
+        """(B, K, C) measured features."""
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What the base model leaves of one reference drive after that day's own fit."""
+
+    trial: Trial
+    day: int
+    series: np.ndarray  # (K, C)
+    mask: np.ndarray  # (K, C) weights
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is known of a vehicle before the drives in question."""
+
+    params: Any
+    """Fitted `VehicleParams`."""
+    space: Space
+    u: np.ndarray  # (P,) fitted unit coordinates
+    spread: np.ndarray  # (P, P) covariance of a day's parameters around u
+    days: np.ndarray  # (D, P) each day's offset from u
+    whitener: Whitener
+    factors: np.ndarray  # (4, C) noise of rough bins beside smooth ones
+    leftovers: tuple[Leftover, ...]
+    width: float
+    """Of the bins [s]."""
+    known: bool
+    """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
+    remark: str
+
+    @property
+    def shared(self) -> float:
+        """Share of the white noise of a drive that its replicates on the same day have as well: what the model lacks
+        that day, and the error of what the other days expect. 0 where no day has replicates."""
+        if not self.known:
+            return 0.0
+        apart = []
+        for number in {one.day for one in self.leftovers}:
+            mine = [one for one in self.leftovers if one.day == number]
+            series = np.stack([one.series - self.expected_on_others(one) for one in mine])
+            white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
+            courses = np.zeros(len(mine), int)
+            for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
+                courses[group] = course
+            apart.append(scatter(white, courses))
+        told = [one for one in apart if np.isfinite(one)]
+        return float(np.clip(-np.mean(told), 0.0, 1.0)) if told else 0.0
+
+    def expected(self, trial: Trial, bins: int) -> np.ndarray:
+        """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
+        same = [one for one in self.leftovers if alike(one.trial, trial)]
+        return mean_by_day(same, bins) if self.known else np.zeros((bins, self.leftovers[0].series.shape[1]))
+
+    def expected_on_others(self, one: Leftover) -> np.ndarray:
+        """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
+        return expected_without(self.leftovers, one) if self.known else np.zeros_like(one.series)
+
+    def target_of(self, drives: Binned) -> np.ndarray:
+        """(B, K, C) measured features less what the model is known to leave of such drives."""
+        bins = drives.target.shape[1]
+        return drives.target - np.stack([self.expected(trial, bins) for trial in drives.trials])
+
+
+def alike(a: Trial, b: Trial) -> bool:
+    """Whether two trials have the same course of commands up to size, so that bins correspond."""
+    if a.manoeuvre != b.manoeuvre or len(a.command.t) != len(b.command.t):
+        return False
+    if not np.allclose(a.command.t, b.command.t, atol=0.02):
+        return False
+    for name in ("v", "omega"):
+        x, y = getattr(a.command, name), getattr(b.command, name)
+        if np.allclose(x, y, atol=1e-6):
+            continue
+        size = np.linalg.norm(x) * np.linalg.norm(y)
+        if size == 0 or x @ y < EVEN * size:
+            return False
+    return True
+
+
+def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
+    """(K, C) mean over days of the mean over a day's drives, shrunk towards 0 where few days were seen."""
+    channels = leftovers[0].series.shape[1] if leftovers else 5
+    days: dict[int, list[np.ndarray]] = {}
+    for one in leftovers:
+        days.setdefault(one.day, []).append(_fit_length(one.series * (one.mask > 0), bins))
+    if not days:
+        return np.zeros((bins, channels))
+    drives = sum(len(each) for each in days.values())
+    mean = np.mean([np.mean(each, axis=0) for each in days.values()], axis=0)
+    return mean * drives / (drives + 1.0)
+
+
+def expected_without(leftovers: Sequence[Leftover], one: Leftover) -> np.ndarray:
+    """(K, C) mean leftover of the other days' drives of the same course."""
+    others = [other for other in leftovers if other.day != one.day and alike(other.trial, one.trial)]
+    return mean_by_day(others, len(one.series))
+
+
+def difference_sizes(spread: np.ndarray) -> np.ndarray:
+    """(P,) steps of difference quotients, in unit coordinates: a day's standard deviation, within reason."""
+    return np.clip(np.sqrt(np.diag(spread)), 0.004, 0.05)
+
+
+@dataclass(frozen=True)
+class Wander:
+    """Day-to-day covariance of the coordinates, in the order of `Evidence.columns`."""
+
+    covariance: tuple[np.ndarray, ...]  # (k, k) each
+    shapes: tuple[np.ndarray, ...]  # (D, k) each: root mean square 1 in units of that covariance
+    freedom: float
+    """Degrees of freedom that the covariances rest on."""
+    excess: float = EXCESS
+    """Standard deviation from day to day of the squared residual over the noise, less 1."""
+    usual: float = 0.0
+    """What smooth functions that know no physics gain on a reference day, per trial."""
+    usual_size: float = 0.0
+    """Root mean square of it over the days, for a new one; 0 where reference days do not tell."""
+    scatter: float = 0.0
+    """Excess of what a reference day's replicates do not share."""
+
+    def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
+        """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
+        return max(float(np.nan_to_num(scatter(residual, courses) - self.scatter)), 0.0)
+
+    def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
+        """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""
+        mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
+        return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
+
+    def draw_shares(self, draws: int, rng: np.random.Generator) -> np.ndarray:
+        """(N, D) of each reference day's apparent effects in simulated days, heavy-tailed as few days ask for."""
+        days = len(self.shapes[0])
+        share = rng.standard_normal((draws, days)) / np.sqrt(days)
+        return share * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(draws, 1)))
+
+    def away(self, column: int, share: np.ndarray) -> np.ndarray:
+        """(N, k) apparent coordinates of one of the evidence's columns on days with these shares (N, D)."""
+        return share @ self.shapes[column] * np.sqrt(np.diag(self.covariance[column]))
+
+    def of(self, kept: Sequence[bool]) -> Wander:
+        """Of some of the evidence's columns only."""
+        return replace(self, covariance=tuple(compress(self.covariance, kept)),
+                       shapes=tuple(compress(self.shapes, kept)))
+
+    def p_excess(self, excess: float) -> float:
+        """Probability of so much excess on a day with nothing in it."""
+        from scipy import stats
+
+        return float(stats.t.sf(excess / self.excess, self.freedom))
+
+    def excess_limit(self, alpha: float) -> float:
+        """Excess that a day with nothing in it has with probability alpha."""
+        from scipy import stats
+
+        return float(stats.t.isf(alpha, self.freedom)) * self.excess
+
+    def smooth_limit(self, alpha: float) -> float:
+        """What smooth functions gain per trial on a day with nothing in it with probability alpha; infinite where days
+        do not tell."""
+        from scipy import stats
+
+        return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")
+
+
+def no_wander(columns: Sequence[Columns], size: float = 0.0) -> Wander:
+    """Coordinates that wander by themselves with a given standard deviation."""
+    width = max((c.index[-1] for c in columns), default=0) + 1
+    shapes = []
+    for one in columns:
+        shape = np.zeros((width, len(one.index)))
+        shape[one.index, range(len(one.index))] = np.sqrt(width)
+        shapes.append(shape)
+    return Wander(tuple(size**2 * np.eye(len(c.index)) for c in columns), tuple(shapes), ASSUMED_DAYS)
+
+
+def _fit_length(series: np.ndarray, bins: int) -> np.ndarray:
+    out = np.zeros((bins, series.shape[1]))
+    out[: min(bins, len(series))] = series[:bins]
+    return out

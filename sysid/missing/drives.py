@@ -1,0 +1,228 @@
+"""A set of drives in features: the measured ones, and replays of them with any parameters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from sysid.errors.features import Features, bin_width, make_features
+from sysid.errors.noise import roughness
+from sysid.logs.log import Trial
+from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
+from sysid.replay.rollout import PathReplay, make_batch
+from whill_mjx.effects.supply_sag import ROUND
+from whill_mjx.vehicle.parameters import get_values, set_values
+from whill_mjx.vehicle.types import parameters_of
+
+SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
+RECORD_DT = 0.025  # s between recorded states: bins of motion are ten times as long
+CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
+ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
+
+
+@dataclass(frozen=True)
+class Courses:
+    """Which trials repeat one another's motion: same commands, same start at rest or in motion.
+
+    Where they start and which way they face does not matter to a vehicle in its own frame, unless something in the
+    room does: replicates are simulated once.
+    """
+
+    first: np.ndarray  # (U,) one trial of each course
+    of_trial: np.ndarray  # (B,) course of each trial
+    room: tuple[tuple[int, float], ...]
+    """Free parameters that tie the motion to the room or to the session: index and neutral value."""
+    shared: bool
+    """False where a parameter that is not free does so."""
+
+    def repeat(self, values: np.ndarray) -> bool:
+        """Whether trials of one course repeat one another with these values (P,)."""
+        return self.shared and all(values[index] == neutral for index, neutral in self.room)
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Trials with their features and a compiled replay over named parameters."""
+
+    trials: tuple[Trial, ...]
+    names: tuple[str, ...]
+    paths: PathReplay
+    batch: Batch
+    courses: Courses
+    measured: Measured
+    features: Features
+    target: np.ndarray  # (B, K, 5) measured features
+    weight: np.ndarray | None = None
+    """(B, K, 5) weights of the bins where not all have the same noise."""
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(B, K, 5) weights of the bins, 0 where nothing was measured."""
+        return self.features.mask if self.weight is None else self.weight
+
+    def weighted(self, simulated: np.ndarray, factors: np.ndarray, track: float) -> Drives:
+        """The same drives with rough bins, as `simulated` (B, K, 5) shows them, weighted by noise `factors` (4, 5)."""
+        level = roughness(simulated, self.features.width, track)
+        return replace(self, weight=self.features.mask / factors[level])
+
+    def simulate(self, values: np.ndarray) -> np.ndarray:
+        """Features (N, B, K, 5) of replays with values (N, P)."""
+        def seen(each: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+            return self.features.of(self._sampled(*each))
+
+        return np.stack(on_all_cores(seen, self._paths(values)))
+
+    def replay(self, values: np.ndarray) -> Simulated:
+        """Replays with values (N, P) in the room, at the measurements' times; leaves gain the axis N in front."""
+        start = np.asarray(self.batch.start, float)
+        first = start[self.courses.first[self.courses.of_trial]]
+        every = np.arange(len(self.trials))
+
+        def seen(each: tuple[np.ndarray, np.ndarray]) -> Simulated:
+            paths, mine = each
+            return self._sampled(_moved(paths[mine], first, start) if len(paths) < len(mine) else paths, every)
+
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *on_all_cores(seen, self._paths(values)))
+
+    def _paths(self, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each of values (N, P) the paths (U, R + 1, 9) of courses, or of all trials where those do not repeat one
+        another, and which of them is that of each trial (B,)."""
+        every = np.arange(len(self.trials))
+        once = [self.courses.repeat(row) for row in values]
+        rows = [self.courses.first if shared else every for shared in once]
+        sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
+        drives = np.concatenate(rows)
+        paths = self.paths(self._in_session(values[sets], drives), self.batch, drives)
+        parts = np.split(paths, np.cumsum([len(each) for each in rows])[:-1])
+        return [(part, self.courses.of_trial if shared else every) for part, shared in zip(parts, once, strict=True)]
+
+    def _in_session(self, values: np.ndarray, drives: np.ndarray) -> np.ndarray:
+        """Values (N, P) of one drive each (N,), with the time of the session at which that drive began."""
+        if SESSION not in self.names or DRAIN not in self.names:
+            return values
+        began = np.array([began_at(trial) for trial in self.trials])[drives]
+        known = np.isfinite(began) & (values[:, self.names.index(DRAIN)] != 0)
+        out = values.copy()
+        out[known, self.names.index(SESSION)] = began[known]
+        return out
+
+    def _sampled(self, paths: np.ndarray, of_trial: np.ndarray) -> Simulated:
+        """Paths (U, R + 1, 9), of each trial the one of `of_trial` (B,), at the measurements' times."""
+        first = paths.shape[1] * of_trial[:, None]
+        flat = paths.reshape(-1, paths.shape[2])
+
+        def at(index: Any, weight: Any, columns: slice) -> np.ndarray:
+            place = first + np.asarray(index)
+            before, after = (flat.take(place + step, axis=0)[..., columns].astype(float) for step in (0, 1))
+            return before + np.asarray(weight)[..., None] * (after - before)
+
+        one = self.batch
+        pose = at(one.pose_index, one.pose_weight, POSE)
+        odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
+        return Simulated(pose, odometry, paths[of_trial, -1, 8])  # type: ignore[arg-type]
+
+    def differences(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """(B, K, 5, P) derivative by unit coordinates u (P,), by central differences of the given sizes.
+
+        Skidding wheels make the motion rough in its parameters: over the size of a day's change the mean slope counts.
+        `sets` turns unit coordinates (P,) into values of all replayed parameters.
+        """
+        return self.linearised(sets, u, sizes)[1]
+
+    def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
+        points, spans = quotients(u, sizes)
+        at, *seen = self.simulate(np.stack([sets(point) for point in (u, *points)]))
+        return at, np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
+
+    def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
+        """Other trials through the same compiled replay."""
+        batch, measured = make_batch(trials, dt, RECORD_DT)
+        features = make_features(trials, self.features.width)
+        courses = _courses(batch, self.courses.room, self.courses.shared)
+        return Drives(trials, self.names, self.paths, batch, courses, measured, features,
+                      features.of(measured))
+
+
+def began_at(trial: Trial) -> float:
+    """Time of the session at which a trial began [s], as replicates are driven round by round: the middle of the round
+    that its name counts. nan where the name counts none."""
+    number = re.fullmatch(r".*_(\d{1,2})", trial.name)
+    return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
+
+
+def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
+    """Points (2 P of (P,)), above and below u in each of its P coordinates in turn, and how far each pair is apart."""
+    points, spans = [], []
+    for p in range(len(u)):
+        pair = []
+        for sign in (1, -1):
+            point = u.copy()
+            point[p] = np.clip(point[p] + sign * sizes[p], 0.0, 1.0)
+            pair.append(point)
+        points += pair
+        spans.append(float(pair[0][p] - pair[1][p]))
+    return points, spans
+
+
+def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],
+                width: float | None = None, paths: PathReplay | None = None) -> Drives:
+    """Drives of trials, replayed with the named parameters of `params` free.
+
+    `width`: of the bins [s]; by default what the outside poses allow (`bin_width`).
+    `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
+    """
+    batch, measured = make_batch(trials, plant.dt, RECORD_DT)
+    names = tuple(names)
+
+    def vehicle(values: Any) -> Any:
+        return set_values(params, names, values)
+
+    neutral = {f"{effect.name}.{field}": about.neutral for effect in getattr(params, "effects", ())
+               if effect.room_fixed for field, about in parameters_of(effect).items()}
+    held = [name for name in neutral if name not in names]
+    shared = all(float(get_values(params, [name])[0]) == neutral[name] for name in held)
+    room = tuple((names.index(name), neutral[name]) for name in neutral if name in names)
+    if DRAIN in names and SESSION in names:
+        room += ((names.index(DRAIN), 0.0),)
+    courses = _courses(batch, room, shared)
+    features = make_features(trials, bin_width(trials) if width is None else width)
+    paths = paths or PathReplay(plant, vehicle, rows_of_call(10 * len(courses.first)))
+    return Drives(trials, names, paths, batch, courses, measured, features,
+                  features.of(measured))
+
+
+def rows_of_call(most: int = CHUNK) -> int:
+    """Drives of one replay call, on a processor at most so many."""
+    return min(CHUNK, most) if on_processor() else ACCELERATED
+
+
+def _moved(paths: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Paths (B, R + 1, 9) moved in the room from starts (B, 5) to other ones; odometry and speeds stay."""
+    turn = (after[:, 2] - before[:, 2])[:, None]
+    x, y = paths[..., 0] - before[:, :1], paths[..., 1] - before[:, 1:2]
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y = after[:, :1] + cos * x - sin * y, after[:, 1:2] + sin * x + cos * y
+    return np.concatenate([np.stack([x, y, paths[..., 2] + turn], axis=-1), paths[..., 3:]], axis=-1)
+
+
+def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:
+    """Trials of a batch with the same commands and the same speeds at the start."""
+    command, start = np.asarray(batch.command), np.asarray(batch.start)
+    seen: dict[bytes, int] = {}
+    first: list[int] = []
+    of_trial = []
+    for i in range(len(command)):
+        key = command[i].tobytes() + start[i, 3:].tobytes()
+        if key not in seen:
+            seen[key] = len(first)
+            first.append(i)
+        of_trial.append(seen[key])
+    return Courses(np.array(first), np.array(of_trial), room, shared)

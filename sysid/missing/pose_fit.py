@@ -1,0 +1,113 @@
+"""Fits of a vehicle with effects to whole poses, through the replay that the search has compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.errors.space import Space
+from sysid.logs.log import Trial
+from sysid.logs.metrics import replicate_noise
+from sysid.missing.days import difference_sizes
+from sysid.missing.drives import Drives
+from sysid.missing.evidence import with_values
+from sysid.replay.records import Measured, Simulated
+from sysid.search import least_squares
+
+
+@dataclass(frozen=True)
+class PoseReplay:
+    """What `sysid.errors.pose_objective.Objective` replays: some of the parameters of drives free, the others held."""
+
+    drives: Drives
+    held: np.ndarray  # (all,) values of all parameters
+    free: tuple[str, ...]
+    steps: np.ndarray  # (P,) of difference quotients, in the parameters' own units
+
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """Replays with values (N, P) of the free parameters."""
+        return self.drives.replay(np.stack([self._set(row) for row in values]))
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replays (N, B, ...) and their derivatives (N, B, ..., P) by central differences."""
+        sets = []
+        for row in values:
+            sets.append(row)
+            for p, step in enumerate(self.steps):
+                for sign in (1, -1):
+                    moved = row.copy()
+                    moved[p] += sign * step
+                    sets.append(moved)
+        each = 1 + 2 * len(self.steps)
+        seen = self.simulate(np.stack(sets))
+
+        def slope(leaf: np.ndarray) -> np.ndarray:
+            pairs = leaf.reshape(len(values), each, *leaf.shape[1:])[:, 1:]
+            spans = 2 * self.steps.reshape(1, -1, *(1,) * (leaf.ndim - 1))
+            return np.moveaxis((pairs[:, ::2] - pairs[:, 1::2]) / spans, 1, -1)
+
+        return jax.tree.map(lambda leaf: leaf[::each], seen), jax.tree.map(slope, seen)
+
+    def _set(self, values: np.ndarray) -> np.ndarray:
+        return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))
+
+
+POOLED = 1.0
+"""Degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own."""
+
+
+def by_own_noise(trials: Sequence[Trial], measured: Measured) -> Measured:
+    """The measurements with masks that weigh each trial by what replicates of its manoeuvre differ by.
+
+    Replicates that skid part by ten times as much as others. With one noise for all, the fit would follow their chance
+    and leave the others to errors that are small beside it. Few replicates tell little: their variance is drawn towards
+    that of all. Manoeuvres without any have that one; without replicates nothing changes.
+    """
+    pooled = replicate_noise(tuple(trials))
+    if pooled is None:
+        return measured
+    weights: dict[str, list[np.ndarray]] = {channel: [] for channel in pooled}
+    for trial in trials:
+        mine = tuple(other for other in trials if other.manoeuvre == trial.manoeuvre)
+        own = replicate_noise(mine)
+        for channel, scale in pooled.items():
+            common = np.square(scale)
+            variance = common if own is None else (
+                POOLED * common + (len(mine) - 1) * np.square(own[channel])) / (POOLED + len(mine) - 1)
+            variance, common = (np.concatenate([[each[:2].mean()] * 2, each[2:]]) for each in (variance, common))
+            ratio = np.sqrt(common / np.maximum(variance, 1e-12))
+            weights[channel].append(np.where(np.isfinite(ratio) & (ratio > 0), ratio, 1.0))
+    return replace(measured, pose_mask=measured.pose_mask * np.stack(weights["ground_truth"])[:, None],
+                   odometry_mask=measured.odometry_mask * np.stack(weights["odometry"])[:, None])
+
+
+def fit_poses(
+    drives: Drives, trials: Sequence[Trial], space: Space, held: np.ndarray, spread: np.ndarray, iterations: int,
+    others: np.ndarray | None = None,
+) -> np.ndarray | None:
+    """Unit coordinates (P,) of the least error in whole poses and speeds; None where the start is best.
+
+    Args:
+        space: the free parameters, from where to start.
+        held: (all,) values of all parameters of the drives.
+        spread: (P, P) covariance over which derivatives are taken, in unit coordinates.
+        others: (S, P) further starts, in unit coordinates.
+    """
+    start = space.to_unit(space.initial)
+    noise, measured = estimate_noise(tuple(trials)), by_own_noise(trials, drives.measured)
+
+    def objective(at: np.ndarray) -> Objective:
+        replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
+        return Objective(replay, space, tuple(trials), measured, noise)
+
+    if noise.source == "defaults":
+        noise = objective(start).residual_noise(start)
+    starts = [start] if others is None else [start, *others]
+    fits = [least_squares.fit(objective(one), space, starts=one[None], iterations=iterations) for one in starts]
+    best = min(fits, key=lambda fit: fit.cost)
+    return best.u if best.cost < fits[0].initial_cost else None

@@ -1,0 +1,123 @@
+"""A vehicle as its reference drives show it: the fitted base model, how far it wanders from day to day, what it
+does not reproduce, and the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.errors.noise import (
+    first_scales,
+    fit_roughness,
+    fit_whitener,
+    replicate_groups,
+    roughness,
+)
+from sysid.errors.space import Space, make_space
+from sysid.logs.log import Log, Trial
+from sysid.missing.base_fit import fit_base
+from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
+from sysid.missing.drives import make_drives
+from sysid.replay.records import Plant
+from sysid.search.result import Progress
+from whill_mjx.vehicle.parameters import set_values
+
+ASSUMED_SPREAD = 0.05
+"""Day-to-day standard deviation of a parameter, as a share of its value, where reference drives do not tell."""
+ASSUMED_DAYS = 4.0
+"""How many days of reference drives that assumption counts as."""
+LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
+WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
+
+
+def make_reference(
+    plant: Plant, start: Any, logs: Sequence[Log], known: bool = True, iterations: int = 15,
+    names: Sequence[str] | None = None, progress: Progress | None = None, fitted: bool = False,
+) -> Reference:
+    """Fit the base model to the training trials of all logs, then each log by itself.
+
+    Args:
+        start: `VehicleParams` where the fit starts.
+        logs: drives of one vehicle, each log of one day.
+        known: whether they are reference drives, or the drives in question themselves.
+        fitted: `start` is a vehicle fitted before; it is kept.
+    """
+    spec = logs[0].spec
+    space = make_space(start, spec, names)
+    trials = tuple(trial for log in logs for trial in log.training)
+    day = np.array([number for number, log in enumerate(logs) for _ in log.training])
+    drives = make_drives(plant, start, space.names, trials)
+    groups = replicate_groups_by_day(trials, day)
+    whitener = first_scales(drives.target, drives.mask, groups)
+    u = space.to_unit(space.initial)
+    sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
+    if not fitted:
+        u = fit_base(drives, space, whitener, u, sizes, iterations, progress=progress).u
+    at = drives.simulate(space.to_values(u)[None])[0]
+    factors = fit_roughness(drives.target - at, drives.mask, roughness(at, drives.features.width, spec.track))
+    drives = drives.weighted(at, factors, spec.track)
+    if not fitted:
+        whitener = fit_whitener(drives.target - at, drives.mask)
+        u = fit_base(drives, space, whitener, u, sizes, max(iterations // 2, 3), progress=progress).u
+    left = drives.target - drives.simulate(space.to_values(u)[None])[0]
+    whitener = fit_whitener(left, drives.mask)
+    days = np.zeros((len(logs), space.size))
+    if known:
+        prior = (u, np.diag(1 / (3 * assumed_spread(space, u)) ** 2))
+        for number, log in enumerate(logs):
+            index = np.flatnonzero(day == number)
+            one = drives.of(log.training, plant.dt)
+            one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
+            fit = fit_base(one, space, whitener, u, sizes, 6, prior=prior, progress=progress)
+            days[number] = fit.u - u
+            bins = one.target.shape[1]
+            left[index, :bins] = one.target - one.simulate(space.to_values(fit.u)[None])[0]
+        shift = days.mean(0)  # the pooled fit weighs drives, not days
+        u, days = np.clip(u + shift, 0.0, 1.0), days - shift
+        factors = fit_roughness(left, drives.features.mask, roughness(at, drives.features.width, spec.track))
+        drives = drives.weighted(at, factors, spec.track)
+        whitener = fit_whitener(left, drives.mask)
+    spread, remark = _spread(space, u, days, known)
+    leftovers = tuple(Leftover(trial, int(day[i]), left[i], drives.mask[i]) for i, trial in enumerate(trials))
+    if known:
+        whitener = fit_whitener(np.stack([one.series - expected_without(leftovers, one) for one in leftovers]),
+                                drives.mask)
+    params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
+    return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
+                     known, remark)
+
+
+def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[list[int]]:
+    """Replicates within each day: another day's vehicle differs."""
+    groups = []
+    for number in np.unique(day):
+        index = np.flatnonzero(day == number)
+        groups += [[int(index[i]) for i in group] for group in replicate_groups(tuple(trials[i] for i in index))]
+    return groups
+
+
+def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:
+    """(P,) standard deviations in unit coordinates where drives do not tell."""
+    value = np.abs(space.to_values(u))
+    scale = np.where(value > 0, value, space.high - space.low)
+    return np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)
+
+
+def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool) -> tuple[np.ndarray, str]:
+    """Covariance of a new day's parameters and what it rests on."""
+    if not known:
+        return WEAK_PRIOR**2 * np.eye(space.size), (
+            "no reference drives: base parameters are free, so effects that they imitate (mass, track, scrub, "
+            "friction, drag, traction) cannot be seen")
+    assumed = np.diag(assumed_spread(space, u) ** 2)
+    if len(days) < 2:
+        return assumed, (f"one reference day: parameters are assumed to vary by {ASSUMED_SPREAD:.0%} of their values "
+                         "from day to day")
+    centred = days - days.mean(0)
+    covariance = centred.T @ centred
+    count = len(days) - 1
+    mixed = (ASSUMED_DAYS * assumed + covariance) / (ASSUMED_DAYS + count) * (1 + 1 / len(days))
+    return mixed, f"day-to-day spread from {len(days)} reference days, with {ASSUMED_SPREAD:.0%} of the values as prior"

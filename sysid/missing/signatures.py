@@ -1,0 +1,135 @@
+"""What the simulator adds to the evidence: how base parameters and each hypothesis change the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sysid.errors.noise import repeated
+from sysid.logs.log import Trial
+from sysid.missing.catalogue import LEVELS, Hypothesis, base_values
+from sysid.missing.days import Leftover, Reference, alike, difference_sizes
+from sysid.missing.drives import Drives
+from sysid.missing.evidence import Columns, Evidence, with_values
+from sysid.search.result import Progress
+from whill_mjx.vehicle.types import VehicleParams
+
+UNSEEN = 1e-3  # change by an axis that only acts through others, as a share of theirs, below which it does nothing
+PARTS = 10  # in which signatures are simulated, for the progress bar
+
+
+def base_columns(drives: Drives, reference: Reference, values: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(B, K, C, P) derivative of the features by the base parameters' unit coordinates."""
+    space = reference.space
+
+    def sets(u: np.ndarray) -> np.ndarray:
+        row = values.copy()
+        row[[names.index(name) for name in space.names]] = space.to_values(u)
+        return row
+
+    return drives.differences(sets, reference.u, difference_sizes(reference.spread))
+
+
+def signature_columns(
+    drives: Drives, hypotheses: Sequence[Hypothesis], values: np.ndarray, names: Sequence[str], at: np.ndarray,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, list[Columns]]:
+    """(B, K, C, S) change of the features per unit of each coordinate, and which column is which.
+
+    Two-sided axes: central differences at 1. One-sided: the change at each level, per unit; of those that only change
+    what the others do, against the others alone.
+    """
+    base = dict(zip(names, values.tolist(), strict=True))
+    sets: list[np.ndarray] = []
+    jobs: list[tuple[int, float, int, float]] = []
+    for number, one in enumerate(hypotheses):
+        for level in ((1.0,) if one.signed else LEVELS):
+            for position, axis in enumerate(one.axes):
+                q = np.zeros(len(one.axes))
+                if axis.dependent:
+                    q[one.main] = level
+                top = 1.0 if axis.signed else min(level, axis.limit)
+                bottom = -1.0 if axis.signed else 0.0
+                for size in (top, bottom) if axis.signed or axis.dependent else (top,):
+                    q[position] = size
+                    sets.append(with_values(values, names, one.values(q, base)))
+                jobs.append((number, level, position, top - bottom))
+    seen = []
+    for part in np.array_split(np.stack(sets), min(PARTS, len(sets))):
+        seen.append(drives.simulate(part))
+        if progress is not None:
+            progress(1, "signatures")
+    flat, cursor = np.concatenate(seen), 0
+    parts, columns = [], []
+    for number, level, position, span in jobs:
+        axis = hypotheses[number].axes[position]
+        pair = axis.signed or axis.dependent
+        change = flat[cursor] - (flat[cursor + 1] if pair else at)
+        if axis.dependent and np.abs(change).max() < UNSEEN * np.abs(flat[cursor] - at).max():
+            change = flat[cursor] - at  # nothing tells the two apart here: not a column of its own
+        parts.append(change / span)
+        cursor += 2 if pair else 1
+        if position == 0:
+            columns.append(Columns(number, level, ()))
+        columns[-1] = Columns(number, level, (*columns[-1].index, len(parts) - 1))
+    return np.stack(parts, axis=-1), columns
+
+
+def gather(
+    drives: Drives, reference: Reference, hypotheses: Sequence[Hypothesis], full: VehicleParams,
+    progress: Progress | None = None, pools: bool = True,
+) -> tuple[Evidence, np.ndarray]:
+    """Simulate and multiply out; also returns the base's derivatives (B, K, C, P).
+
+    `full` is the vehicle with the catalogue; `drives` free all its parameters. `pools`: with noise for simulated nulls.
+    """
+    base = base_values(full)
+    names = list(drives.names)
+    values = np.array([base[name] for name in names])
+    at = drives.simulate(values[None])[0]
+    slopes = base_columns(drives, reference, values, names)
+    signatures, columns = signature_columns(drives, hypotheses, values, names, at, progress)
+    white = reference.whitener
+    residual = white.apply(reference.target_of(drives) - at, drives.mask)
+    design = white.apply(np.concatenate([slopes, signatures], axis=-1), drives.mask)
+    count, size = len(residual), residual[0].size
+    residual, design = residual.reshape(count, size), design.reshape(count, size, -1)
+    pool = [_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials)] if pools else []
+    offset = reference.space.size
+    placed = tuple(Columns(c.hypothesis, c.level, tuple(offset + i for i in c.index)) for c in columns)
+    evidence = Evidence(
+        residual, design, offset, placed, np.linalg.inv(reference.spread),
+        np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
+        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives),
+        reference.shared)
+    return evidence, slopes
+
+
+def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
+    """Trials of one manoeuvre, in order of first appearance; single windows of a long drive are put into eighths."""
+    names: dict[str, list[int]] = {}
+    for i, trial in enumerate(drives.trials):
+        names.setdefault(trial.manoeuvre, []).append(i)
+    if len(names) > 40 or len(names) < len(drives.trials) and not repeated(drives.trials):
+        parts = np.array_split(np.arange(len(drives.trials)), 8)
+        return tuple(tuple(int(i) for i in part) for part in parts)
+    return tuple(tuple(each) for each in names.values())
+
+
+def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
+    """(J, n) white noise of reference drives of the same manoeuvre; of any manoeuvre where there are few."""
+    like = [one for one in reference.leftovers if alike(one.trial, trial)]
+    if len(like) < 3:
+        same = [one for one in reference.leftovers if one.trial.manoeuvre == trial.manoeuvre]
+        like = same if len(same) >= 3 else list(reference.leftovers)
+    return np.stack([white_leftover(reference, one, mask) for one in like])
+
+
+def white_leftover(reference: Reference, one: Leftover, mask: np.ndarray) -> np.ndarray:
+    """(n,) white noise of a reference drive, put into the bins of another drive of weights `mask` (K, C)."""
+    series = (one.series - reference.expected_on_others(one)) * one.mask
+    inside = np.flatnonzero(one.mask.prod(-1) > 0)
+    last = inside[-1] + 1 if len(inside) else len(series)
+    fitted = np.resize(series[:last], mask.shape)  # a longer drive repeats a shorter one's noise
+    return reference.whitener.apply(fitted[None], (mask > 0).astype(float)[None]).reshape(-1)

@@ -1,0 +1,1 @@
+"""Reports that people read: HTML pages, charts, plots, and the JSON beside them."""

@@ -1,0 +1,105 @@
+"""How a proposed manoeuvre reads: a text, and a page with its path, its commands and what the others would tell."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.errors.space import Space
+from sysid.intervals.design import Criterion, Plan
+from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
+from sysid.logs.manoeuvre_library import Limits
+from sysid.pages.html import Cell, Section, charts, html_page, paragraph, table
+from sysid.pages.svg import PALETTE, Line, line_chart
+
+SHOWN = 12  # candidates listed
+
+
+def text(
+    chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, criterion: Criterion
+) -> str:
+    """What was chosen, why, and what it changes."""
+    lines = []
+    for number, plan in enumerate(chosen, start=1):
+        x, y, yaw = plan.start
+        lines.append(f"{number}. {plan.candidate.name}: {plan.candidate.command.t[-1]:.1f} s; start {x:.2f} m, "
+                     f"{y:.2f} m from the corner, heading {np.rad2deg(yaw):.0f} degrees")
+    index = int(np.argmax(before))
+    after = chosen[-1].deviation
+    lines.append(f"largest uncertainty: {space.names[index]}, {_share(before[index])} of its range; after the drive "
+                 f"{_share(after[index])}")
+    lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({criterion}-optimal first)")
+    lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
+    blind = blind_parameters(plans, space)
+    if blind:
+        lines.append("no candidate tells: " + ", ".join(blind))
+    return "\n".join(lines)
+
+
+def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
+    """Parameters that no single candidate narrows well below their bounds."""
+    best = np.min([plan.deviation for plan in plans], axis=0)
+    return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
+
+
+def write_page(
+    path: Path, chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, limits: Limits,
+    config: Any,
+) -> Path:
+    """Write the page, whole or not at all."""
+    sections = []
+    for plan in chosen:
+        command = plan.candidate.command
+        items = [_room_chart(plan, limits),
+                 line_chart([_held(command.t, command.v)], "t [s]", "v [m/s]", "speed", smallest=0.1),
+                 line_chart([_held(command.t, command.omega)], "t [s]", "omega [rad/s]", "yaw rate", smallest=0.1)]
+        x, y, yaw = plan.start
+        sections.append(Section(plan.candidate.name, charts(items) + paragraph(
+            f"Start {x:.2f} m, {y:.2f} m from the lower left corner, heading {np.rad2deg(yaw):.0f} degrees. The path "
+            f"is simulated; the dashed frame keeps {limits.margin:.2f} m for the body.")))
+    rows: list[list[str | float | Cell | None]] = [
+        [name, float(space.initial[k]), float(before[k] / PRIOR_SD), float(chosen[-1].deviation[k] / PRIOR_SD)]
+            for k, name in enumerate(space.names)]
+    ranking: list[list[str | float | Cell | None]] = [
+        [plan.candidate.name, float(plan.candidate.command.t[-1]), plan.trace, plan.volume]
+        for plan in plans]
+    sections += [
+        Section("What it tells", paragraph("Standard deviations as shares of what the bounds alone tell, before and "
+                                           "after the drives; above one half counts as not told.")
+                + table(["parameter", "value", "before", "after"], rows)),
+        Section("Other manoeuvres", paragraph("Sum of variances relative to now, and logarithm of the volume of the "
+                                              "uncertainty; the less the better.")
+                + table(["manoeuvre", "seconds", "sum of variances", "volume (log)"], ranking))]
+    page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
+                     sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
+                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(page, encoding="utf-8")
+    os.replace(temporary, path)
+    return path
+
+
+def _room_chart(plan: Plan, limits: Limits) -> str:
+    x0, y0, yaw = plan.start
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = x0 + cos * plan.path[:, 0] - sin * plan.path[:, 1], y0 + sin * plan.path[:, 0] + cos * plan.path[:, 1]
+    (length, width), margin = limits.room, limits.margin
+    outer = Line(np.array([0, length, length, 0, 0.0]), np.array([0, 0, width, width, 0.0]), colour=PALETTE[6])
+    inner = Line(np.array([margin, length - margin, length - margin, margin, margin]),
+                 np.array([margin, margin, width - margin, width - margin, margin]), colour=PALETTE[7], dash="4 3")
+    return line_chart([outer, inner, Line(x, y), Line(x[:1], y[:1], colour=PALETTE[3], markers=True)], "x [m]", "y [m]",
+                      "path in the room (dot: start)", equal=True)
+
+
+def _held(t: np.ndarray, values: np.ndarray) -> Line:
+    """A command that holds until the next."""
+    return Line(np.repeat(t, 2)[1:], np.repeat(values, 2)[:-1])
+
+
+def _share(deviation: float) -> str:
+    return f"+-{deviation:.1%}"

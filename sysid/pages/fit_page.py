@@ -1,0 +1,346 @@
+"""The sections of a fit's `report.html`; `sysid.pages.report.write_html` puts them on a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.metrics import METRICS, UNITS
+from sysid.pages.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from sysid.pages.series import Channel, TrialSeries
+from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
+
+REPLAYS = ("ideal", "initial", "fitted")
+CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
+COLUMNS = {"ground_truth": ("along [m]", "left [m]", "yaw [rad]"),
+           "odometry": ("along [m]", "left [m]", "yaw [rad]", "v [m/s]", "omega [rad/s]")}
+MAX_TRIALS = 12  # drawn one by one
+MAX_ROWS = 60  # of a table of trials
+MAX_LAG = 3.0  # s of the autocorrelation
+WORSE = 1.001  # times as much counts as worse
+SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
+
+
+def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[Section]:
+    """All sections of the report of a fit.
+
+    Args:
+        report: content of report.json (keys in `sysid.report`).
+        series: motion of the trials; without any, the charts are left out.
+    """
+    drawn = choose(series)
+    sections = [Section("Summary", summary(report)), Section("Parameters", parameters(report))]
+    if report.get("profiles"):
+        sections.append(Section("Profile likelihoods", profiles(report)))
+    if drawn:
+        sections += [Section("Trajectories", trajectories(drawn)), Section("Yaw", yaws(drawn)),
+                     Section("Residuals", residuals(series, drawn))]
+    return [*sections, Section("Errors per trial", errors(report)), Section("What got worse", worse(report)),
+            Section("Search", search(report)), Section("Data and code", origin(report))]
+
+
+def choose(series: Sequence[TrialSeries]) -> list[TrialSeries]:
+    """At most MAX_TRIALS, held-out ones first, each manoeuvre before its repetitions."""
+    order = sorted(range(len(series)), key=lambda i: (not series[i].held_out, _repetition(series[i].name), i))
+    held_out = [i for i in order if series[i].held_out][: MAX_TRIALS // 2 + 2]
+    rest = [i for i in order if not series[i].held_out]
+    return [series[i] for i in held_out + rest[: MAX_TRIALS - len(held_out)]]
+
+
+def _repetition(name: str) -> int:
+    tail = name.rsplit("_", 1)[-1]
+    return int(tail) if tail.isdigit() else 0
+
+
+def summary(report: dict[str, Any]) -> str:
+    """The headline and the mean errors, held-out trials first and apart."""
+    held, train = report["summary"]["held_out"], report["summary"]["training"]
+    dataset = report["dataset"]
+    parts = [paragraph(headline(report), "lead"),
+             paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} trials "
+                       f"fitted, {len(dataset['held_out'])} held out. Model: {report['model']['preset']} with "
+                       f"{', '.join(report['model']['effects'])}.")]
+    for title, part in (("Held-out trials: predicted, never fitted", held), ("Training trials", train)):
+        if part:
+            parts += [heading(title), _summary_table(part)]
+    if not held:
+        parts.append(paragraph("Nothing was held out: how well this vehicle predicts is not known."))
+    parts.append(paragraph('"Ideal" follows its commands at once and without slip; "initial" is the model before the '
+                           "fit. The floor is the spread between replicates, which no model of the mean motion can "
+                           "beat. Root mean squares, averaged over trials.", "dim"))
+    parts += [bullets(dataset["notes"])] if dataset.get("notes") else []
+    return "".join(parts)
+
+
+def headline(report: dict[str, Any]) -> str:
+    """One sentence: the error that the fit is judged by."""
+    part = "held_out" if report["summary"]["held_out"] else "training"
+    channels = report["summary"][part]
+    channel = "ground_truth" if "trajectory" in channels.get("ground_truth", {}) else "odometry"
+    one = channels.get(channel, {}).get("trajectory")
+    if not one:
+        return "No position was measured; see the table."
+    text = (f"Position error on {'held-out' if part == 'held_out' else 'training'} trials "
+            f"({CHANNEL_NAMES[channel]}): {number(one['initial'])} m before the fit, {number(one['fitted'])} m after")
+    if one.get("noise_floor") and one["fitted"] is not None:
+        text += f"; {number(one['fitted'] / one['noise_floor'])} times the spread between replicates"
+    return text + f" (ideal vehicle: {number(one['ideal'])} m)."
+
+
+def _summary_table(part: dict[str, Any]) -> str:
+    rows = []
+    for channel, metrics in part.items():
+        for metric in (name for name in METRICS if name in metrics):
+            one = metrics[metric]
+            floor = one.get("noise_floor")
+            rows.append([CHANNEL_NAMES[channel], f"{metric.replace('_', ' ')} [{UNITS[metric]}]",
+                         *(one[replay] for replay in REPLAYS[:2]),
+                         Cell(one["fitted"], "bad" if _is_more(one["fitted"], one["initial"]) else "good"), floor,
+                         one["fitted"] / floor if floor and one["fitted"] is not None else None, metrics["trials"]])
+    return table(["channel", "RMSE", *REPLAYS, "floor", "fitted / floor", "trials"], rows)
+
+
+def parameters(report: dict[str, Any]) -> str:
+    """Initial and fitted values with intervals; what was not fitted; what the log does not tell."""
+    rows: list[list[Any]] = []
+    for one in report["parameters"]:
+        low, high = one["interval"]
+        bounds = one.get("bounds") or [low, high]
+        values = (one["value"], low, high, *bounds, one["initial"])
+        bar = interval_bar(one["value"], (low, high), (bounds[0], bounds[1]), one["initial"],
+                           bounds[0] > 0 and bounds[1] > 10 * bounds[0]) if None not in values else ""
+        rows.append([one["name"], one["unit"], one["initial"], one["value"], low, high, Cell(bar, html=True),
+                     Cell("yes" if one["identifiable"] else "no", "good" if one["identifiable"] else "warn"),
+                     one["remark"]])
+    confidence = report["parameters"][0]["confidence"] if report["parameters"] else 0.9
+    parts = [table(["parameter", "unit", "initial", "fitted", f"{confidence:.0%} from", "to", "within its bounds",
+                    "identifiable", "remark"], rows),
+             paragraph("Bar: interval (blue) and fitted value (dot) within the bounds of the search; the orange tick "
+                       "is the initial value.", "dim")]
+    if report["weak_combinations"]:
+        parts += [heading("Combinations that this log does not tell"), bullets(report["weak_combinations"])]
+    if report.get("spectrum"):
+        parts += [heading("Fisher information"),
+                  table(["combination", "information", "standard error"], [
+                      [one["combination"], one["information"], max(one["information"], 1e-12) ** -0.5]
+                      for one in report["spectrum"]]),
+                  paragraph("Eigenvalues, weakest first; the standard error along each is a share of the range between "
+                            "the bounds.", "dim")]
+    if report["fixed"]:
+        parts += [heading("Not fitted"), table(["parameter", "value", "reason"], [
+            [one["name"], one["value"], one["reason"]] for one in report["fixed"]])]
+    return "".join(parts)
+
+
+def profiles(report: dict[str, Any]) -> str:
+    """Each profile with the parabola of the interval from curvature, and the interval that it gives."""
+    items, rows = [], []
+    fitted = {one["name"]: one for one in report["parameters"]}
+    for one in report["profiles"]:
+        values, statistic = (np.array(one[key], float) for key in ("values", "statistic"))
+        about, top = fitted[one["name"]], 4 * one["threshold"]
+        lines = [Line(values, np.where(statistic <= top, statistic, np.nan), "profile", PALETTE[0], markers=True)]
+        low, high = about["interval"]
+        if about["identifiable"] and high > low:
+            fine = np.linspace(values[0], values[-1], 200)
+            half = np.where(fine < about["value"], about["value"] - low, high - about["value"])
+            parabola = one["threshold"] * ((fine - about["value"]) / np.maximum(half, 1e-12)) ** 2
+            lines.append(Line(fine, np.where(parabola <= top, parabola, np.nan), "curvature", PALETTE[1], "5 3"))
+        items.append(line_chart(lines, f"{one['name']} [{one['unit']}]", "2 x loss of log likelihood",
+                                band=(0.0, one["threshold"]), width=340, height=250))
+        rows.append([one["name"], one["unit"], about["value"], *one["interval"], low, high, one["remark"]])
+    confidence = report["parameters"][0]["confidence"]
+    header = ["parameter", "unit", "fitted", f"profile, {confidence:.0%} from", "to", "curvature from", "to", "remark"]
+    return charts(items, "All other parameters are fitted again at each point. Inside the band, the log allows the "
+                         "value; autocorrelation is accounted for.") + table(header, rows)
+
+
+def trajectories(drawn: Sequence[TrialSeries]) -> str:
+    """Paths of the outside pose, or of the odometry without one."""
+    items = []
+    for trial in drawn:
+        channel = _position_channel(trial)
+        if channel is not None:
+            items.append(line_chart([replay_line(values[:, 0], values[:, 1], name)
+                                     for name, values in channel.values.items()], "x [m]", "y [m]", _label(trial),
+                                    equal=True, smallest=SMALLEST))
+    return _replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
+                                            "pose. Held-out trials first.")
+
+
+def yaws(drawn: Sequence[TrialSeries]) -> str:
+    """Yaw over time of the same trials."""
+    items = []
+    for trial in drawn:
+        channel = _position_channel(trial)
+        if channel is not None:
+            items.append(line_chart([replay_line(channel.t, values[:, 2], name)
+                                     for name, values in channel.values.items()], "t [s]", "yaw [rad]", _label(trial),
+                                    smallest=0.05))
+    return _replay_legend() + charts(items)
+
+
+def _replay_legend() -> str:
+    return legend([(name, COLOURS[name]) for name in ("measured", *REPLAYS)])
+
+
+def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> str:
+    """Fitted minus measured over time, and its autocorrelation."""
+    parts = []
+    for channel in ("ground_truth", "odometry"):
+        mine = [trial for trial in drawn if channel in trial.channels][:6]
+        if not mine:
+            continue
+        parts.append(heading(f"{CHANNEL_NAMES[channel].capitalize()}: fitted minus measured"))
+        found = [(trial.channels[channel], trial.channels[channel].error()) for trial in mine]
+        items = []
+        for column, name in enumerate(COLUMNS[channel]):
+            lines = [Line(one.t, error[:, column], "", PALETTE[k % len(PALETTE)], width=1.0)
+                     for k, (one, error) in enumerate(found) if np.isfinite(error[:, column]).any()]
+            if lines:
+                items.append(line_chart(lines, "t [s]", name, f"residual {name}", smallest=1e-4))
+        parts += [legend([(_label(trial), PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
+                  heading(f"{CHANNEL_NAMES[channel].capitalize()}: autocorrelation of the residual about zero"),
+                  legend([("training trials", PALETTE[0]), ("held-out trials", PALETTE[1])]),
+                  charts(_autocorrelations(series, channel), "White noise would lie in the band for 95 % of the lags.")]
+    return "".join(parts)
+
+
+def _autocorrelations(series: Sequence[TrialSeries], channel: str) -> list[str]:
+    items = []
+    for column, name in enumerate(COLUMNS[channel]):
+        lines, samples = [], 0
+        for held_out, colour in ((False, PALETTE[0]), (True, PALETTE[1])):
+            mine = [trial.channels[channel] for trial in series
+                    if trial.held_out is held_out and channel in trial.channels]
+            lag, value, count = autocorrelation(mine, column)
+            if len(lag):
+                lines.append(Line(lag, value, "", colour))
+                samples = max(samples, count)
+        if lines:
+            bound = 1.96 / np.sqrt(samples)
+            items.append(line_chart(lines, "lag [s]", "autocorrelation", name, band=(-bound, bound), width=280,
+                                    height=200))
+    return items
+
+
+def autocorrelation(
+    channels: Sequence[Channel], column: int, max_lag: float = MAX_LAG
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Lags [s], autocorrelation about zero pooled over trials, and number of samples of a column's residual."""
+    steps = [float(np.median(np.diff(one.t))) for one in channels if len(one.t) > 8]
+    if not steps:
+        return np.zeros(0), np.zeros(0), 0
+    dt = float(np.median(steps))
+    longest = min(max_lag, min(float(one.t[-1] - one.t[0]) for one in channels if len(one.t) > 8) / 2)
+    lags = np.arange(0, int(longest / dt) + 1)
+    sums, counts, samples = np.zeros(len(lags)), np.zeros(len(lags)), 0
+    for one in channels:
+        error = one.error()[:, column]
+        known = np.isfinite(error)
+        if known.sum() <= 8:
+            continue
+        grid = np.arange(one.t[known][0], one.t[known][-1], dt)
+        values = np.interp(grid, one.t[known], error[known])
+        samples += len(values)
+        for k in lags[lags < len(values)]:
+            sums[k] += values[: len(values) - k] @ values[k:]
+            counts[k] += len(values) - k
+    if samples == 0 or sums[0] <= 0:
+        return np.zeros(0), np.zeros(0), 0
+    mean = sums / np.maximum(counts, 1)
+    return lags * dt, mean / mean[0], samples
+
+
+def errors(report: dict[str, Any]) -> str:
+    """Error of each trial as bars and as a table."""
+    rows = sorted(report["errors"], key=lambda row: not row["held_out"])
+    position = [row for row in rows if "trajectory" in row["metrics"]]
+    channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in position) else "odometry"
+    shown = [row for row in position if row["channel"] == channel][:40]
+    names = [row["trial"] + ("*" if row["held_out"] else "") for row in shown]
+    items = [bar_chart(names, {replay: [_float(row["metrics"][metric][replay]) for row in shown]
+                               for replay in REPLAYS}, f"{metric} RMSE [{UNITS[metric]}]",
+                       f"{CHANNEL_NAMES[channel]}, {metric}", width=max(420, min(1100, 30 * len(shown) + 120)))
+             for metric in ("trajectory", "yaw") if shown]
+    body = [[row["trial"], "held out" if row["held_out"] else "training", CHANNEL_NAMES[row["channel"]],
+             *(Cell(row["metrics"][metric]["fitted"], "bad" if _is_more(row["metrics"][metric]["fitted"],
+                                                                        row["metrics"][metric]["initial"]) else "")
+               if metric in row["metrics"] else None for metric in METRICS)] for row in rows[:MAX_ROWS]]
+    note = f"the first {MAX_ROWS} of {len(rows)} rows; all are in report.json" if len(rows) > MAX_ROWS else ""
+    header = ["trial", "part", "channel", *(f"{metric.replace('_', ' ')} [{UNITS[metric]}]" for metric in METRICS)]
+    return charts(items, "* held out. The scale is logarithmic.") + heading("Fitted vehicle") + table(
+        header, body, note) + paragraph("Red: more than before the fit.", "dim")
+
+
+def worse(report: dict[str, Any]) -> str:
+    """Every error that the fit, or the model against an ideal vehicle, made larger."""
+    found: list[tuple[float, list[Any]]] = []
+    for row in report["errors"]:
+        for metric, one in row["metrics"].items():
+            for reference in ("initial", "ideal"):
+                if _is_more(one["fitted"], one[reference]):
+                    ratio = one["fitted"] / one[reference] if one[reference] else float("inf")
+                    found.append((ratio, [row["trial"] + ("*" if row["held_out"] else ""),
+                                          CHANNEL_NAMES[row["channel"]], f"{metric.replace('_', ' ')} "
+                                          f"[{UNITS[metric]}]", f"{reference} vehicle", one[reference],
+                                          Cell(one["fitted"], "bad"), ratio]))
+    total = sum(len(row["metrics"]) for row in report["errors"])
+    if not found:
+        return paragraph(f"Nothing: none of {total} errors is more than before the fit or than an ideal vehicle's.")
+    found.sort(key=lambda entry: -entry[0])
+    initial = sum(1 for _, row in found if row[3] == "initial vehicle")
+    return paragraph(f"Of {total} errors (trial, channel, quantity), {initial} are more than before the fit and "
+                     f"{len(found) - initial} more than those of an ideal vehicle. The largest ratios first:") + table(
+        ["trial", "channel", "RMSE", "than the", "was", "is", "ratio"], [row for _, row in found[:25]],
+        f"25 of {len(found)}" if len(found) > 25 else "")
+
+
+def search(report: dict[str, Any]) -> str:
+    """Cost, evaluations, agreement of the starts, delay profiles."""
+    about = report["search"]
+    rows: list[list[Any]] = [["cost before", about["cost_initial"]], ["cost after", about["cost"]],
+                             ["simulator evaluations", about["evaluations"]], ["seconds", about["seconds"]],
+                             ["noise scales from", report["noise"]["source"]]]
+    costs = [cost for cost in about.get("start_costs") or [] if cost is not None]
+    if costs:
+        near = sum(1 for cost in costs if cost < 1.02 * min(costs))
+        rows.append(["starts within 2 % of the best", f"{near} of {len(costs)}"])
+    items = [line_chart([Line(np.array(one["values"], float), np.array(one["cost"], float), markers=True)],
+                        f"{one['name']} [s]", "cost", "delay profile", width=320, height=220)
+             for one in about.get("delay_profiles") or []]
+    scale = table(["channel", "noise scale"], [[name, value] for name, value in report["noise"]["scale"].items()])
+    return table(["", ""], rows) + (charts(items) if items else "") + heading("Noise scales") + scale
+
+
+def origin(report: dict[str, Any]) -> str:
+    """Hashes of data and code, and the settings of the fit."""
+    dataset, code = report["dataset"], report.get("code") or {}
+    rows: list[list[Any]] = [["dataset SHA-256", dataset["sha256"]],
+                             *([f"code: {name}", value] for name, value in code.items())]
+    settings = [[name, str(value)] for name, value in report["settings"].items()]
+    return table(["", ""], rows) + heading("Settings") + table(["setting", "value"], settings) + paragraph(
+        f"Training trials: {', '.join(dataset['training'][:60])}. Held out: "
+        f"{', '.join(dataset['held_out'][:60]) or 'none'}.", "dim")
+
+
+def _position_channel(trial: TrialSeries) -> Channel | None:
+    for name in ("ground_truth", "odometry"):
+        channel = trial.channels.get(name)
+        if channel is not None and np.isfinite(channel.values["measured"][:, :3]).any():
+            return channel
+    return None
+
+
+def _label(trial: TrialSeries) -> str:
+    return trial.name + (" (held out)" if trial.held_out else "")
+
+
+def _is_more(value: float | None, reference: float | None) -> bool:
+    return value is not None and reference is not None and value > WORSE * reference
+
+
+def _float(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,0 +1,123 @@
+"""What a fit writes besides its pages: report.json (keys in `sysid.report`), and the origin in its vehicle file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from sysid.errors.prior import moved
+from sysid.intervals import uncertainty
+from sysid.logs import odometry_frames
+from sysid.logs.log import Log
+from sysid.logs.measured import load_any
+from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
+from sysid.pages.series import collect, save
+from sysid.replay.models import Model, describe_parameters, get_parameters, save_model
+from sysid.search import starts
+from sysid.search.fitting import Fit, fit_log, predict
+from sysid.search.result import Progress
+from sysid.search.settings import FitConfig
+
+
+def make_report(
+    log: Log, config: FitConfig, fit: Fit, rows: list[dict[str, Any]], path: str, source: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """The report of a fit (keys in `sysid.report`)."""
+    about = describe_parameters(fit.params)
+    parameters = [
+        {"name": one.name, "unit": about[one.name].unit, "initial": one.initial, "value": one.value,
+         "interval": [one.low, one.high], "confidence": uncertainty.CONFIDENCE,
+         "bounds": [float(fit.space.low[i]), float(fit.space.high[i])], "identifiable": one.identifiable,
+         "remark": one.remark}
+        for i, one in enumerate(fit.uncertainty.estimates)]
+    fixed = [{"name": name, "value": float(get_parameters(fit.params, [name])[0]), "reason": reason}
+             for name, reason in fit.space.fixed]
+    searches = [result for result in (fit.scan, fit.coarse, fit.search) if result is not None]
+    ends = fit.coarse if fit.coarse is not None and len(fit.coarse.start_costs) > 1 else fit.search
+    return {
+        "schema": SCHEMA, "kind": KIND,
+        "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
+                    "notes": list(log.notes), "training": [trial.name for trial in log.training],
+                    "held_out": [trial.name for trial in log.held_out], **(source or {})},
+        "code": code_hashes(),
+        "settings": {**asdict(config), "vehicle": None if config.vehicle is None else str(config.vehicle)},
+        "model": {"preset": config.preset if fit.model is None else fit.model.name,
+                  "effects": [effect.name for effect in fit.params.effects]},
+        "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},
+        "parameters": parameters, "fixed": fixed,
+        "prior": None if fit.prior is None else {
+            "file": str(config.vehicle), "assumed_spread": config.spread, "moved": moved(fit.prior, fit.space, fit.u)},
+        "profiles": [{"name": one.name, "unit": about[one.name].unit, "values": one.values, "cost": one.cost,
+                      "statistic": one.statistic, "threshold": one.threshold, "interval": list(one.interval),
+                      "remark": one.remark(fit.space)} for one in fit.likelihoods],
+        "spectrum": [{"information": value, "combination": parts} for value, parts in fit.uncertainty.spectrum()],
+        "weak_combinations": fit.uncertainty.weak_combinations(),
+        "search": {"evaluations": sum(result.evaluations for result in searches), "seconds": fit.seconds,
+                   "cost_initial": fit.initial_cost, "cost": fit.cost,
+                   "start_costs": ends.start_costs if ends is not None else [],
+                   "starts_agreeing": starts.agreeing(ends.start_costs) if ends is not None else None,
+                   "delay_profiles": [{"name": name, "values": grid, "cost": costs}
+                                      for name, grid, costs in fit.profiles]},
+        **summaries(rows, log.trials), "errors": rows,
+    }
+
+
+def provenance(report: dict[str, Any]) -> dict[str, Any]:
+    """What the vehicle file says of its origin."""
+    summary = report["summary"]["held_out"] or report["summary"]["training"]
+    errors = {f"{channel}_{metric}": one["fitted"] for channel, metrics in summary.items()
+              for metric, one in metrics.items() if isinstance(one, dict)}
+    return {"made_by": "sysid.fit", "dataset": report["dataset"]["name"], "dataset_sha256": report["dataset"]["sha256"],
+            "preset": report["model"]["preset"], "method": report["settings"]["method"],
+            "seed": report["settings"]["seed"], "cost": report["search"]["cost"],
+            "scored_on": "held_out" if report["summary"]["held_out"] else "training", "rmse": errors,
+            "not_identifiable": [one["name"] for one in report["parameters"] if not one["identifiable"]]}
+
+
+def fit_dataset(
+    path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
+    progress: Progress | None = None, source: dict[str, Any] | None = None, model: Model | None = None,
+) -> dict[str, Any]:
+    """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
+
+    Of another model than the simulator's vehicle, model.toml is written instead of vehicle.toml, and model.xml where
+    it came from an MJCF or URDF file.
+
+    Args:
+        path: dataset folder; only named in the report when `log` is given.
+        quick: overrides `config.quick` where true.
+        log: an already loaded log.
+        source: more to note in the report's `dataset`.
+        model: as of `fit_log`.
+
+    Returns:
+        The report.
+    """
+    from sysid.pages.plots import write_plots
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
+
+    config = config or FitConfig()
+    config = replace(config, quick=quick or config.quick)
+    log = load_any(path) if log is None else log
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    fit = fit_log(log, config, progress, model=model)
+    if fit.frame is not None:
+        log = replace(log, trials=odometry_frames.at_frames(log.trials, fit.frame),
+                      notes=(*log.notes, odometry_frames.note(fit.frame)))
+    trials = (*log.training, *log.held_out)
+    initial, fitted = predict(fit, trials)
+    rows = error_rows(trials, initial, fitted)
+    report = make_report(log, config, fit, rows, str(path), source)
+    write_report(out / "report.json", report)
+    write_plots(out, trials, initial, fitted, rows)
+    series = collect(trials, initial, fitted)
+    save(out, series)
+    write_html(out, series)
+    intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
+    if fit.model is None:
+        save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+    else:
+        save_model(out, fit.model, fit.params, intervals, provenance(report))
+    return report

@@ -1,0 +1,119 @@
+"""The picture of an inspected log: sampling, excitation, clocks and replicates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.log import Log, command_in_force
+from sysid.logs.streams import speeds
+
+COLOURS = {"command": "tab:gray", "odometry": "tab:blue", "ground_truth": "tab:red"}
+LABELS = {"command": "command", "odometry": "odometry", "ground_truth": "outside pose"}
+
+
+def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
+    """Write the picture (PNG) of a log and what `sysid.logs.inspection.inspect` found on it."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(2, 2, figsize=(11.5, 8.0), layout="constrained")
+    _intervals(axes[0, 0], log)
+    _velocities(axes[0, 1], log)
+    _liveliest(axes[1, 0], log)
+    _spread(axes[1, 1], found)
+    figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp.png")
+    figure.savefig(temporary, dpi=100)
+    pyplot.close(figure)
+    temporary.replace(path)
+    return path
+
+
+def _intervals(axis: Any, log: Log) -> None:
+    """Distribution of the intervals between samples."""
+    for name in COLOURS:
+        streams = [getattr(trial, name) for trial in log.trials]
+        steps = [np.diff(stream.t) for stream in streams if stream is not None and len(stream.t) > 1]
+        if steps:
+            ordered = np.sort(np.concatenate(steps)) * 1e3
+            axis.plot(ordered, np.linspace(0, 1, len(ordered)), color=COLOURS[name], label=LABELS[name])
+    axis.set_xscale("log")
+    low, high = axis.get_xlim()
+    axis.set_xlim(low / 3, high * 3)
+    axis.set_xlabel("interval between samples [ms]")
+    axis.set_ylabel("share of intervals below")
+    axis.set_title("Sampling: an upright line is regular")
+    axis.legend()
+    axis.grid(alpha=0.3)
+
+
+def _velocities(axis: Any, log: Log) -> None:
+    """Which speeds and yaw rates were reached."""
+    for trial in log.trials:
+        channel = "odometry" if trial.odometry is not None else "ground_truth"
+        rates = speeds(trial, channel)
+        if rates is not None:
+            axis.plot(rates[1][::5], rates[2][::5], ".", markersize=2, alpha=0.35, color=COLOURS[channel])
+        axis.plot(trial.command.v[:: max(len(trial.command.v) // 200, 1)],
+                  trial.command.omega[:: max(len(trial.command.v) // 200, 1)], "x", markersize=4, color="black",
+                  alpha=0.5)
+    axis.plot([], [], ".", color=COLOURS[channel], label=f"measured ({LABELS[channel]})")
+    axis.plot([], [], "x", color="black", label="commanded")
+    axis.axhline(0, color="black", linewidth=0.5)
+    axis.axvline(0, color="black", linewidth=0.5)
+    axis.set_xlabel("v [m/s]")
+    axis.set_ylabel("omega [rad/s]")
+    axis.set_title("Excitation: empty regions are extrapolated")
+    axis.legend()
+    axis.grid(alpha=0.3)
+
+
+def _liveliest(axis: Any, log: Log) -> None:
+    """Command against measured yaw rate, or speed, of the trial that changes most."""
+
+    def changes(trial: Any) -> float:
+        return float(np.abs(np.diff(trial.command.v)).sum() + np.abs(np.diff(trial.command.omega)).sum())
+
+    trial = max(log.trials, key=changes)
+    turning = trial.command.omega.std() > trial.command.v.std()
+    column, label = (2, "omega [rad/s]") if turning else (1, "v [m/s]")
+    for channel in ("ground_truth", "odometry"):
+        rates = speeds(trial, channel)
+        if rates is not None:
+            axis.plot(rates[0], rates[column], color=COLOURS[channel], label=LABELS[channel], linewidth=1.2)
+    t = np.arange(0.0, trial.duration, 0.01)
+    held = np.maximum(command_in_force(trial.command, t), 0)
+    axis.plot(t, (trial.command.omega if turning else trial.command.v)[held], color="black", linewidth=1.0,
+              label="command")
+    axis.set_xlabel("t [s]")
+    axis.set_ylabel(label)
+    axis.set_title(f"Command and motion: {trial.name}")
+    axis.legend(fontsize=8)
+    axis.grid(alpha=0.3)
+
+
+def _spread(axis: Any, found: dict[str, Any]) -> None:
+    """Spread between replicates by manoeuvre."""
+    groups = found["replicates"]
+    axis.set_title("Replicates: the spread that no model can beat")
+    if not groups:
+        axis.text(0.5, 0.5, "no replicates in this log", ha="center", va="center", transform=axis.transAxes)
+        axis.set_xticks([])
+        axis.set_yticks([])
+        return
+    names = list(dict.fromkeys(name for group in groups for name in group["spread"]))
+    for k, name in enumerate(names):
+        axis.plot([group["spread"].get(name, np.nan) for group in groups], "o-", linewidth=0.6, markersize=4,
+                  color=f"C{k}", label=name.replace("ground_truth", "outside"))
+    axis.set_yscale("log")
+    axis.set_ylabel("standard deviation [m, rad, m/s, rad/s]")
+    axis.set_xticks(range(len(groups)), [group["trials"][0].rsplit("_", 1)[0] for group in groups], rotation=35,
+                    ha="right", fontsize=8)
+    axis.legend(fontsize=7, ncols=2)
+    axis.grid(alpha=0.3)

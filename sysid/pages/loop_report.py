@@ -1,0 +1,389 @@
+"""The report of a closed loop: `report.json` (versioned, below), the page, the vehicle file with the effect in it.
+
+    schema, kind      1, "sysid-close-loop"
+    verdict, reason   "named", "none" or "unexplained", and why in one sentence
+    warnings          what speaks against taking a name as certain, in sentences
+    question          what was asked: against a reference, or of the model family
+    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
+                      p_value, equation, evidence
+    before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
+                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not
+    change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
+                      resampled trials, and how many trials got worse
+    by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
+                      (`sysid.follow_up.changes`)
+    worse             those of these rows whose error surely grew
+    missing           p-value of "nothing is missing", against reference days calibrated
+    (`sysid.follow_up.calibrated`), and
+                      `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
+                      noise, as a share of it, before and after; share of it explained; of simulated days that were
+                      refitted (`--refit-nulls`, else null) count, calibrated p-value, false alarms and the upper 95 %
+                      bound of their rate
+    operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
+                      of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
+                      the share of simulated days on which it would be noticed, at factors on its size
+    contradicted      what speaks against an effect that would else have been named, in sentences
+    pairs             of the scan: the pairs of effects that explain most together
+    candidates        per round the refitted effects: gain, share of the residual explained, coordinates
+    detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
+                      noticed on simulated days (`power`)
+    lives_in          where the unexplained residual lives
+    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.follow_up.unnamed.as_report`);
+    where
+                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
+    next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
+                      there is nothing to tell (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
+    base              base parameters: reference value, day-to-day spread, value on these drives
+    manifest          everything fixed beforehand, and its SHA-256
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.follow_up.calibrated import calibrated
+from sysid.follow_up.changes import by_manoeuvre, worse
+from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
+from sysid.follow_up.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
+from sysid.follow_up.trust import CONFIDENCE, beside_still_base, contradicted, intervals, warnings
+from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.logs.log import Prediction, Trial
+from sysid.logs.metrics import METRICS, own_floor
+from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
+from sysid.missing.days import Reference
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.unexplained import held_back_gains
+from sysid.pages.loop_page import describe_unnamed, sentence
+from sysid.pages.report import code_hashes, error_rows
+from sysid.replay.rollout import predictions
+from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
+from sysid.verdict.falsifiers import as_report as predictions_of
+from sysid.verdict.result import LoopConfig, Result
+from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
+from whill_mjx.effects import EFFECTS, equation
+from whill_mjx.vehicle.parameters import describe
+from whill_mjx.vehicle.types import parameters_of
+
+SCHEMA = 1
+KIND = "sysid-close-loop"
+RESAMPLES = 2000
+
+
+def make_report(result: Result) -> dict[str, Any]:
+    """The report; this is where the held-out trials are opened."""
+    found = result.search
+    settings = manifest(result.config, result.hypotheses, result.reference)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
+    trials = (*result.log.training, *result.log.held_out)
+    wrench = find_unnamed(result)
+    before = replay(result, fitted_before(result), trials)
+    after = replay(result, fitted_after(result), trials) if wrench is None or not wrench.kept else replay_unnamed(
+        result, wrench, trials)
+    rows = error_rows(trials, before, after)
+    moved = by_manoeuvre(trials, before, after)
+    days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
+                          found.scan, seed=result.config.seed)
+    about = [one.name for one in result.references]
+    asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
+             if result.reference.known else "what the model family lacks")
+    nulls = result.null_refits
+    return {
+        "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
+        "warnings": warnings(result), "question": asked, "remark": result.reference.remark,
+        "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
+                    "training": [t.name for t in result.log.training],
+                    "held_out": [t.name for t in result.log.held_out]},
+        "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
+        "effects": effects(result) if found.verdict == "named" else [],
+        "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
+        "by_manoeuvre": moved, "worse": worse(moved), "operating": operating(result, days),
+        "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
+                    "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
+                    "excess_before": found.excess[0],
+                    "excess_after": found.excess[1], "explained": found.share,
+                    "null_refits": None if nulls is None else {
+                        "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
+                        "upper": nulls.upper}},
+        "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
+                         "p_value": one.p, "explained": one.share,
+                         "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
+                       for each in found.rounds],
+        "detectable": detectable(result, days), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "unnamed": None if wrench is None else as_report(wrench),
+        "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
+        "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
+    }
+
+
+def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
+    """Replays of trials by a vehicle."""
+
+    drives, values = drives_of(result, trials, vehicle)
+    simulated = drives.replay(values[None])
+    return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
+
+
+def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> dict[str, Any]:
+    """part -> channel -> metric -> mean RMSE, with the noise floor of the same trials."""
+    out: dict[str, Any] = {}
+    for part, held in (("training", False), ("held_out", True)):
+        floor = own_floor(trials, held)
+        out[part] = {}
+        for channel in dict.fromkeys(row["channel"] for row in rows):
+            mine = [row for row in rows if row["channel"] == channel and row["held_out"] is held]
+            means = {metric: [row["metrics"][metric][which] for row in mine if metric in row["metrics"]]
+                     for metric in METRICS}
+            out[part][channel] = {metric: float(np.mean(values)) for metric, values in means.items() if values}
+            if floor and mine:
+                out[part][channel]["noise_floor"] = floor.get(channel)
+    return out
+
+
+def change(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Mean change of each RMSE, its interval from trials drawn anew, and the share of trials that got worse."""
+    rng = np.random.default_rng(0)
+    out: dict[str, Any] = {}
+    for part, held in (("training", False), ("held_out", True)):
+        out[part] = {}
+        for channel in dict.fromkeys(row["channel"] for row in rows):
+            mine = [row for row in rows if row["channel"] == channel and row["held_out"] is held]
+            for metric in METRICS:
+                pairs = np.array([[row["metrics"][metric]["initial"], row["metrics"][metric]["fitted"]]
+                                  for row in mine if metric in row["metrics"]])
+                if len(pairs) == 0:
+                    continue
+                difference = pairs[:, 1] - pairs[:, 0]
+                draws = difference[rng.integers(0, len(pairs), (RESAMPLES, len(pairs)))].mean(1)
+                out[part].setdefault(channel, {})[metric] = {
+                    "mean": float(difference.mean()), "interval": np.quantile(draws, [0.025, 0.975]).tolist(),
+                    "relative": float(difference.mean() / max(pairs[:, 0].mean(), 1e-12)),
+                    "worse": int((difference > 0).sum()), "trials": len(pairs)}
+    return out
+
+
+def scanned(result: Result) -> Evidence:
+    """The evidence that the scan was run on: around the base model refitted to these drives."""
+    base = result.search.base
+    return at_fit(result.evidence, base.residual, base.jacobian[..., : len(base.u)], base.u - result.reference.u)
+
+
+def operating(result: Result, days: Days) -> dict[str, Any]:
+    """False alarms and power of these very drives, on simulated days."""
+    found, alpha = result.search, result.config.thresholds.alpha
+    power = []
+    if found.verdict == "named":
+        kept = {one.hypothesis.key for one in found.accepted}
+        for one, q in zip(found.final.hypotheses, found.final.split, strict=True):
+            if one.key in kept:
+                number = result.hypotheses.index(one)
+                power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
+    return {"alpha": alpha, "decisions": result.config.thresholds.rounds + 2, "days": "simulated, linear",
+            "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
+    """The pairs of effects with the largest gain in the scan."""
+    pairs = result.search.pairs
+    if pairs is None:
+        return []
+    out: dict[frozenset[str], dict[str, Any]] = {}
+    for m in np.argsort(-pairs.gain):
+        names = [result.hypotheses[h].effect for h in pairs.members[m]]
+        out.setdefault(frozenset(names), {"effects": names, "gain": float(pairs.gain[m]), "p_value": float(pairs.p[m])})
+        if len(out) == most:
+            break
+    return list(out.values())
+
+
+def effects(result: Result) -> list[dict[str, Any]]:
+    """The named effects with values, intervals and evidence.
+
+    Values are those of the joint refit that decided; the vehicle file has them after the last refit to whole poses.
+    """
+    final, found = result.search.final, result.search
+    ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
+    low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
+    values = dict(zip(result.names, final.values.tolist(), strict=True))
+    base = base_values(result.full)
+    for index, name in enumerate(result.reference.space.names):
+        base[name] = float(result.reference.space.to_values(final.u)[index])
+    kept = {one.hypothesis.key for one in found.accepted}
+    out, start = [], 0
+    for one in final.hypotheses:
+        stop = start + len(one.axes)
+        ends = [one.values(np.clip(edge, [-a.limit if a.signed else 0.0 for a in one.axes], None), base)
+                for edge in (low[start:stop], high[start:stop])]
+        if one.key in kept:
+            index = [c.hypothesis.key for c in found.accepted].index(one.key)
+            out.append({
+                "name": one.effect, "kind": one.kind, "variant": one.variant, "class": found.classes[index],
+                "parameters": {axis.parameter: {
+                    "value": values[axis.parameter],
+                    "interval": sorted(end[axis.parameter] for end in ends),
+                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
+                "p_value": found.accepted[index].p, "equation": equation_of(one),
+                "evidence": evidence_for(result, slice(start, stop), one.effect)})
+        start = stop
+    return out
+
+
+def unit_of(parameter: str) -> str:
+    """Unit of a dotted parameter name."""
+    effect, _, name = parameter.partition(".")
+    return parameters_of(EFFECTS[effect])[name].unit
+
+
+def equation_of(one: Hypothesis) -> str:
+    """The equation of the effect."""
+    return equation(EFFECTS[one.effect]) if one.effect in EFFECTS else ""
+
+
+def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
+    """What each manoeuvre says of an effect by itself, whether it predicts manoeuvres that were left out, and its
+    falsifiers."""
+    one = next((one for one in result.stood if one.effect == effect), None)
+    final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
+    sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
+    told = one.foretold if one else foretold(final, part, groups, precision)
+    agreement = heterogeneity(sizes, errors)
+    names = [result.log.training[group[0]].manoeuvre for group in groups]
+    return {"left_out_gain": dict(zip(names, told.tolist(), strict=True)), "left_out_total": float(told.sum()),
+            "left_out_interval": list(interval_of_sum(told)),
+            "by_manoeuvre": [{"manoeuvre": name, "factor": float(size), "standard_error": float(error),
+                              "asked": bool(asked)}
+                             for name, size, error, asked in zip(names, sizes, errors, agreement.asked, strict=True)],
+            "heterogeneity": {"q": agreement.q, "manoeuvres": int(agreement.asked.sum()), "p_value": agreement.p,
+                              "scatter": agreement.scatter, "power": agreement.power, "outcome": agreement.outcome},
+            "falsifiers": predictions_of(one.falsifiers) if one else []}
+
+
+def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
+    """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units, and the
+    share of simulated days on which it is noticed there."""
+    found = result.search
+    limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
+    solver = Solver(result.evidence)
+    base = base_values(result.full)
+    done, tried = set(), []
+    for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
+        one = result.hypotheses[columns.hypothesis]
+        for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
+            variance = 1 / float(solver.information((index,))[0, 0]) + wander[position, position]
+            q = (np.sqrt(limit) + 0.84) * np.sqrt(variance)
+            usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
+            if (one.key, axis.parameter) in done or not usable:
+                continue
+            done.add((one.key, axis.parameter))
+            if axis.dependent:
+                continue
+            tried.append((one, axis, columns, np.array([q if other is axis else 0.0 for other in one.axes])))
+    shares = smallest(days, result.config.thresholds.alpha, [(columns, q) for _, _, columns, q in tried])
+    out = []
+    for (one, axis, _, q), (factor, power) in zip(tried, shares, strict=True):
+        value, reach = one.values(factor * q, base)[axis.parameter], factor * q.max() <= axis.limit and power >= POWER
+        out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
+                    "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
+                    "unit": unit_of(axis.parameter), "power": power})
+    return out
+
+
+def lives_in(result: Result) -> list[dict[str, Any]]:
+    """Where the unexplained residual lives (`sysid.missing.unexplained`)."""
+
+    return where_it_lives(result)
+
+
+def base_table(result: Result) -> list[dict[str, Any]]:
+    """Base parameters on these drives beside the reference."""
+    space, reference = result.reference.space, result.reference
+    away = (result.search.final.u - reference.u) / np.sqrt(np.diag(reference.spread))
+    slope = space.slope(reference.u)
+    return [{"name": name, "reference": float(space.to_values(reference.u)[i]),
+             "spread": float(np.sqrt(reference.spread[i, i]) * slope[i]),
+             "value": float(space.to_values(result.search.final.u)[i]), "away": float(away[i])}
+            for i, name in enumerate(space.names)]
+
+
+def summary(report: dict[str, Any]) -> str:
+    """What a person reads first."""
+    lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+    lines += [f"  warning: {one}" for one in report["warnings"]]
+    for one in report["effects"]:
+        values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
+                           for name, p in one["parameters"].items())
+        lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
+    if report["next_manoeuvre"] is not None:
+        lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
+    for part in ("training", "held_out"):
+        for channel, metrics in report["before"][part].items():
+            if "trajectory" in metrics:
+                after = report["after"][part][channel]["trajectory"]
+                lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} -> {after:.4f} m")
+    for one in report["lives_in"][:4]:
+        lines.append(f"  lives in {one['quantity']}: {one['share']:.0%} of what is left")
+    if report["unnamed"] is not None:
+        lines.append(f"  {describe_unnamed(report['unnamed'])}")
+    return "\n".join(lines)
+
+
+def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
+    """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
+    from sysid.pages.loop_page import write_page
+    from sysid.pages.report import write_report
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
+
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    unnamed = report["unnamed"]
+    kept = unnamed is not None and unnamed["kept"]
+    vehicle = vehicle_of(result, unnamed["parameters"]) if kept else fitted_after(result)
+    known = describe(vehicle)
+    bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
+              if name in known and np.isfinite(p["interval"]).all()}
+    save_vehicle(out / "vehicle.toml", result.log.spec, vehicle, bounds,
+                 {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
+                  "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
+                  "effects_added": [one["name"] for one in report["effects"]] + ["unnamed"] * kept})
+    write_next_command(out, report["next_manoeuvre"])
+    write_report(out / "report.json", report)
+    write_page(out, report)
+
+
+def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:
+    """Everything that was fixed before the drives were looked at."""
+    space = reference.space
+    return {
+        "settings": {key: value for key, value in asdict(config).items() if key != "thresholds"},
+        "thresholds": asdict(config.thresholds),
+        "catalogue": [{"effect": one.effect, "variant": one.variant, "kind": one.kind,
+                       "axes": [asdict(axis) for axis in one.axes], "constants": dict(one.constants)}
+                      for one in found],
+        "falsifiers": {name: [asdict(one) for one in each] for name, each in falsifiers().items()},
+        "bounds": {name: [float(space.low[i]), float(space.high[i])] for i, name in enumerate(space.names)},
+    }
+
+
+def where_it_lives(result: Result) -> list[dict[str, Any]]:
+    """Quantities by the share of the systematic residual that they predict on other drives, best first."""
+    residual, excess = result.search.final.residual, result.search.excess[1]
+    beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
+    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
+    out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
+    return sorted(out, key=lambda one: -one["share"])
+
+
+def write_result(out: Path, result: Result) -> dict[str, Any]:
+    """Open the held-out trials, write the folder `out`, print the verdict, and return the report."""
+    report = make_report(result)
+    write_run(out, result, report)
+    print(summary(report))
+    print(f"wrote report.json, report.html and vehicle.toml into {out}")
+    return report

@@ -1,0 +1,170 @@
+"""The report of a fit: report.json, its tables, and the page that people read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.log import Prediction, Trial
+from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
+from sysid.pages.html import Section
+from sysid.pages.series import TrialSeries
+
+SCHEMA = 1
+KIND = "sysid-report"
+REPLAYS = ("ideal", "initial", "fitted")
+
+
+def error_rows(trials: tuple[Trial, ...], initial: list[Prediction], fitted: list[Prediction]) -> list[dict[str, Any]]:
+    """Errors of each trial and channel for the three replays."""
+    rows = []
+    for trial, before, after in zip(trials, initial, fitted, strict=True):
+        scores = [score(trial, prediction) for prediction in (ideal_replay(trial), before, after)]
+        for channel in scores[0]:
+            tables = [one[channel].as_dict() for one in scores]
+            metrics = {metric: dict(zip(REPLAYS, (table[metric] for table in tables), strict=True))
+                       for metric in METRICS if tables[0][metric] is not None}
+            rows.append({"trial": trial.name, "manoeuvre": trial.manoeuvre, "group": trial.group,
+                         "held_out": trial.held_out, "channel": channel, "metrics": metrics})
+    return rows
+
+
+def summarise(rows: Iterable[dict[str, Any]], floor: dict[str, dict[str, float | None]] | None) -> dict[str, Any]:
+    """Mean over trials per channel and metric of the three replays, beside the noise floor."""
+    rows = list(rows)
+    summary: dict[str, Any] = {}
+    for channel in dict.fromkeys(row["channel"] for row in rows):
+        mine = [row for row in rows if row["channel"] == channel]
+        summary[channel] = {"trials": len(mine)}
+        for metric in METRICS:
+            found = [row["metrics"][metric] for row in mine if metric in row["metrics"]]
+            if found:
+                summary[channel][metric] = {
+                    **{replay: float(np.mean([one[replay] for one in found])) for replay in REPLAYS},
+                    "unit": UNITS[metric], "noise_floor": floor[channel][metric] if floor else None}
+    return summary
+
+
+def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str, Any]:
+    """`noise_floor`, `summary` and `groups` of the report."""
+    parts = {"training": False, "held_out": True}
+    floors = {part: own_floor(trials, held) or None for part, held in parts.items()}
+    groups = sorted({row["group"] for row in rows})
+    return {
+        "noise_floor": floors,
+        "summary": {part: summarise((row for row in rows if row["held_out"] is held), floors[part])
+                    for part, held in parts.items()},
+        "groups": {} if len(groups) < 2 else {
+            group: {part: summarise((row for row in rows if row["held_out"] is held and row["group"] == group), None)
+                    for part, held in parts.items()} for group in groups},
+    }
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    _write(path, json.dumps(plain(report), indent=1) + "\n")
+
+
+def read_report(run: Path) -> dict[str, Any]:
+    """Content of RUN/report.json; FileNotFoundError, ValueError where it is missing or none of a fit."""
+    path = Path(run) / "report.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.")
+    try:
+        report: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not valid JSON ({error}). Fit the log again.") from None
+    if report.get("kind") != KIND or report.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: kind {report.get('kind')!r}, schema {report.get('schema')!r}; this program reads "
+                         f"{KIND!r}, schema {SCHEMA}. Fit the log again.")
+    return report
+
+
+def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections: Sequence[Section] = ()) -> Path:
+    """Write RUN/report.html from RUN/report.json, self-contained.
+
+    Args:
+        run: folder of a fit.
+        series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
+        sections: more sections, shown first.
+    """
+    from sysid.pages.fit_page import fit_sections
+    from sysid.pages.html import html_page
+    from sysid.pages.series import FILE, load, replay
+
+    run = Path(run)
+    report = read_report(run)
+    if series is None:
+        series = load(run) if (run / FILE).is_file() else replay(run, report)
+    page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
+                     [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
+    return _write(run / "report.html", page)
+
+
+def code_hashes() -> dict[str, str]:
+    """SHA-256 over names and contents of the packages' sources, and the versions of what they run on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {}
+    for package in ("whill_mjx", "sysid"):
+        root, digest = Path(__file__).parents[2] / package, hashlib.sha256()
+        for path in sorted(root.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+        found[f"{package} sources SHA-256"] = digest.hexdigest()
+    for name in ("jax", "mujoco-mjx", "numpy", "optuna"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _write(path: Path, text: str) -> Path:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+    return path
+
+
+def table(report: dict[str, Any]) -> str:
+    """The summary as text."""
+    lines = [f"{'trials':9} {'channel':13} {'RMSE':23} {'ideal':>9} {'initial':>9} {'fitted':>9} {'floor':>9}"]
+    for part, channels in report["summary"].items():
+        for channel, metrics in channels.items():
+            for metric in (name for name in METRICS if name in metrics):
+                one = metrics[metric]
+                floor = "-" if one["noise_floor"] is None else f"{one['noise_floor']:.4f}"
+                errors = " ".join(f"{one[replay]:9.4f}" for replay in REPLAYS)
+                lines.append(f"{part:9} {channel:13} {metric + ' ' + one['unit']:23} {errors} {floor:>9}")
+    return "\n".join(lines)
+
+
+def parameter_table(report: dict[str, Any]) -> str:
+    """Fitted parameters with their intervals as text."""
+    lines = []
+    for one in report["parameters"]:
+        low, high = one["interval"]
+        lines.append(f"{one['name']:32} {one['initial']:10.4g} -> {one['value']:10.4g}  [{low:.4g}, {high:.4g}] "
+                     f"{one['unit']} {one['remark']}".rstrip())
+    return "\n".join(lines)
+
+
+def plain(value: Any) -> Any:
+    """The same with arrays as lists, numpy numbers as Python ones and numbers that are not finite as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

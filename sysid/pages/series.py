@@ -1,0 +1,141 @@
+"""Measured and replayed motion of all trials of a fit, beside the fit: `RUN/series.npz`.
+
+Per trial and channel the time (T,) and, for "measured", "ideal", "initial" and "fitted", the columns x, y, yaw of the
+outside pose (T, 3) and x, y, yaw, v, omega of the odometry (T, 5); columns that were not logged are nan.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.metrics import CHANNELS, ideal_replay
+
+REPLAYED = ("measured", "ideal", "initial", "fitted")
+FILE = "series.npz"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of one trial."""
+
+    t: np.ndarray  # (T,) s
+    values: dict[str, np.ndarray]
+    """"measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)."""
+
+    def error(self, replay: str = "fitted") -> np.ndarray:
+        """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
+        measured = self.values["measured"]
+        error = self.values[replay] - measured
+        cos, sin = np.cos(measured[:, 2]), np.sin(measured[:, 2])
+        x, y = error[:, 0].copy(), error[:, 1].copy()
+        error[:, 0], error[:, 1] = cos * x + sin * y, -sin * x + cos * y
+        error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
+        return error
+
+
+@dataclass(frozen=True)
+class TrialSeries:
+    """All channels of one trial."""
+
+    name: str
+    held_out: bool
+    start: tuple[float, float, float]
+    """x, y [m], yaw [rad] in the room."""
+    channels: dict[str, Channel]
+
+
+def collect(
+    trials: Sequence[Trial], initial: Sequence[Prediction], fitted: Sequence[Prediction]
+) -> list[TrialSeries]:
+    """Series of trials and their two replays."""
+    found = []
+    for trial, before, after in zip(trials, initial, fitted, strict=True):
+        sources = {"measured": trial, "ideal": ideal_replay(trial), "initial": before, "fitted": after}
+        channels = {}
+        for channel in CHANNELS:
+            stream = getattr(trial, channel)
+            if stream is not None:
+                channels[channel] = Channel(stream.t, {name: _table(getattr(source, channel))
+                                                       for name, source in sources.items()})
+        start = trial.start.x, trial.start.y, trial.start.yaw
+        found.append(TrialSeries(trial.name, trial.held_out, start, channels))
+    return found
+
+
+def save(folder: Path, series: Sequence[TrialSeries]) -> Path:
+    """Write the series into a run folder, whole or not at all."""
+    arrays: dict[str, Any] = {}
+    about = []
+    for index, trial in enumerate(series):
+        about.append({"name": trial.name, "held_out": trial.held_out, "start": trial.start,
+                      "channels": list(trial.channels)})
+        for name, channel in trial.channels.items():
+            arrays[f"{index}.{name}.t"] = channel.t
+            arrays |= {f"{index}.{name}.{replay}": values.astype(np.float32)
+                       for replay, values in channel.values.items()}
+    path = Path(folder) / FILE
+    temporary = path.with_name(path.name + ".tmp.npz")
+    np.savez_compressed(temporary, about=np.array(json.dumps(about)), **arrays)
+    os.replace(temporary, path)
+    return path
+
+
+def load(folder: Path) -> list[TrialSeries]:
+    """Series of a run folder; FileNotFoundError where it has none."""
+    path = Path(folder) / FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: missing. Fit again, or give the dataset, to replay the trials.")
+    with np.load(path, allow_pickle=False) as file:
+        return [TrialSeries(one["name"], one["held_out"], tuple(one["start"]), {
+            name: Channel(file[f"{index}.{name}.t"],
+                          {replay: file[f"{index}.{name}.{replay}"].astype(float) for replay in REPLAYED})
+            for name in one["channels"]}) for index, one in enumerate(json.loads(str(file["about"])))]
+
+
+def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
+    """Series of a run folder without the file: load its dataset and replay the vehicle before and after the fit.
+
+    Raises:
+        FileNotFoundError, ValueError: the dataset has moved or changed since the fit.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from sysid.logs.measured import load_any
+    from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
+    from whill_mjx.vehicle.config import VehicleConfig
+    from whill_mjx.vehicle.parameters import set_values
+    from whill_mjx.vehicle.vehicle_file import load_vehicle
+
+    dataset = report["dataset"]
+    log = load_any(dataset["path"], train=tuple(dataset.get("train") or ()),
+                   held_out=tuple(dataset.get("held_out_selection") or ()))
+    if log.sha256 != dataset["sha256"]:
+        raise ValueError(f"{dataset['path']}: has changed since {run / 'report.json'} was written (SHA-256 "
+                         f"{log.sha256[:12]}, then {dataset['sha256'][:12]}). Fit it again.")
+    spec, params, _ = load_vehicle(run / "vehicle.toml")
+    plant = vehicle_plant(spec, VehicleConfig(physics_dt=report["settings"].get("physics_dt", 0.005)))
+    names = [one["name"] for one in report["parameters"]]
+    trials = (*log.training, *log.held_out)
+    batch, _ = make_batch(trials, plant.dt)
+    replayed = Replay(plant, batch, lambda values: set_values(params, names, values)).simulate(
+        np.array([[one[key] for one in report["parameters"]] for key in ("initial", "value")], float))
+    before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
+                     for k in (0, 1))
+    return collect(trials, before, after)
+
+
+def _table(stream: PoseStream | OdometryStream) -> np.ndarray:
+    absent = np.full(len(stream.t), np.nan)
+    columns = [absent if one is None else one for one in (stream.x, stream.y, stream.yaw)]
+    if isinstance(stream, OdometryStream):
+        columns += [stream.v, stream.omega]
+    return np.column_stack(columns)

@@ -1,0 +1,185 @@
+"""A user's MJCF or URDF differential drive, stepped by MJX, as a model that the fit can drive.
+
+Parameters are dotted paths KIND.NAME.FIELD into the model; NAME may be a pattern, and then all that it matches share
+one value:
+
+    body.base.mass              kg; the body's inertia scales with it
+    body.base.com_x, .inertia_z m in the body's frame, kg m^2 about a principal axis
+    geom.*_tyre.friction        sliding friction; MuJoCo takes the larger one of two geoms, or that of higher priority
+    joint.left.damping          also armature, frictionloss, stiffness
+    actuator.*.gain             of a motor; of a velocity servo its kv, with both of its entries
+    actuator.*.force_limit      either way [N m]
+    drive.kp                    N m s/rad, of the speed controller that is put before motors (torque actuators)
+    geom.floor.solref.0         any other array of mjx.Model, as KIND.NAME.ARRAY.COLUMN
+
+The constants that MuJoCo derives from masses to soften contacts keep their nominal values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from sysid.replay.mjcf_file import SERVO_GAIN, Entry, Robot, default_paths, load_robot, resolve, write_mjcf
+from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+
+FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
+@struct.dataclass
+class Motion:
+    """What MJX carries from step to step."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    warm: jax.Array
+    """Where the contact solver starts."""
+
+
+def mjcf_model(
+    path: str | Path, parameters: Mapping[str, tuple[float, float]] | Sequence[str] | None = None, *,
+    wheels: Sequence[str] = (), wheel_radius: float | None = None, track: float | None = None,
+    timestep: float | None = None, effects: Sequence[str] = (), room_fixed: bool | None = None,
+) -> Model:
+    """A differential drive from an MJCF or URDF file.
+
+    A model without a free joint, a floor or actuators on its wheels gets them. A command is turned into wheel speeds
+    with the nominal radius and track, and the odometry adds up the wheels' speeds with the same.
+
+    Args:
+        path: of the file; meshes are looked for beside it.
+        parameters: dotted path -> (lowest, highest), or paths alone (a fifth to five times the file's value); by
+            default gain, damping and friction of the driven wheels.
+        wheels: joints or actuators of the driven wheels, left and right; by default the two that have "left" and
+            "right" in their names.
+        wheel_radius, track: nominal, of controller and odometry [m]; by default those of the file.
+        timestep: physics step [s]; by default the file's.
+        effects: of the catalogue, around the model; for example command_delay.
+        room_fixed: it matters where in the room it starts; by default where the world has more than planes in it.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
+    """
+    robot = load_robot(Path(path), wheels, wheel_radius, track, timestep)
+    host, names = robot.host, default_paths(robot) if parameters is None else tuple(parameters)
+    bounds: dict[str, Bounds] = {}
+    entries: dict[str, Entry] = {}
+    if robot.motors:
+        bounds["drive.kp"] = (SERVO_GAIN, SERVO_GAIN / 100, SERVO_GAIN * 100, "N m s/rad")
+    for name in names:
+        given = parameters[name] if isinstance(parameters, Mapping) else None
+        if name == "drive.kp" and robot.motors:
+            low, high = given or bounds[name][1:3]
+            bounds[name] = ((low * high) ** 0.5, low, high, "N m s/rad")
+            continue
+        entries[name] = entry = resolve(robot, name)
+        value = entry.read(host)
+        if given is None and value == 0:
+            raise ValueError(f"{path}: {name} is 0 in the file, so that its bounds cannot be guessed. Give them: "
+                             f"parameters={{{name!r}: (lowest, highest)}}.")
+        low, high = sorted((value / FACTOR, value * FACTOR)) if given is None else given
+        bounds[name] = (float(np.clip(value, low, high)), low, high, entry.unit)
+    # A mass scales its inertia: before an inertia is set by itself.
+    entries = dict(sorted(entries.items(), key=lambda one: one[1].array != "body_mass"))
+    if room_fixed is None:
+        world = host.geom_bodyid == 0
+        room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
+    params = make_parameters(bounds, room_fixed=room_fixed)
+    plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
+                              wheel_radius=robot.wheel_radius, track=robot.track)
+
+    def write(folder: Path, params: Parameters) -> Path:
+        return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
+                                  if name in entries}, Path(folder) / "model.xml")
+
+    return Model(robot.path.name, plant, params, write).with_effects(effects)
+
+
+def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, Any, Any]:
+    """place, substep, observe and move of `with_surroundings`."""
+    from mujoco import mjx
+
+    host, root, speed = robot.host, robot.root, robot.speed
+    nominal = mjx.put_model(host)
+    blank = mjx.make_data(nominal)
+    float_type = jnp.result_type(float)
+    point, ahead = jnp.asarray(robot.point, float_type), jnp.asarray(robot.forward, float_type)
+    rest = jnp.asarray(robot.rest, float_type)
+    sign, wheels = jnp.asarray(robot.sign, float_type), np.array(robot.wheels)
+
+    def with_values(params: Parameters) -> Any:
+        model = nominal
+        for name, entry in entries.items():
+            model = model.replace(**entry.changes(model, params.values[name]))
+        return model
+
+    def wheel_speeds(v: jax.Array, omega: jax.Array) -> jax.Array:
+        half = omega * robot.track / 2
+        return jnp.stack([v - half, v + half]) / robot.wheel_radius
+
+    def pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Reference point (3,) and heading ()."""
+        quaternion = qpos[root + 3 : root + 7]
+        forward = _rotate(quaternion, ahead)
+        return qpos[root : root + 3] + _rotate(quaternion, point), jnp.arctan2(forward[1], forward[0])
+
+    def at(qpos: jax.Array, qvel: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The motion turned and moved so that the reference point is at the start."""
+        where, heading = pose(qpos)
+        turn = start[2] - heading
+        spin = jnp.stack([jnp.cos(turn / 2), 0 * turn, 0 * turn, jnp.sin(turn / 2)])
+        arm = _rotate(spin, qpos[root : root + 3] - where)
+        origin = jnp.stack([start[0] + arm[0], start[1] + arm[1], qpos[root + 2]])
+        attitude = _product(spin, qpos[root + 3 : root + 7])
+        qpos = qpos.at[root : root + 3].set(origin).at[root + 3 : root + 7].set(attitude)
+        return qpos, qvel.at[speed : speed + 3].set(_rotate(spin, qvel[speed : speed + 3]))
+
+    def place(params: Parameters, start: jax.Array) -> Motion:
+        qpos, qvel = at(rest, jnp.zeros(host.nv, float_type), start)
+        v, omega = start[3], start[4]
+        where, heading = pose(qpos)
+        arm = qpos[root : root + 3] - where
+        velocity = jnp.stack([v * jnp.cos(heading) - omega * arm[1], v * jnp.sin(heading) + omega * arm[0], 0 * v])
+        inverse = qpos[root + 3 : root + 7] * jnp.array([1.0, -1.0, -1.0, -1.0])
+        rate = _rotate(inverse, jnp.stack([0 * v, 0 * v, omega]))
+        qvel = qvel.at[speed : speed + 3].set(velocity).at[speed + 3 : speed + 6].set(rate)
+        qvel = qvel.at[wheels].set(sign * wheel_speeds(v, omega))
+        return Motion(qpos, qvel, jnp.zeros(host.na, float_type), jnp.zeros(host.nv, float_type))
+
+    def substep(params: Parameters, state: Motion, command: jax.Array) -> Motion:
+        target = sign * wheel_speeds(command[0], command[1])
+        if robot.motors:
+            target = params.values["drive.kp"] * (target - state.qvel[wheels])
+        ctrl = jnp.zeros(host.nu, float_type).at[np.array(robot.actuators)].set(target)
+        data = blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warm, ctrl=ctrl)
+        data = mjx.step(with_values(params), data)
+        return Motion(data.qpos, data.qvel, data.act, data.qacc_warmstart)
+
+    def observe(state: Motion) -> jax.Array:
+        where, heading = pose(state.qpos)
+        left, right = sign * state.qvel[wheels] * robot.wheel_radius
+        return jnp.stack([where[0], where[1], heading, (left + right) / 2, (right - left) / robot.track])
+
+    def move(state: Motion, start: jax.Array) -> Motion:
+        qpos, qvel = at(state.qpos, state.qvel, start)
+        return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
+
+    return place, substep, observe, move
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Rotation b, then a, as quaternions (w, x, y, z)."""
+    vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
+    return jnp.concatenate([(a[0] * b[0] - a[1:] @ b[1:])[None], vector])
+
+
+def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+    """Vector (3,) turned by a quaternion (w, x, y, z)."""
+    cross = jnp.cross(quaternion[1:], vector) * 2
+    return vector + quaternion[0] * cross + jnp.cross(quaternion[1:], cross)

@@ -1,0 +1,336 @@
+"""The file of a differential drive: what of it drives, where its parameters stand, and how it is written back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
+SERVO_GAIN = 1.0  # N m s/rad of the velocity servos that a model without actuators gets
+FIELDS = {  # KIND, FIELD -> array of the model, column, unit
+    ("body", "mass"): ("body_mass", None, "kg"),
+    **{("body", f"com_{axis}"): ("body_ipos", i, "m") for i, axis in enumerate("xyz")},
+    **{("body", f"inertia_{axis}"): ("body_inertia", i, "kg m^2") for i, axis in enumerate("xyz")},
+    **{("geom", name): ("geom_friction", i, unit) for i, (name, unit) in enumerate(
+        (("friction", "-"), ("friction_torsional", "m"), ("friction_rolling", "m")))},
+    ("geom", "radius"): ("geom_size", 0, "m"),
+    ("joint", "damping"): ("dof_damping", None, "N m s/rad"),
+    ("joint", "armature"): ("dof_armature", None, "kg m^2"),
+    ("joint", "frictionloss"): ("dof_frictionloss", None, "N m"),
+    ("joint", "stiffness"): ("jnt_stiffness", None, "N m/rad"),
+    ("actuator", "gain"): ("actuator_gainprm", 0, "-"),
+    ("actuator", "force_limit"): ("actuator_forcerange", 1, "N m"),
+}
+KINDS = {"body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM, "joint": mujoco.mjtObj.mjOBJ_JOINT,
+         "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a parameter stands in the model."""
+
+    path: str
+    array: str
+    rows: tuple[int, ...]
+    column: int | None
+    unit: str
+    ids: tuple[int, ...]
+    """Of the elements that the path names."""
+    servo: tuple[int, ...] = ()
+    """Columns of actuator_biasprm with which a servo pulls back what its gain pulls."""
+
+    def read(self, model: Any) -> float:
+        """Its value, of the first element."""
+        values = np.asarray(getattr(model, self.array))
+        return float(values[self.rows[0]] if self.column is None else values[self.rows[0], self.column])
+
+    def changes(self, model: Any, value: Any) -> dict[str, Any]:
+        """Arrays of a model, of NumPy or JAX, with the value put in."""
+        rows = np.array(self.rows)
+
+        def put(array: Any, column: int | None, value: Any) -> Any:
+            index: Any = rows if column is None else (rows, column)
+            if isinstance(array, jax.Array):
+                return array.at[index].set(value)
+            array = np.array(array)
+            array[index] = value
+            return array
+
+        found = {self.array: put(getattr(model, self.array), self.column, value)}
+        if self.array == "body_mass":
+            scale = (value / model.body_mass[rows])[:, None]
+            found["body_inertia"] = put(model.body_inertia, None, model.body_inertia[rows] * scale)
+        if self.array == "actuator_forcerange":
+            found[self.array] = put(found[self.array], 0, -value)
+        for column in self.servo:
+            found["actuator_biasprm"] = put(found.get("actuator_biasprm", model.actuator_biasprm), column, -value)
+        return found
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A compiled differential drive and where its parts are."""
+
+    path: Path
+    spec: Any
+    """The editable mujoco.MjSpec."""
+    host: mujoco.MjModel
+    root: int
+    """Address of the free joint in qpos."""
+    speed: int
+    """Address of the free joint in qvel."""
+    wheels: tuple[int, int]
+    """Addresses of the driven wheels in qvel, left and right."""
+    actuators: tuple[int, int]
+    sign: tuple[float, float]
+    """1 where a positive speed of the joint drives forwards."""
+    motors: bool
+    """The actuators take a torque, and not a speed."""
+    point: np.ndarray  # (3,) middle between the driven wheels, root's frame
+    forward: np.ndarray  # (3,) root's frame
+    wheel_radius: float
+    track: float
+    rest: np.ndarray  # qpos after SETTLE
+
+
+def load_robot(
+    path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None, track: float | None = None,
+    timestep: float | None = None,
+) -> Robot:
+    """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such model. Give an MJCF or URDF file.")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        joints = _wheel_joints(path, spec, wheels)
+        _complete(path, spec, joints)
+        if timestep is not None:
+            spec.option.timestep = timestep
+        host = spec.compile()
+        data = mujoco.MjData(host)
+        mujoco.mj_kinematics(host, data)
+        ids = [host.joint(name).id for name in joints]
+        bodies = [int(host.jnt_bodyid[one]) for one in ids]
+        radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
+        if not (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
+            bottom = float(data.xpos[bodies[0], 2]) - _wheel_radius(path, host, bodies[0], radius)
+            spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom])
+            host = spec.compile()
+            data = mujoco.MjData(host)
+            mujoco.mj_kinematics(host, data)
+    except ValueError as error:
+        text = str(error).strip()
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}") from None
+    left = data.xanchor[ids[0]] - data.xanchor[ids[1]]
+    distance = float(np.linalg.norm(left))
+    left = left / distance
+    forward = np.cross(left, [0.0, 0.0, 1.0])
+    free = int(host.body_jntadr[host.body_rootid[bodies[0]]])
+    rotation = data.xmat[host.body_rootid[bodies[0]]].reshape(3, 3).copy()  # the data moves on
+    middle = (data.xanchor[ids[0]] + data.xanchor[ids[1]]) / 2 - data.xpos[host.body_rootid[bodies[0]]]
+    sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
+    actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
+    for _ in range(round(SETTLE / host.opt.timestep)):
+        mujoco.mj_step(host, data)
+    if not np.isfinite(data.qpos).all():
+        raise ValueError(f"{path}: at rest on its floor the model becomes non-finite. Check its contacts and timestep.")
+    root = int(host.jnt_qposadr[free])
+    return Robot(path, spec, host, root, int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids]), _pair(actuators),
+                 (sign[0], sign[1]), _are_motors(path, host, actuators), rotation.T @ middle, rotation.T @ forward,
+                 float(radius), distance if track is None else track, data.qpos.copy())
+
+
+def resolve(robot: Robot, path: str) -> Entry:
+    """Where a dotted path leads; ValueError names what is known."""
+    kind, _, rest = path.partition(".")
+    host = robot.host
+    parts = rest.split(".")
+    if kind not in KINDS or len(parts) < 2:
+        raise ValueError(f"{robot.path}: parameter {path!r} is not KIND.NAME.FIELD with KIND one of "
+                         f"{', '.join(KINDS)}; write for example body.base.mass.")
+    numbered = parts[-1].isdigit() and len(parts) > 2
+    pattern, field = ".".join(parts[: -2 if numbered else -1]), parts[-2 if numbered else -1]
+    known = names_of(host, kind)
+    ids = [number for name, number in known.items() if name == pattern or fnmatchcase(name, pattern)]
+    if not ids:
+        raise ValueError(f"{robot.path}: no {kind} {pattern!r} (known: {', '.join(known)}). Correct {path!r}.")
+    array, column, unit = FIELDS.get((kind, field), (f"{kind}_{field}", None, "-"))
+    if (kind, field) not in FIELDS:
+        values = getattr(host, array, None)
+        if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+            fields = [name for one, name in FIELDS if one == kind]
+            raise ValueError(f"{robot.path}: {kind} has no field {field!r} (known: {', '.join(fields)}, or an array "
+                             f"{kind}_NAME of mjx.Model). Correct {path!r}.")
+        column = int(parts[-1]) if numbered else 0 if values.ndim > 1 else None
+    rows = [int(host.jnt_dofadr[one]) for one in ids] if array.startswith("dof_") else ids
+    servo: tuple[int, ...] = ()
+    if array == "actuator_gainprm" and column == 0:
+        servo = tuple(one for one in (1, 2) if (host.actuator_biasprm[ids, one] != 0).all())
+    entry = Entry(path, array, tuple(rows), column, unit, tuple(ids), servo)
+    if array == "dof_frictionloss" and (host.dof_frictionloss[rows] <= 0).any():
+        raise ValueError(f"{robot.path}: {path} is 0 in the file, and MJX then leaves dry friction out. Give the joint "
+                         "a small frictionloss.")
+    if array == "actuator_forcerange" and not host.actuator_forcelimited[list(ids)].all():
+        raise ValueError(f"{robot.path}: {path} has no limit in the file. Give the actuator a forcerange.")
+    return entry
+
+
+def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
+    """Elements of a kind by name."""
+    count = {"body": host.nbody, "geom": host.ngeom, "joint": host.njnt, "actuator": host.nu}[kind]
+    found = {mujoco.mj_id2name(host, KINDS[kind], i): i for i in range(count)}
+    return {name: i for name, i in found.items() if name and name != "world"}
+
+
+def write_mjcf(robot: Robot, values: Mapping[Entry, float], path: Path) -> Path:
+    """Write the completed model with values put in, whole or not at all."""
+    host, spec = robot.host, robot.spec.copy()
+    arrays: dict[str, np.ndarray] = {}
+    for entry, value in values.items():
+        view: Any = _Overlaid(host, arrays)
+        arrays.update(entry.changes(view, value))
+    for entry in values:
+        for number in entry.ids:
+            _put(spec, entry, number, _Overlaid(host, arrays))
+    spec.compile()
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(spec.to_xml())
+    os.replace(temporary, path)
+    return path
+
+
+class _Overlaid:
+    """A model with some of its arrays replaced."""
+
+    def __init__(self, host: mujoco.MjModel, arrays: dict[str, np.ndarray]):
+        self._host, self._arrays = host, arrays
+
+    def __getattr__(self, name: str) -> Any:
+        return self._arrays.get(name, getattr(self._host, name))
+
+
+def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
+    """Set one element of the editable model to what the compiled one says."""
+    kind = entry.path.partition(".")[0]
+    name = mujoco.mj_id2name(model._host, KINDS[kind], number)
+    element = {"body": spec.body, "geom": spec.geom, "joint": spec.joint, "actuator": spec.actuator}[kind](name)
+    if kind == "body" and entry.array in ("body_mass", "body_ipos", "body_inertia"):
+        element.explicitinertial = True
+        element.mass = float(model.body_mass[number])
+        element.ipos, element.iquat = model.body_ipos[number], model.body_iquat[number]
+        element.inertia = model.body_inertia[number]
+        element.fullinertia = np.full(6, np.nan)
+        return
+    arrays = (entry.array, "actuator_biasprm") if entry.array == "actuator_gainprm" else (entry.array,)
+    for array in arrays:
+        row = entry.rows[entry.ids.index(number)]
+        values, field = np.asarray(getattr(model, array))[row], array.partition("_")[2]
+        held = getattr(element, field)
+        if isinstance(held, np.ndarray):
+            held[: values.size] = values.reshape(-1)[: held.size]
+        else:
+            setattr(element, field, float(values))
+
+
+def _wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, str]:
+    """Names of the joints of the driven wheels, left and right."""
+    hinges = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name]
+    driven = {actuator.name: actuator.target for actuator in spec.actuators}
+    if wheels:
+        found = [driven.get(name, name) for name in wheels]
+        if len(found) != 2 or not set(found) <= set(hinges):
+            raise ValueError(f"{path}: wheels are {' and '.join(wheels)}; they must be two hinge joints or "
+                             f"their actuators, left and right (joints: {', '.join(hinges)}; "
+                             f"actuators: {', '.join(driven)}).")
+        return found[0], found[1]
+    for among in ([name for name in hinges if name in driven.values()], hinges):
+        sides = [[name for name in among if side in name.lower()] for side in ("left", "right")]
+        if all(len(side) == 1 for side in sides):
+            return sides[0][0], sides[1][0]
+    raise ValueError(f"{path}: the driven wheels cannot be told by their names (joints: {', '.join(hinges)}). Name "
+                     "them: wheels=(left, right), on the command line --wheels LEFT RIGHT.")
+
+
+def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
+    """Give the model a free joint, servos on its wheels and names to its geoms, where it has none."""
+    spec.compiler.fusestatic = False
+    top = next(body for body in spec.bodies if any(joint.name == joints[0] for joint in body.joints))
+    while top.parent.name != "world":
+        top = top.parent
+    if not len(top.joints):
+        top.add_freejoint()
+    elif top.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError(f"{path}: body {top.name!r} hangs on joint {top.joints[0].name!r}; a vehicle moves freely. "
+                         "Give it a freejoint, or no joint.")
+    for joint in joints:
+        if not any(actuator.target == joint for actuator in spec.actuators):
+            actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.set_to_velocity(kv=SERVO_GAIN)
+    for body in spec.bodies:
+        taken = {geom.name for geom in spec.geoms}
+        for k, geom in enumerate(body.geoms):
+            plain = body.name if k == 0 else f"{body.name}_{k}"
+            if not geom.name and plain and plain not in taken:
+                geom.name = plain
+
+
+def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
+    """Radius of the largest round geom of a wheel."""
+    kinds = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
+    round_ones = [int(kind) for kind in kinds]
+    sizes = [float(size[0]) for size, kind, owner in zip(host.geom_size, host.geom_type, host.geom_bodyid, strict=True)
+             if owner == body and int(kind) in round_ones]
+    if not sizes and known is None:
+        raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to tell its radius. Give wheel_radius.")
+    return max(sizes) if sizes else float(known or 0.0)
+
+
+def _are_motors(path: Path, host: mujoco.MjModel, actuators: Sequence[int]) -> bool:
+    """Whether the wheels' actuators take a torque; ValueError where they take neither that nor a speed."""
+    ids = list(actuators)
+    bias = host.actuator_biasprm[ids]
+    if (host.actuator_biastype[ids] == int(mujoco.mjtBias.mjBIAS_NONE)).all():
+        return True
+    if (bias[:, 1] == 0).all() and (bias[:, 2] < 0).all() and (host.actuator_dyntype[ids] == 0).all():
+        return False
+    raise ValueError(f"{path}: the wheels' actuators are neither motors nor velocity servos. Use <motor> or "
+                     "<velocity>.")
+
+
+def default_paths(robot: Robot) -> tuple[str, ...]:
+    """Gain and damping of the driven wheels and friction of their tyres, each pair as one pattern where one fits."""
+    host = robot.host
+    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    bodies = host.jnt_bodyid[joints]
+    geoms = [int(np.flatnonzero(host.geom_bodyid == body)[0]) for body in bodies]
+    found = []
+    for kind, ids, field in (("actuator", robot.actuators, "gain"), ("joint", joints, "damping"),
+                             ("geom", geoms, "friction")):
+        names = [mujoco.mj_id2name(host, KINDS[kind], one) for one in ids]
+        pattern = _pattern(names, names_of(host, kind))
+        for name in names if pattern is None else [pattern]:
+            path = f"{kind}.{name}.{field}"
+            if resolve(robot, path).read(host) != 0:
+                found.append(path)
+    return tuple(found)
+
+
+def _pattern(names: Sequence[str], known: Mapping[str, int]) -> str | None:
+    """One pattern that matches these two names and no other."""
+    side = names[0].lower().find("left")
+    start = names[0][:side] if side >= 0 else os.path.commonprefix(list(names))
+    end = names[0][side + 4 :] if side >= 0 else os.path.commonprefix([name[len(start):][::-1] for name in names])[::-1]
+    pattern = f"{start}*{end}"
+    return pattern if {name for name in known if fnmatchcase(name, pattern)} == set(names) else None
+
+
+def _pair(values: Sequence[int] | np.ndarray) -> tuple[int, int]:
+    return int(values[0]), int(values[1])

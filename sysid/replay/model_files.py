@@ -1,0 +1,50 @@
+"""Models by name: an MJCF or URDF file, or a Python file that defines one."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from sysid.replay.models import Model
+from whill_mjx.effects import EFFECTS
+from whill_mjx.vehicle.specs import VehicleSpec
+
+SUFFIXES = (".xml", ".mjcf", ".urdf")
+
+
+def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:
+    """The model that `--model` names.
+
+    Args:
+        text: an MJCF or URDF file, or FILE.py, or FILE.py:NAME. NAME (by default `model`) is a `Model`, or a function
+            that makes one from the log's `VehicleSpec`.
+        wheels: of an MJCF or URDF file, joints or actuators of the driven wheels, left and right.
+        parameters: of such a file, dotted paths of what to fit.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
+    """
+    file, _, attribute = text.rpartition(":") if ".py:" in text else (text, "", "model")
+    path = Path(file)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such model. Give an MJCF or URDF file, or a Python file that defines one.")
+    if path.suffix in SUFFIXES:
+        from sysid.replay.mjcf import mjcf_model
+
+        inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
+        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track)
+    if path.suffix != ".py":
+        raise ValueError(f"{path}: a model is {', '.join(SUFFIXES)} or .py. Rename the file or write an adapter.")
+    loader = importlib.util.spec_from_file_location(path.stem, path)
+    assert loader is not None and loader.loader is not None
+    module = importlib.util.module_from_spec(loader)
+    loader.loader.exec_module(module)
+    if not hasattr(module, attribute):
+        raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
+    found = getattr(module, attribute)
+    found = found if isinstance(found, Model) or not callable(found) else found(spec)
+    if not isinstance(found, Model):
+        raise ValueError(f"{path}: {attribute} is a {type(found).__name__}; it must be a sysid.replay.models.Model. "
+                         "Make it with function_model or mjcf_model.")
+    return found

@@ -1,0 +1,302 @@
+"""Models of other people in place of the simulator's vehicle: what the fit needs of them, and a plain JAX function.
+
+The fit sees a model only through a `Plant` of one instance and its parameters, numbers by name. `function_model` makes
+one of a function that steps a state, `sysid.replay.mjcf.mjcf_model` of an MJCF or URDF file. Effects of the catalogue
+that act on commands or on what the odometry reports may be put around either.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sysid.errors.space import LOG_SPAN, Space
+from sysid.logs.log import Trial
+from sysid.replay.records import Plant
+from whill_mjx.effects import EFFECTS, make_effects
+from whill_mjx.effects.base import apply_chain
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
+
+AROUND = ("command", "sensing")
+"""Places of effects that need to know nothing of what is inside a model."""
+Bounds = tuple[float, float, float] | tuple[float, float, float, str]
+"""Initial value, lowest, highest, and, where it has one, the unit."""
+
+
+@struct.dataclass
+class Parameters:
+    """Parameters of a model that is not a vehicle file: what `VehicleParams` is to the simulator's vehicle."""
+
+    values: dict[str, jax.Array]
+    """() each, by name."""
+    effects: tuple = ()
+    """Effects around the model, of the places `AROUND`."""
+    about: tuple[tuple[str, Parameter], ...] = struct.field(pytree_node=False, default=())
+    """Unit, bounds and initial value (as `neutral`) of each of `values`."""
+    room_fixed: bool = struct.field(pytree_node=False, default=False)
+    """Whether the motion depends on where in the room it starts."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model that is fitted in place of the simulator's vehicle."""
+
+    name: str
+    plant: Plant
+    """Its functions take `Parameters`."""
+    params: Parameters
+    """Where the search starts."""
+    write: Callable[[Path, Parameters], Path] | None = None
+    """Writes the fitted model into a folder in its own format; returns the file."""
+
+    def with_effects(self, names: Sequence[str]) -> Model:
+        """The same model with effects of the catalogue around it; ValueError for those that act inside one."""
+        for name in names:
+            if name in EFFECTS and not acts_around(name):
+                known = [one for one in EFFECTS if acts_around(one)]
+                raise ValueError(f"effect {name!r} acts inside a vehicle and cannot be put around the model "
+                                 f"{self.name!r}. Use one of {', '.join(known)}, or put it into the model.")
+        outside = with_effects(VehicleParams(Body(), self.params.effects), names)
+        return replace(self, params=replace(self.params, effects=outside.effects))
+
+
+def acts_around(name: str) -> bool:
+    """Whether an effect of the catalogue may be put around a model: it sees commands or readings alone."""
+    return any(hasattr(EFFECTS[name], place) for place in AROUND)
+
+
+def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], losses: bool = True,
+                     receipt: bool = False) -> tuple[str, ...]:
+    """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
+
+    On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
+    wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
+    torque is at its limit nothing makes up for it. A wheel that skids is thrown by its own inertia, of which the
+    rotor of its motor may be the most. Soft springs let a vehicle nod, and its wheels turn with that.
+    Readings of the odometry have an age of their own, which shows against an outside pose; so has an outside pose that
+    is stamped when it is received (`receipt`), which shows against the odometry.
+    """
+    if not any(effect.name == "slip_traction" for effect in params.effects):
+        return ()
+    rolling: tuple[str, ...] = ("suspension",)
+    if spec.drive != "skid":
+        loss = ("wheel_damping",) if losses else ()
+        rolling = ("axle_pivot", "lateral_damping", *loss, "suspension", "wheel_inertia")
+    both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
+    if not both:
+        return rolling
+    return (*rolling, "sensor_delay", "pose_delay") if receipt else (*rolling, "sensor_delay")
+
+
+def with_effects(params: Any, names: Sequence[str]) -> Any:
+    """The vehicle with more effects of the catalogue, where they do nothing or next to nothing."""
+    have = {effect.name for effect in params.effects}
+    for name in names:
+        if name not in EFFECTS:
+            raise ValueError(f"no effect {name!r} (known: {', '.join(EFFECTS)}). Correct --effects.")
+    params = VehicleParams(params.body, (*params.effects, *make_effects(name for name in names if name not in have)))
+    about = {name: one for name, one in describe(params).items() if name.partition(".")[0] not in have | {"body"}}
+    endless = [name for name, one in about.items() if not np.isfinite(one.neutral)]
+    if not endless:
+        return params
+    return set_values(params, endless, jnp.asarray([about[name].high for name in endless], jnp.result_type(float)))
+
+
+def describe_parameters(params: Any) -> dict[str, Parameter]:
+    """Every parameter of a vehicle or a model by name."""
+    if not isinstance(params, Parameters):
+        return describe(params)
+    return dict(params.about) | {name: about for name, about in describe(_outside(params)).items()
+                                 if not name.startswith("body.")}
+
+
+def get_parameters(params: Any, names: Sequence[str]) -> jax.Array:
+    """Values (P,) of the named parameters of a vehicle or a model."""
+    if not isinstance(params, Parameters):
+        return get_values(params, names)
+    return jnp.stack([jnp.asarray(params.values[name] if name in params.values
+                                  else get_values(_outside(params), [name])[0]) for name in names])
+
+
+def set_parameters(params: Any, names: Sequence[str], values: jax.Array) -> Any:
+    """The same vehicle or model with the named parameters at `values` (P,)."""
+    if not isinstance(params, Parameters):
+        return set_values(params, names, values)
+    inside = {name: values[i] for i, name in enumerate(names) if name in params.values}
+    rest = [i for i, name in enumerate(names) if name not in params.values]
+    outside = set_values(_outside(params), [names[i] for i in rest], [values[i] for i in rest])  # type: ignore[arg-type]
+    return replace(params, values={**params.values, **inside}, effects=outside.effects)
+
+
+def model_space(params: Parameters, names: Sequence[str] | None = None) -> Space:
+    """Space of a model's parameters, by default all of them; logarithmic where the bounds span more than a decade."""
+    about = describe_parameters(params)
+    names = tuple(about) if names is None else tuple(names)
+    unknown = sorted(set(names) - set(about))
+    if unknown:
+        raise ValueError(f"the model has no parameter {unknown[0]!r} (known: {', '.join(about)}).")
+    low, high = (np.array([getattr(about[name], end) for name in names], float) for end in ("low", "high"))
+    initial = np.clip(np.asarray(get_parameters(params, names), float), low, high)
+    log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
+    return Space(names, low, high, initial, log, tuple((name, "not selected") for name in about if name not in names))
+
+
+def make_parameters(bounds: Mapping[str, Bounds], **fields: bool) -> Parameters:
+    """`Parameters` from name -> (initial, lowest, highest[, unit])."""
+    about = []
+    for name, (initial, low, high, *unit) in bounds.items():
+        if not low <= initial <= high or not low < high:
+            raise ValueError(f"parameter {name!r}: initial value {initial:g}, bounds {low:g} to {high:g}; the value "
+                             "must lie within them. Give (initial, lowest, highest).")
+        about.append((name, Parameter(str(unit[0]) if unit else "-", float(low), float(high), float(initial))))
+    values = {name: jnp.asarray(one.neutral, jnp.result_type(float)) for name, one in about}
+    return Parameters(values, (), tuple(about), **fields)
+
+
+def function_model(
+    step: Callable[[dict[str, jax.Array], jax.Array, jax.Array], jax.Array], parameters: Mapping[str, Bounds], *,
+    dt: float, size: int = 5, name: str = "function", effects: Sequence[str] = (), room_fixed: bool = False,
+) -> Model:
+    """A model from a JAX function of one instance.
+
+    The state is a vector that begins with x, y [m] and yaw [rad] of the reference point in the room, and v [m/s] and
+    omega [rad/s] as wheel odometry reports them; more may follow, and is 0 at the start of a drive.
+
+    Args:
+        step: (parameters by name, state (S,), command (2,) v, omega) -> state after `dt`, made of jax.numpy.
+        parameters: name -> (initial, lowest, highest) or (initial, lowest, highest, unit).
+        dt: time of one step [s].
+        size: S, at least 5.
+        effects: of the catalogue, around it; for example command_delay.
+        room_fixed: it depends on where in the room it starts, and not only on its own motion.
+
+    Raises:
+        ValueError: the step does not return a state of that size.
+    """
+    if size < 5:
+        raise ValueError(f"model {name!r}: size is {size}; a state has at least x, y, yaw, v, omega. Give 5 or more.")
+    params = make_parameters(parameters, room_fixed=room_fixed)
+    float_type = jnp.result_type(float)
+    given = jax.ShapeDtypeStruct((size,), float_type)
+    after = jax.eval_shape(step, params.values, given, jax.ShapeDtypeStruct((2,), float_type))
+    if getattr(after, "shape", None) != (size,):
+        raise ValueError(f"model {name!r}: step returns {getattr(after, 'shape', type(after).__name__)} for a state of "
+                         f"({size},); it must return the state after one step. Correct it, or size.")
+
+    def place(params: Parameters, start: jax.Array) -> jax.Array:
+        return jnp.zeros(size, float_type).at[:5].set(start)
+
+    def substep(params: Parameters, state: jax.Array, command: jax.Array) -> jax.Array:
+        return step(params.values, state, command).astype(float_type)
+
+    def move(state: jax.Array, start: jax.Array) -> jax.Array:
+        return state.at[:3].set(start[:3])
+
+    plant = with_surroundings(place, substep, lambda state: state[:5], move, dt)
+    return Model(name, plant, params).with_effects(effects)
+
+
+@struct.dataclass
+class Surrounded:
+    """State of a model with what is around it."""
+
+    inner: Any
+    memory: tuple
+    """Of the effects."""
+    encoder: Odometry
+    reading: Odometry
+    """The same after the effects of place `sensing`."""
+    diverged: jax.Array  # () bool
+
+
+def with_surroundings(
+    place: Callable[[Parameters, jax.Array], Any], substep: Callable[[Parameters, Any, jax.Array], Any],
+    observe: Callable[[Any], jax.Array], move: Callable[[Any, jax.Array], Any], dt: float, wheel_radius: float = 0.1,
+    track: float = 0.5,
+) -> Plant:
+    """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
+
+    Args:
+        place: (params, start (5,)) -> state.
+        substep: (params, state, command (2,)) -> state.
+        observe: state -> (5,) x, y, yaw of the body, v and omega of the odometry.
+        move: (state, start (5,)) -> the same motion at the start's pose.
+        wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
+    """
+    surroundings: Any = SimpleNamespace(dt=dt, wheel_radius=wheel_radius, track=track)
+
+    def start_at(params: Parameters, start: jax.Array) -> Surrounded:
+        inner = place(params, start)
+        zero = jnp.zeros_like(start[0])
+        odometry = Odometry(zero, zero, zero, start[3], start[4], start[4])
+        memory = tuple(effect.init() for effect in params.effects)
+        return Surrounded(inner, memory, odometry, odometry, jnp.zeros((), bool))
+
+    def advance(params: Parameters, state: Surrounded, command: jax.Array) -> Surrounded:
+        memory, command = apply_chain(params.effects, state.memory, "command", command, surroundings)
+        inner = substep(params, state.inner, command)
+        seen = observe(inner)
+        healthy = jnp.isfinite(seen).all()
+        inner = jax.tree.map(lambda new, old: jnp.where(healthy, new, old), inner, state.inner)
+        v, omega = (jnp.where(healthy, seen[i], 0.0) for i in (3, 4))
+        encoder = _integrate(state.encoder, v, omega, dt)
+        memory, reading = apply_chain(params.effects, memory, "sensing", encoder, surroundings)
+        return Surrounded(inner, memory, encoder, reading, state.diverged | ~healthy)
+
+    def look(state: Surrounded) -> jax.Array:
+        reading = state.reading
+        told = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
+        pose = observe(state.inner)[:3]
+        return jnp.concatenate([pose, told, state.diverged.astype(pose.dtype)[None]])
+
+    def shift(state: Surrounded, start: jax.Array) -> Surrounded:
+        zero = jnp.zeros_like(start[0])
+        encoder, reading = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.reading))  # type: ignore[attr-defined]
+        return replace(state, inner=move(state.inner, start), encoder=encoder, reading=reading)
+
+    return Plant(start_at, advance, look, dt, shift)
+
+
+def save_model(
+    folder: Path, model: Model, params: Parameters, intervals: Mapping[str, tuple[float, float]],
+    provenance: Mapping[str, Any],
+) -> Path:
+    """Write model.toml (value, unit and, where known, interval of each parameter), and the model in its own format."""
+    import tomlkit
+
+    names = list(describe_parameters(params))
+    values = np.asarray(get_parameters(params, names), float)
+    table = {name: {"value": float(value), "unit": about.unit,
+                    **({"interval": [float(end) for end in intervals[name]]} if name in intervals else {})}
+             for (name, about), value in zip(describe_parameters(params).items(), values, strict=True)}
+    path = Path(folder) / "model.toml"
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(tomlkit.dumps({"schema": 1, "kind": "micromobility-model", "model": model.name,
+                                        "parameters": table, "provenance": dict(provenance)}))
+    os.replace(temporary, path)
+    if model.write is not None:
+        model.write(Path(folder), params)
+    return path
+
+
+def _outside(params: Parameters) -> VehicleParams:
+    return VehicleParams(Body(), params.effects)
+
+
+def _integrate(before: Odometry, v: jax.Array, omega: jax.Array, dt: float) -> Odometry:
+    """Odometry one step on, with the mean of old and new speeds."""
+    speed, turn = (before.v + v) / 2, (before.omega + omega) / 2 * dt
+    middle = before.yaw + turn / 2
+    return Odometry(before.x + speed * jnp.cos(middle) * dt, before.y + speed * jnp.sin(middle) * dt,
+                    before.yaw + turn, v, omega, omega)

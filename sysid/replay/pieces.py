@@ -1,0 +1,81 @@
+"""Drives in pieces side by side: on an accelerator a replay takes as long as its steps come one after the other.
+
+How a vehicle moves depends on little more than the last seconds: wheels, controllers and delays forget. A long drive is
+cut into pieces that are replayed at the same time, each from a while before it begins, with the speeds that were
+measured there; the motion within the pieces is then put together to one drive. What lasts longer, the integral of a
+controller or a battery that sags, begins anew in each: searches use pieces on their way and end on whole drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.logs.log import Trial, command_in_force
+
+LENGTH = 2.75  # s, of a piece
+OVERLAP = 2.0
+"""Time that is replayed before each [s]: whitened motion of a vehicle fitted to a plant log then differs by 0.2 of its
+noise (0.05 with 3 s, 0.3 with 1.5 s); the last steps of a search, on whole drives, make up for it."""
+AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
+
+
+def count(duration: float) -> int:
+    """How many pieces a drive of so many seconds is cut into."""
+    return max(int(duration / LENGTH), 1)
+
+
+def begins(records: int, pieces: int) -> np.ndarray:
+    """(W,) records at which pieces begin, evenly."""
+    return np.arange(pieces) * -(-records // pieces)
+
+
+def speeds_at(trial: Trial, times: np.ndarray) -> np.ndarray:
+    """(W, 2) speeds that the odometry reports at times (W,) of a trial, or those commanded where it reports none."""
+    held = command_in_force(trial.command, times)
+    found = np.stack([np.where(held >= 0, speed[held], first) for speed, first in (
+        (trial.command.v, trial.start.v), (trial.command.omega, trial.start.omega))], axis=-1)
+    found[times <= 0] = trial.start.v, trial.start.omega
+    if trial.odometry is not None:
+        for i, time in enumerate(times):
+            near = np.abs(trial.odometry.t - time) < AROUND
+            if time > 0 and near.any():
+                found[i] = trial.odometry.v[near].mean(), trial.odometry.omega[near].mean()
+    return found
+
+
+def record(
+    drive: Callable[[jax.Array, jax.Array], jax.Array], command: jax.Array, start: jax.Array, speeds: jax.Array,
+    overlap: int, poses: Sequence[tuple[slice, jax.Array]],
+) -> jax.Array:
+    """What is recorded (R + 1, C) of a drive in pieces.
+
+    Args:
+        drive: (start (5,), command (T, K, 2)) -> records (T + 1, C) of a drive from there.
+        command: (R, K, 2) of the whole drive.
+        start: (5,) x, y, yaw, v, omega of it.
+        speeds: (W, 2) where pieces are begun, `overlap` records before each.
+        poses: columns x, y, yaw of each pose that goes on from piece to piece, and where it begins (3,).
+    """
+    records, pieces = len(command), len(speeds)
+    length = -(-records // pieces)
+    before = jnp.broadcast_to(start[3:], (overlap, *command.shape[1:]))
+    after = jnp.broadcast_to(command[-1:], (pieces * length - records, *command.shape[1:]))
+    held = jnp.concatenate([before, command, after])
+    index = begins(records, pieces)[:, None] + np.arange(overlap + length)
+    starts = jnp.concatenate([jnp.broadcast_to(start[:3], (pieces, 3)), speeds], axis=1)
+    paths = jax.vmap(drive)(starts, held[index])[:, overlap:]  # (W, L + 1, C)
+    whole = [paths[0], *paths[1:, 1:]]
+    for columns, at in poses:
+        for piece in range(pieces):
+            first = paths[piece, 0, columns]
+            turn = at[2] - first[2]
+            cos, sin = jnp.cos(turn), jnp.sin(turn)
+            x, y, yaw = (whole[piece][:, columns] - first).T
+            moved = jnp.stack([at[0] + cos * x - sin * y, at[1] + sin * x + cos * y, at[2] + yaw], axis=-1)
+            whole[piece] = whole[piece].at[:, columns].set(moved)
+            at = moved[-1]
+    return jnp.concatenate(whole)[: records + 1]

@@ -1,0 +1,368 @@
+"""Open-loop replay of a log, batched over trials and parameter sets: the only compiled entry point of this package.
+
+Commands are resampled to the physics grid (each holds until the next), trials are padded to one length with masks, the
+motion is recorded every few physics steps and interpolated at the measurements' own times. The vehicle comes in as
+a few functions of one instance (`Plant`), so that a test can put a small model in its place.
+
+A trial that starts in motion is settled first: the vehicle drives a while at the start's wheel speeds and is then
+moved to the start pose. Its controller, delays and slip are those of a vehicle under way, not of one that just began.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial, command_in_force
+from sysid.replay import odometry, pieces
+from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.delays import delayed, without
+from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, YAW_COLUMNS, Batch, Measured, Plant, Simulated
+from whill_mjx.effects.odometry_lag import OdometryLag
+from whill_mjx.effects.sensor_delay import SensorDelay
+from whill_mjx.processor import as_one_function
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.specs import VehicleSpec
+
+WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
+WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
+FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
+IN_ONE = 256
+"""Drives at most that one function computes: with 128 it takes 0.7 ms for each of 22 s where many functions take 1.1,
+with 512 they take 1.5 and 0.8, for those divide loops among the cores; within one XLA fails to (seen with 1024)."""
+UNROLLED = 2  # steps between records at most that `Plant.record` takes: compiling it takes as long as it has steps
+
+
+def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
+    """The simulator's vehicle as a `Plant`; its parameters are `VehicleParams`."""
+    from whill_mjx.vehicle.dynamics import place, record, substep, substeps
+    from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose
+    from whill_mjx.vehicle.model import build_model
+
+    config = config or VehicleConfig()
+    model = build_model(spec, config)
+
+    def observe(state: Any) -> jax.Array:
+        odometry = state.odometry
+        return jnp.stack([*reference_pose(model, state.qpos), odometry.x, odometry.y, odometry.yaw, odometry.v,
+                          odometry.omega, state.diverged.astype(state.qpos.dtype)])
+
+    def move(state: Any, start: jax.Array) -> Any:
+        x, y, yaw = reference_pose(model, state.qpos)
+        turn = start[2] - yaw
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+
+        def rotate(a: jax.Array, b: jax.Array) -> jax.Array:
+            return jnp.stack([cos * a - sin * b, sin * a + cos * b])
+
+        origin = start[:2] + rotate(state.qpos[0] - x, state.qpos[1] - y)
+        attitude = _quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
+        qpos = jnp.concatenate([origin, state.qpos[2:3], attitude, state.qpos[7:]])
+        qvel = jnp.concatenate([rotate(state.qvel[0], state.qvel[1]), state.qvel[2:]])
+        zero = jnp.zeros_like(turn)
+        encoder, odometry = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.odometry))
+        return state.replace(qpos=qpos, qvel=qvel, encoder=encoder, odometry=odometry)
+
+    return Plant(lambda params, start: place(model, params, *start),
+                 lambda params, state, command: substep(model, params, state, command), observe,
+                 config.physics_dt, move,
+                 lambda params, state, commands: substeps(model, params, state, commands),
+                 lambda params, state, commands: record(model, params, state, commands, observe), arithmetic=True)
+
+
+def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Rotation b, then a (w, x, y, z)."""
+    return jnp.stack([
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ])
+
+
+def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_DT) -> tuple[Batch, Measured]:
+    """Resample and pad trials; ValueError when there is none."""
+    if not trials:
+        raise ValueError("no trials to simulate. Check the selections of training and held-out trials.")
+    stride = max(round(record_dt / dt), 1)
+    record = stride * dt
+    records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
+    poses = [_pose_table(trial.ground_truth) for trial in trials]
+    odometries = [_odometry_table(trial.odometry) for trial in trials]
+    command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
+    start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
+    pose_t, pose, pose_mask = _pad(poses)
+    odometry_t, odometry, odometry_mask = _pad(odometries)
+    pose_index, pose_weight = _grid(pose_t, record, records)
+    odometry_index, odometry_weight = _grid(odometry_t, record, records)
+    floats = [command.reshape(len(trials), records, stride, 2), start]
+    command_array, start_array = (jnp.asarray(array, jnp.result_type(float)) for array in floats)
+    batch = Batch(command_array, start_array, jnp.asarray(pose_index), jnp.asarray(pose_weight, jnp.result_type(float)),
+                  jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)),
+                  round(WARM_UP / dt) if start[:, 3:].any() else 0)
+    return batch, Measured(pose, pose_mask, odometry, odometry_mask)
+
+
+def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
+    """Replay all trials of a batch with one parameter set. Differentiable in forward mode."""
+    return jax.vmap(lambda one: _simulate_one(plant, params, one))(batch)
+
+
+class Replay:
+    """Compiled replay of one batch for many parameter sets: `values` (N, P) go in, host arrays come out.
+
+    A call with fewer sets than an earlier one is padded to that size: a few spare rows cost less than compiling again.
+    """
+
+    def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
+        """`set_values` turns values (P,) into the vehicle's parameters."""
+
+        def rows(values: jax.Array, batch: Batch, directions: int = 1) -> Simulated:
+            """Each set on each trial, in one row of instances: loops over a single axis fill a processor's vectors."""
+            sets, trials = len(values), len(batch.start)
+            few = sets * trials * directions <= IN_ONE and batch.speeds is None
+
+            def tiled(leaf: jax.Array) -> jax.Array:
+                return jnp.tile(leaf, (sets, *(1,) * (leaf.ndim - 1)))
+
+            one = jax.vmap(lambda value, trial: _simulate_one(plant, set_values(value), trial, few))
+            found = one(jnp.repeat(values, trials, axis=0), jax.tree.map(tiled, batch))
+            return jax.tree.map(lambda leaf: leaf.reshape(sets, trials, *leaf.shape[1:]), found)
+
+        def jacobian(values: jax.Array, batch: Batch) -> tuple[Simulated, Simulated]:
+            """Values and their derivatives along each parameter: forward mode, directions batched."""
+            tangents = jnp.eye(values.shape[1], dtype=values.dtype)
+
+            def along(tangent: jax.Array) -> tuple[Simulated, Simulated]:
+                return jax.jvp(lambda v: rows(v, batch, len(tangents)), (values,),
+                               (jnp.broadcast_to(tangent, values.shape),))
+
+            return jax.vmap(along, out_axes=(None, -1))(tangents)
+
+        self.batch = batch
+        self._simulate, self._jacobian = jax.jit(rows), jax.jit(jacobian)
+        self._sizes: dict[Any, set[int]] = {self._simulate: set(), self._jacobian: set()}
+
+    def on(self, batch: Batch) -> Replay:
+        """The same replay of another batch; nothing is compiled again where its shapes are the same."""
+        other = object.__new__(Replay)
+        other.__dict__ = {**self.__dict__, "batch": batch}
+        return other
+
+    def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
+        """Replay with each of values (N, P); leaves gain the axis N in front. `size`: rows that are computed."""
+        return self._call(self._simulate, values, size)
+
+    def traced(self, values: jax.Array) -> Simulated:
+        """As `simulate`, within a compiled function."""
+        return self._simulate(values, self.batch)
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replay and derivatives (a last axis P) for each of values (N, P)."""
+        return self._call(self._jacobian, values)
+
+    def _call(self, function: Any, values: np.ndarray, size: int | None = None) -> Any:
+        count = len(values)
+        sizes = self._sizes[function]
+        size = size or min((size for size in sizes if size >= count), default=count)
+        sizes.add(size)
+        padded = np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
+        output = function(jnp.asarray(padded, jnp.result_type(float)), self.batch)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], output)
+
+
+def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Prediction]:
+    """Per trial what `metrics.score` compares, from the padded arrays of one parameter set (no axis N)."""
+    results = []
+    for i, trial in enumerate(trials):
+        truth = odometry = None
+        if trial.ground_truth is not None:
+            pose = np.asarray(simulated.pose[i, : len(trial.ground_truth.t)], float)
+            truth = PoseStream(trial.ground_truth.t, *pose.T)
+        if trial.odometry is not None:
+            table = np.asarray(simulated.odometry[i, : len(trial.odometry.t)], float)
+            odometry = OdometryStream(trial.odometry.t, *table.T)
+        results.append(Prediction(truth, odometry))
+    return results
+
+
+def path_of(
+    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None,
+    few: bool = False,
+) -> jax.Array:
+    """States (R + 1, 9) at the records, as `Plant.observe` tells them, of one drive.
+
+    Args:
+        command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].
+        start: (5,) x, y, yaw, v, omega.
+        warm_up: physics steps at the start's speeds before it.
+        speeds: (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`).
+        few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
+    """
+    params, latency = without(params, SensorDelay.name)
+    params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
+    if not warm_up:  # which finds its commands on the way
+        params, command = delayed(params, command, plant.dt)
+
+    in_one = as_one_function if few and plant.arithmetic else lambda function: function
+
+    def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
+        state = _advance(plant, params, state, commands)
+        return state, plant.observe(state)
+
+    def drive(start: jax.Array, command: jax.Array) -> jax.Array:
+        state = plant.place(params, start)
+        if warm_up:
+            state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
+        if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
+            later = in_one(partial(jax.lax.scan, after))(state, command)[1]
+        else:
+            later = plant.record(params, state, command)
+        return jnp.concatenate([plant.observe(state)[None], later])
+
+    gap = plant.dt * command.shape[1]
+    if speeds is None:
+        path = drive(start, command)
+    else:
+        begin = ((POSE, start[:3]), (slice(3, 6), jnp.zeros_like(start[:3])))
+        path = pieces.record(drive, command, start, speeds, round(pieces.OVERLAP / gap), begin)
+        path = path.at[-1, 8].set(path[:, 8].max())
+    turns = jax.lax.stop_gradient(_turns(start[2] - path[0, 2]))
+    for column in YAW_COLUMNS:
+        path = path.at[:, column].set(_unwrap(path[:, column]))
+    if lag is not None and plant.frame:
+        path = path.at[:, SPEEDS].set(odometry.framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
+    if latency is not None:
+        path = path.at[:, ODOMETRY].set(odometry.late(path[:, ODOMETRY], latency, gap))
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "outside"):
+            path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
+    # The measured yaw may count full turns from another origin than the simulated one.
+    return path.at[:, 2].add(turns)
+
+
+class PathReplay:
+    """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
+
+    It is compiled once for all batches of the same length, whatever their trials.
+    """
+
+    def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
+        def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> jax.Array:
+            return path_of(plant, set_values(values), command, start, warm_up, few=rows <= IN_ONE)
+
+        self.rows, self._compiled = rows, False
+        self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), static_argnums=3)
+
+    def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
+        """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""
+        count = len(values)
+        spare = -count % self.rows
+        values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)])
+        trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
+        command, start = jnp.asarray(batch.command), jnp.asarray(batch.start)  # commands are much larger than the rest
+
+        def part(first: int) -> jax.Array:
+            chosen = trials[first : first + self.rows]
+            return self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
+                             command[chosen], start[chosen], batch.warm_up)
+
+        firsts = range(0, len(values), self.rows)
+        if on_processor():
+            parts = on_all_cores(lambda first: np.asarray(part(first)), firsts, self._compiled)
+        else:  # it computes while rows are sent and fetched; most of the spare ones stay there
+            begun = [part(first) for first in firsts]
+            begun[-1] = begun[-1][: self.rows - spare // FETCHED * FETCHED]
+            parts = [np.asarray(paths) for paths in begun]
+        self._compiled = True
+        return np.concatenate(parts)[:count]
+
+
+def _simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
+    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few)
+
+    def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
+        before, after = path[index, columns], path[index + 1, columns]
+        return before + weight[:, None] * (after - before)
+
+    return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
+                     path[-1, 8])
+
+
+def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
+    """State after K physics steps, each with its own of commands (K, 2)."""
+    if plant.substeps is not None:
+        return plant.substeps(params, state, commands)
+    return jax.lax.scan(lambda state, command: (plant.substep(params, state, command), None), state, commands)[0]
+
+
+def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int) -> Any:
+    """State after driving so that the odometry reports `speeds` (2,): where the vehicle falls short of its command, as
+    a skid-steered one does, the command, which is held for a few steps, is raised until it does not."""
+
+    def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
+        state, command = carry
+        state = _advance(plant, params, state, jnp.broadcast_to(command, (held, 2)))
+        return (state, command + WARM_UP_GAIN * held * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
+
+    return jax.lax.scan(body, (state, speeds), None, length=max(steps // held, 1))[0][0]
+
+
+def _turns(angle: jax.Array) -> jax.Array:
+    return 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def _unwrap(angle: jax.Array) -> jax.Array:
+    """Angle (T,) without jumps; the full turns are constants to differentiation."""
+    jumps = jax.lax.stop_gradient(_turns(jnp.diff(angle)))
+    return angle - jnp.concatenate([jnp.zeros(1, angle.dtype), jnp.cumsum(jumps)])
+
+
+def _held_commands(trial: Trial, steps: int, dt: float) -> np.ndarray:
+    """(S, 2) command in force in the middle of each physics step; before the first command the start's speeds hold."""
+    middle = (np.arange(steps) + 0.5) * dt
+    held = command_in_force(trial.command, middle)
+    v = np.where(held >= 0, trial.command.v[held], trial.start.v)
+    omega = np.where(held >= 0, trial.command.omega[held], trial.start.omega)
+    return np.stack([v, omega], axis=-1)
+
+
+def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.ndarray]:
+    index = np.clip(np.floor(t / record + 1e-9).astype(int), 0, records - 1)
+    return index, np.clip(t / record - index, 0.0, 1.0)
+
+
+def _pad(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (B, M), values (B, M, C) and mask (B, M, C) of tables of different length; nan values are masked."""
+    longest = max(max(len(t) for t, _ in tables), 1)
+    width = tables[0][1].shape[1]
+    time = np.zeros((len(tables), longest))
+    values, mask = np.zeros((len(tables), longest, width)), np.zeros((len(tables), longest, width))
+    for i, (t, table) in enumerate(tables):
+        time[i, : len(t)] = t
+        known = np.isfinite(table)
+        values[i, : len(t)] = np.where(known, table, 0.0)
+        mask[i, : len(t)] = known
+    return time, values, mask
+
+
+def _pose_table(stream: PoseStream | None) -> tuple[np.ndarray, np.ndarray]:
+    if stream is None:
+        return np.zeros(0), np.zeros((0, 3))
+    return stream.t, np.stack([stream.x, stream.y, stream.yaw], axis=-1)
+
+
+def _odometry_table(stream: OdometryStream | None) -> tuple[np.ndarray, np.ndarray]:
+    if stream is None:
+        return np.zeros(0), np.zeros((0, 5))
+    absent = np.full(len(stream.t), np.nan)
+    pose = [absent if values is None else values for values in (stream.x, stream.y, stream.yaw)]
+    return stream.t, np.stack([*pose, stream.v, stream.omega], axis=-1)
+
+

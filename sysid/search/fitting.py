@@ -1,0 +1,272 @@
+"""Fit a vehicle or a model to the training trials of a log, and predict others with it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sysid.errors.bin_objective import FeatureObjective, make_features_objective
+from sysid.errors.pose_objective import Noise, Objective, Told, estimate_noise
+from sysid.errors.prior import Prior, bounds_alone, make_prior
+from sysid.errors.robust import robust_cost
+from sysid.errors.space import Space, make_space, searched
+from sysid.intervals import uncertainty
+from sysid.intervals.profiles import Profile, check_names, profile
+from sysid.logs import odometry_frames
+from sysid.logs.log import Log, Prediction, Trial
+from sysid.replay.differences import make_replay
+from sysid.replay.model_files import load_model
+from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
+from sysid.replay.records import Plant
+from sysid.replay.rollout import predictions, vehicle_plant
+from sysid.search import least_squares, slopes, starts, tpe
+from sysid.search.result import FitResult, Progress
+from sysid.search.settings import (
+    FEATURE_ITERATIONS,
+    GLOBAL,
+    QUICK_EVALUATIONS,
+    QUICK_ITERATIONS,
+    QUICK_TRIALS,
+    TOGETHER,
+    TRIED,
+    FitConfig,
+)
+from sysid.search.valleys import FIRST, LOOK, gradient_search
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted vehicle and what is known of it."""
+
+    params: Any
+    """`VehicleParams` at the fitted values."""
+    initial_params: Any
+    space: Space
+    uncertainty: uncertainty.Uncertainty
+    noise: Noise
+    scan: FitResult | None
+    """Result of the global search."""
+    coarse: FitResult | None
+    """Result of the search on features, of all its starts."""
+    search: FitResult | None
+    """Result of the gradient search."""
+    u: np.ndarray  # (P,) fitted unit coordinates
+    initial_cost: float
+    cost: float
+    """Mean squared white residual (large ones counted linearly); J in metres after a global search."""
+    profiles: list[tuple[str, np.ndarray, np.ndarray]]
+    seconds: float
+    plant: Plant
+    prior: Prior | None = None
+    """Of an earlier vehicle file."""
+    model: Model | None = None
+    """What was fitted in place of the simulator's vehicle."""
+    likelihoods: tuple[Profile, ...] = ()
+    """Profile likelihoods of the parameters that `profile` names."""
+    frame: float | None = None
+    """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
+
+
+def fit_log(
+    log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None,
+    model: Model | None = None,
+) -> Fit:
+    """Fit the training trials of a log.
+
+    Args:
+        log: its held-out trials are not looked at.
+        params: where the search starts; by default the preset's values for the log's vehicle.
+        model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
+    """
+    config = config or FitConfig()
+    began = time.perf_counter()
+    given = make_problem(log, config, params, model)
+    model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
+    trials = objective.trials
+    wanted = space.names if config.profile == ("all",) else config.profile
+    check_names(space, wanted)
+    if wanted and config.method in GLOBAL:
+        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
+                         "profile starts from. Use --method features, lm or both.")
+
+    scan = coarse = search = None
+    points = least_squares.random_starts(space, config.starts, config.seed)
+    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
+    profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
+    if config.method in (*GLOBAL, "both"):
+        evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
+        cost = "paper" if config.method in GLOBAL else "weighted"
+        count = max(min(config.starts, 2) if config.quick else config.starts, 2)
+        problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in trials), "channels": config.channels,
+                   "model": config.preset if model is None else model.name, "step": f"{plant.dt:g}"}
+        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
+                       progress=progress, storage=config.storage, study=config.study, problem=problem,
+                       method="cmaes" if config.method == "cmaes" else "tpe")
+        points = np.concatenate([points[:1], scan.starts])[:count]
+    elif config.method == "features":
+        starts.compile_ahead(objective, log.spec.track)
+        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
+        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
+        points = coarse.u[None]
+    if config.vehicle is not None:
+        objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
+    told: Told = choose(objective, points[0], log.spec.track, config, progress)
+    if config.method in GLOBAL:
+        assert scan is not None
+        u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
+    else:
+        search, told, profiles = gradient_search(told, space, points, iterations, config, progress)
+        u, final_cost = search.u, search.cost
+        first = told.residuals(space.to_unit(space.initial)[None])
+        initial_cost = float(robust_cost(first, config.robust)[0]) / told.counted
+    known = uncertainty.estimate(told, u, robust=config.robust and config.method not in GLOBAL)
+    traced = profile(told, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    objective = objective.renewed(u)  # its noise is reported
+    values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
+    fitted = set_parameters(params, space.names, values)
+    earlier = told.prior if config.vehicle is not None else None
+    return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
+               profiles, time.perf_counter() - began, plant, earlier, model, tuple(traced), given.frame)
+
+
+def choose(
+    objective: Objective, u: np.ndarray, track: float, config: FitConfig, progress: Progress | None = None
+) -> Told:
+    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
+    tell.
+
+    Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
+    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins tells more.
+
+    Args:
+        u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
+        track: of the vehicle [m].
+    """
+    if config.method in GLOBAL:
+        return objective
+    near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
+                        progress=progress)
+    share = uncertainty.inflation(objective, near.u)
+    told: Objective | FeatureObjective = objective
+    if config.method == "features" and share >= TOGETHER:
+        binned = make_features_objective(objective, track)
+        if binned.enough:
+            told = binned.renewed(u)
+            share = uncertainty.inflation(told, u)
+    return told if told.prior is None else replace(told, prior=replace(told.prior, share=share))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a search is given."""
+
+    plant: Plant
+    params: Any
+    """Where it starts."""
+    space: Space
+    objective: Objective
+    """Over the training trials."""
+    intervals: dict[str, tuple[float, float]]
+    """Of an earlier vehicle file."""
+    model: Model | None
+    frame: float | None = None
+    """Time between the frames of the odometry [s], which the trials' rows are at."""
+
+
+def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
+    """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
+    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
+    if not trials:
+        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    if config.quick and len(trials) > QUICK_TRIALS:
+        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
+    frame = odometry_frames.find_period(trials)
+    trials = odometry_frames.at_frames(trials, frame)
+    intervals: dict[str, tuple[float, float]] = {}
+    if model is None and config.model:
+        model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is not None:
+        if config.vehicle is not None:
+            raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
+                             "--vehicle or --model out.")
+        model = model.with_effects(config.effects)
+        plant, params = model.plant, model.params if params is None else params
+        space = model_space(params, config.parameters or None)
+    else:
+        plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
+        given = params is not None
+        if config.vehicle is not None:
+            params, intervals = _earlier(config.vehicle, log)
+        params = preset_params(log.spec, config.preset) if params is None else params
+        receipt = log.fields.get("pose_stamps") == "receipt"
+        measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
+        params = with_effects(params, (*config.effects, *measured))
+        space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+    plant = replace(plant, frame=frame)
+    if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
+        space = space.without(odometry_frames.AGE, "speeds are those of the odometry's frames")
+    noise = estimate_noise(odometry_frames.at_frames(log.training, frame))
+    objective = make_objective(plant, params, space, trials, noise)
+    objective = replace(objective, prior=bounds_alone(space))
+    return Problem(plant, params, space, objective, intervals, model, frame)
+
+
+def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
+    """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
+    from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
+
+    spec, params, _ = load_vehicle(path)
+    for name in ("wheel_radius", "track", "wheelbase", "drive"):
+        if getattr(spec, name) != getattr(log.spec, name):
+            raise ValueError(f"{path}: {name} is {getattr(spec, name)}, but {getattr(log.spec, name)} in {log.name!r}. "
+                             "The vehicle file must be of the same vehicle; correct dataset.toml or leave it out.")
+    return params, load_intervals(path)
+
+
+def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:
+    """Objective over the space's parameters; the others keep their values in `params`."""
+    replay, measured = make_replay(plant, params, space, trials)
+    return Objective(replay, space, trials, measured, noise)
+
+
+def fitted_plant(spec: VehicleSpec) -> Plant:
+    """The simulator's vehicle with the physics step that fits have by default: for logs with planted truth, since the
+    step is part of a model."""
+    return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
+
+
+def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list[Prediction]]:
+    """Replays of trials with the initial and with the fitted vehicle."""
+    if not trials:
+        return [], []
+    replay, _ = make_replay(fit.plant, fit.params, fit.space, trials)
+    values = np.stack([np.asarray(get_parameters(one, fit.space.names)) for one in (fit.initial_params, fit.params)])
+    simulated = replay.simulate(values)
+    initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
+    return initial, fitted
+
+
+def _keep_channels(trial: Trial, channels: str) -> Trial:
+    if channels == "ground_truth" and trial.ground_truth is not None:
+        return replace(trial, odometry=None)
+    if channels == "odometry" and trial.odometry is not None:
+        return replace(trial, ground_truth=None)
+    return trial
+
+
+def expected_steps(config: FitConfig) -> int:
+    """How far the progress bar goes, unless searches from elsewhere lead on."""
+    scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
+    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
+    drawn = starts.FIRST + starts.STEPS if config.starts > 1 else 0
+    first = {"features": drawn + FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
+    elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
+    return first + (TRIED + iterations + elsewhere if config.method not in GLOBAL else 0)

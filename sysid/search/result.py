@@ -1,0 +1,49 @@
+"""What a search returns, and how it reports its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Progress = Callable[[int, str], None]
+"""Called with the number of evaluations just done and a short remark."""
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Best point of a search, in unit coordinates."""
+
+    u: np.ndarray  # (P,)
+    cost: float
+    initial_cost: float
+    """Cost of the first candidate, the initial values."""
+    evaluations: int
+    starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(S, P) end points of the search: the best candidates of TPE, the end of each start of LM."""
+    start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(S,) cost of each of them, where known."""
+    order: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """(S,) which of the given starts each of them comes from, in a gradient search."""
+    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Best cost so far after each evaluation or iteration."""
+
+    @property
+    def as_given(self) -> tuple[np.ndarray, np.ndarray]:
+        """End points (S, P) and costs (S,) of a gradient search in the order of the given starts."""
+        place = np.argsort(self.order)
+        return self.starts[place], self.start_costs[place]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Best point so far of one search, whenever it got better, and at its end."""
+
+    method: str
+    seed: int
+    evaluations: np.ndarray  # (K,) parameter sets simulated until then
+    seconds: np.ndarray  # (K,)
+    cost: np.ndarray  # (K,) mean squared residual in noise scales
+    u: np.ndarray  # (K, P)
+    held_out: np.ndarray  # (K,) mean position RMSE on held-out trials [m]; nan without any

@@ -1,0 +1,119 @@
+"""Slopes of residuals over the range that estimates err in.
+
+Wheels stick or slip, torques meet their limit and delays act in steps: the floor of a cost is jagged, and its slopes
+depend on how far they look. Differences over a fixed share of each parameter's range (`sysid.replay.differences`)
+lead there
+from afar, but one at a time, over many times what a delay errs by and hardly what a sag does: on the floor a search by
+them stops at one of many folds, and they tell some parameters half, others twice as well as the log does. What it
+tells is how residuals differ over all likely values: a plane through them at points drawn from the ellipsoid of the
+errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes from the slopes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.errors.robust import robust_cost
+from sysid.search.least_squares import Residuals, damped_steps, normal_sums
+from sysid.search.result import FitResult, Progress
+
+ROTATIONS = 3
+"""Of the ellipsoid's axes, at random: each has points at both ends of all P axes."""
+AT_ONCE = 2**23  # residuals, of points that are replayed together
+REFLECTIONS = 8  # passes over the walls of the box; what is outside still then is moved inwards
+REACH = 0.08
+"""Standard deviation in unit coordinates, at most, over which is averaged: further away lie other valleys."""
+EXACT = 1e-9
+"""Cost at least, in squared noise scales: a model that is met to the last bit still has an ellipsoid."""
+ROUNDS, MISSES, WORTH = 24, 3, 2e-4
+"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share, or the sum of
+squares by less than one of them: with more, estimates still move by a share of their errors."""
+DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
+SIZES = (1.0, 0.3)
+"""Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""
+
+
+def average_slopes(
+    objective: Residuals, u: np.ndarray, covariance: np.ndarray, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (B, K) at u (P,), and their derivatives (B, K, P) averaged over errors of that covariance (P, P).
+
+    Args:
+        u: unit coordinates; points beyond their range are reflected into it.
+    """
+    size, random = len(u), np.random.default_rng(seed)
+    axes = np.concatenate([np.linalg.qr(random.standard_normal((size, size)))[0] for _ in range(ROTATIONS)])
+    steps = np.sqrt(size) * axes @ _root(covariance).T  # as far out as errors are on average
+    moves = within(u, np.concatenate([steps, -steps]), covariance)
+    weights = np.linalg.pinv(np.column_stack([moves, np.ones(len(moves))]))[:size]  # (P, N)
+    residual = objective.residuals(u[None])[0]
+    slopes, count = np.zeros((*residual.shape, size)), max(AT_ONCE // residual.size, 1)
+    points = np.clip(objective.space.moved(np.tile(u, (len(moves), 1)), moves), 0.0, 1.0)
+    for first in range(0, len(moves), count):
+        part = slice(first, first + count)
+        slopes += np.einsum("pn,nbk->bkp", weights[:, part], objective.residuals(points[part]))
+    return residual, slopes
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """R (P, P) with R R^T the covariance."""
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:  # by rounding, where some parameters are known far better than others
+        value, vector = np.linalg.eigh(covariance)
+        return vector * np.sqrt(np.maximum(value, 0.0))
+
+
+def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Moves (N, P) from u (P,) that stay in the unit box.
+
+    A wall reflects those beyond it to where, in the ellipsoid of the covariance, they are as likely: what goes along
+    with a parameter turns back with it.
+    """
+    moves = moves.copy()
+    for _ in range(REFLECTIONS):
+        for p in range(len(u)):
+            beyond = (u[p] + moves[:, p] < 0.0) | (u[p] + moves[:, p] > 1.0)
+            moves[beyond] -= 2 * moves[beyond, p, None] * covariance[:, p] / covariance[p, p]
+    room = np.where(moves > 0, 1.0 - u, u) / np.maximum(np.abs(moves), 1e-300)
+    return moves * np.minimum(room.min(1, keepdims=True), 1.0)
+
+
+def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
+    """Covariance (P, P) of errors in unit coordinates, for residuals with these derivatives (B, K, P)."""
+    return likely_by(np.einsum("bkp,bkq->pq", jacobian, jacobian), variance)
+
+
+def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:
+    """The same of J^T J (P, P)."""
+    return np.linalg.inv(hessian / max(variance, EXACT) + np.eye(len(hessian)) / REACH**2)
+
+
+def descend(
+    objective: Residuals, result: FitResult, robust: bool = False, seed: int = 0, progress: Progress | None = None
+) -> FitResult:
+    """The result with where damped Gauss-Newton steps with averaged slopes lead from its u, as long as costs fall."""
+    u, cost, spent, misses = result.u, result.cost, 0, 0
+    free, history = np.ones(len(u), bool), []
+    slopes = objective.jacobian(u[None])[1][0]
+    for number in range(ROUNDS):
+        before = cost
+        covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
+        residual, slopes = average_slopes(objective, u, covariance, seed + number)
+        (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], robust)
+        points = damped_steps(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS), free,
+                              objective.space)
+        costs = robust_cost(objective.residuals(points), robust) / objective.counted
+        spent += 1 + 2 * ROTATIONS * len(u) + len(points)
+        if costs.min() < cost:
+            u, cost = points[costs.argmin()], float(costs.min())
+        history.append(cost)
+        if progress is not None:
+            progress(1, f"cost {cost:.4g}")
+        misses = 0 if cost < before * (1 - min(WORTH, 1 / objective.counted)) else misses + 1
+        if misses == MISSES:
+            break
+    return replace(result, u=u, cost=cost, history=np.concatenate([result.history, history]),
+                   evaluations=result.evaluations + spent)

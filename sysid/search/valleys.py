@@ -1,0 +1,129 @@
+"""The gradient search on poses, and where else it looks: costs of drives have many valleys.
+
+A search ends in the valley that it starts in. Others are looked for at the ends of ranges, far along them, and at other
+delays; what a drive hardly tells, or tells only beyond a limit, is found so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from sysid.errors.pose_objective import Told
+from sysid.errors.space import Space
+from sysid.search import least_squares, slopes
+from sysid.search.result import FitResult, Progress
+from sysid.search.settings import FitConfig
+
+VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
+FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
+DEAR, FAR = 10.0, 12
+"""Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
+FIRST, KEPT, LOOK = 1, 2, 3
+"""Iterations from all of these, how many are searched further, and iterations after which one must be better."""
+LAST = 3  # iterations on whole drives at most, after those in pieces of an accelerator
+LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
+WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
+
+
+def gradient_search(
+    objective: Told, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
+    progress: Progress | None,
+) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
+    """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
+
+    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
+    right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
+    on a grid, and LM tries another valley that is about as deep. The floors of valleys are jagged: at the end slopes
+    averaged over what estimates err lead on (`sysid.search.slopes`). From the floor the ends of ranges are tried
+    again, since what hid them may be gone.
+    Nothing of this is done without `config.elsewhere`.
+    """
+
+    def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
+        return from_all(objective, space, starts, iterations, config.robust, progress)
+
+    def renew(objective: Told, result: FitResult, starts: np.ndarray) -> tuple[Told, FitResult]:
+        """With the noise that the result leaves, searched again from starts (S, P) where that changes it."""
+        again = objective.renewed(result.u)
+        return (objective, result) if again is objective else (again, search(again, starts, iterations))
+
+    result = search(objective, starts, iterations)
+    objective, result = renew(objective, result, result.starts)
+    follow = partial(search, objective)
+    if config.elsewhere:
+        result = _from_ends(follow, objective, result, iterations, config.robust)
+    lost = config.elsewhere
+    while lost:
+        before = result.cost
+        costs, points = least_squares.far_points(objective, result.u, robust=config.robust)
+        points = points[costs < DEAR * result.cost][:FAR]
+        result = _from_elsewhere(follow, result, points, iterations)
+        lost = result.cost < LOST * before
+    found = least_squares.profile_delays(objective, space, result.u, robust=config.robust)
+    for name, _, costs, followed in found:
+        here = result.u[space.names.index(name)]
+        apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
+        if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
+            other = followed[apart][costs[apart].argmin()]
+            result = _from_elsewhere(follow, result, other[None], iterations)
+    deeper = config.elsewhere
+    if deeper:
+        given = result
+        objective, result = renew(objective, result, result.u[None])
+        result = replace(result, starts=given.starts, start_costs=given.start_costs, order=given.order)
+        follow = partial(search, objective)
+    while deeper:
+        result = slopes.descend(objective, result, config.robust, config.seed, progress)
+        floor = result.cost
+        result = _from_ends(follow, objective, result, iterations, config.robust)
+        deeper = result.cost < floor * (1 - WORTH)
+    return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
+
+
+def from_all(
+    objective: Told, space: Space, starts: np.ndarray, iterations: int, robust: bool = False,
+    progress: Progress | None = None,
+) -> FitResult:
+    """LM from all starts (S, P), on what is quicker as long as that leads on."""
+    quicker, spent = getattr(objective, "quicker", objective), 0
+    if quicker is not objective:
+        way = least_squares.fit(quicker, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+        starts, spent, iterations = way.as_given[0], way.evaluations, min(iterations, LAST)
+    found = least_squares.fit(objective, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+    return replace(found, evaluations=found.evaluations + spent)
+
+
+def _from_ends(
+    search: Callable[[np.ndarray, int], FitResult], objective: Told, result: FitResult, iterations: int,
+    robust: bool,
+) -> FitResult:
+    """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here
+    lies on the same ground, and a search from it hardly leads on: such are tried where there are no others."""
+    costs, points = least_squares.ends_of_ranges(objective, result.u, robust=robust)
+    near, level = costs < FLAT * result.cost, np.abs(costs - result.cost) <= WORTH * result.cost
+    near = near & ~level if (near & ~level).any() else near
+    return _from_elsewhere(search, result, points[near], iterations)
+
+
+def _from_elsewhere(
+    search: Callable[[np.ndarray, int], FitResult], result: FitResult, starts: np.ndarray, iterations: int
+) -> FitResult:
+    """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
+    iterations, the best of them to its end where it is lower by then."""
+    if not len(starts):
+        return result
+    spent = result.evaluations
+    if len(starts) > KEPT:
+        first = search(starts, FIRST)
+        starts, spent = first.starts[:KEPT], spent + first.evaluations
+    new = search(starts, min(LOOK, iterations))
+    spent += new.evaluations
+    if new.cost < result.cost:
+        new = search(new.u[None], iterations)
+        result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations
+    return replace(result, evaluations=spent)

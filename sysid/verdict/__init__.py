@@ -1,0 +1,1 @@
+"""The verdict: which effects are named, how surely, and what speaks against them."""

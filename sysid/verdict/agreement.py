@@ -1,0 +1,154 @@
+"""Whether manoeuvres agree on an effect: a real one has one size in all that excite it, a lucky one has many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from sysid.missing.joint_fit import Refit
+
+ALPHA = 0.05
+"""Of the test whether manoeuvres differ on a size."""
+POWER = 0.8
+"""Least power of a manoeuvre to tell an effect from none, for it to be asked; and of that test, to be believed."""
+SCATTER = 0.5
+"""Standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see."""
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Heterogeneity:
+    """Cochran's test that an effect has one size in all manoeuvres that excite it."""
+
+    asked: np.ndarray  # (G,) bool, manoeuvres that by themselves would tell the effect from none
+    q: float
+    """Squared differences from the mean over their variances, about chi-squared with one less than asked where the size
+    is one."""
+    p: float
+    scatter: float
+    """Standard deviation of the sizes beyond the noise, as a share of the mean."""
+    least: float
+    """Lower 95 % end of it, or less: the mean is not known exactly either."""
+    power: float
+    """To see a scatter of `SCATTER`."""
+
+    @property
+    def outcome(self) -> str:
+        """agree, differ, or untold where a scatter would not have been seen."""
+        return "differ" if self.p < ALPHA else "agree" if self.power >= POWER else "untold"
+
+
+def heterogeneity(factor: np.ndarray, error: np.ndarray) -> Heterogeneity:
+    """Whether sizes (G,) with standard errors (G,), as shares of the fitted size, are one.
+
+    A manoeuvre that cannot see the effect has no say. For sizes that scatter by s beside noise of variances e^2,
+    q (k - 1) / (k - 1 + c s^2) is about chi-squared, with c = sum w - sum w^2 / sum w and w = 1 / e^2 (DerSimonian and
+    Laird 1986).
+    """
+    told = special.ndtri(1 - ALPHA / 2) + special.ndtri(POWER)
+    asked = error < 1 / told
+    freedom = int(asked.sum()) - 1
+    if freedom < 1:
+        return Heterogeneity(asked, 0.0, 1.0, 0.0, 0.0, 0.0)
+    weight, sizes = error[asked] ** -2.0, factor[asked]
+    mean = float((weight * sizes).sum() / weight.sum())
+    q = float((weight * (sizes - mean) ** 2).sum())
+    spread = float(weight.sum() - np.square(weight).sum() / weight.sum()) / freedom
+    limit, unit = float(special.chdtri(freedom, ALPHA)), max(abs(mean), 1e-9)
+    scatter = float(np.sqrt(max(q / freedom - 1, 0.0) / spread))
+    largest = unit + special.ndtri(1 - ALPHA) * np.sqrt(scatter**2 / (freedom + 1) + 1 / weight.sum())
+    least = float(np.sqrt(max(q / limit - 1, 0.0) / spread)) / largest
+    power = float(special.chdtrc(freedom, limit / (1 + spread * (SCATTER * unit) ** 2)))
+    return Heterogeneity(asked, q, float(special.chdtrc(freedom, q)), scatter / unit, least, power)
+
+
+def interval_of_sum(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of the sum of values (G,), with the values drawn anew."""
+    rng = np.random.default_rng(seed)
+    sums = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].sum(1)
+    low, high = np.quantile(sums, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def with_prior(fit: Refit, precision: np.ndarray) -> np.ndarray:
+    """(P + k, P + k) information of a joint fit, with the precision (P, P) of the base parameters as prior."""
+    matrix = fit.products(precision)
+    matrix[np.diag_indices(len(matrix))] += 1e-9 * np.diag(matrix).max()
+    return matrix
+
+
+def sizes_apart(
+    fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(G,) size that each manoeuvre by itself asks of some coordinates, as a factor on the fitted one, and its error.
+
+    All else - base parameters, other coordinates - is as the other manoeuvres have it, and may move as far as they
+    allow. A linear step from the joint fit.
+
+    Args:
+        part: coordinates of an effect within q.
+        groups: trials of each manoeuvre.
+    """
+    size = len(fit.u)
+    index = np.arange(size + part.start, size + part.stop)
+    matrix = with_prior(fit, precision)
+    factors, errors = [], []
+    for group in groups:
+        chosen = list(group)
+        flat = fit.jacobian[chosen].reshape(-1, fit.jacobian.shape[-1])
+        column = flat[:, index] @ fit.q[part]
+        others = np.delete(flat, index, axis=1)
+        prior = np.delete(np.delete(matrix - flat.T @ flat, index, 0), index, 1)
+        left = column - others @ np.linalg.solve(others.T @ others + prior, others.T @ column)
+        strength = max(float(left @ left), 1e-9)
+        factors.append(1 + float(left @ fit.residual[chosen].reshape(-1)) / strength)
+        errors.append(strength**-0.5)
+    return np.array(factors), np.array(errors)
+
+
+def disagreement(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:
+    """By how much the size of an effect differs from manoeuvre to manoeuvre beyond the noise, as a share of it: the
+    root mean square about the mean, each manoeuvre counting by what it tells."""
+    factor, error = sizes_apart(fit, part, groups, precision)
+    weight = error**-2
+    if weight.sum() < 1e-6:
+        return 0.0
+    mean = float((weight * factor).sum() / weight.sum())
+    beyond = float((weight * (factor - mean) ** 2).sum()) - (len(factor) - 1)
+    return float(np.sqrt(max(beyond, 0.0) / weight.sum()))
+
+
+def foretold(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> np.ndarray:
+    """(G,) by how much some coordinates, fitted to all other manoeuvres, lower the squared residual of each manoeuvre.
+
+    Compared with a fit without them, to the same other manoeuvres. Linear, around the joint fit.
+    """
+    size = len(fit.u)
+    index = np.arange(size + part.start, size + part.stop)
+    kept = np.delete(np.arange(fit.jacobian.shape[-1]), index)
+    matrix = with_prior(fit, precision)
+    columns, gains = fit.jacobian, []
+    without = fit.residual + columns[..., index] @ fit.q[part]
+    moments = np.einsum("bni,bn->bi", columns, fit.residual)
+    moments_without = np.einsum("bni,bn->bi", columns[..., kept], without)
+    for group in groups:
+        chosen = list(group)
+        flat = columns[chosen].reshape(-1, columns.shape[-1])
+        rest = matrix - flat.T @ flat
+        others = np.setdiff1d(np.arange(len(columns)), chosen)
+        step = np.linalg.solve(rest, moments[others].sum(0))
+        step_without = np.linalg.solve(rest[np.ix_(kept, kept)], moments_without[others].sum(0))
+        left = fit.residual[chosen].reshape(-1) - flat @ step
+        left_without = without[chosen].reshape(-1) - flat[:, kept] @ step_without
+        gains.append(float(left_without @ left_without - left @ left))
+    return np.array(gains)
+
+
+def beside(products: np.ndarray, count: int) -> np.ndarray:
+    """(k, k) information on the last k = `count` columns, beside the others."""
+    size = len(products) - count
+    cross = products[:size, size:]
+    return products[size:, size:] - cross.T @ np.linalg.lstsq(products[:size, :size], cross, rcond=None)[0]

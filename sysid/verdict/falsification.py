@@ -1,0 +1,149 @@
+"""Whether drives do what the law of an effect forbids."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import stats
+
+from sysid.logs.log import Trial, command_in_force
+from sysid.missing.joint_fit import Refit, moved_last
+from sysid.missing.refit import Refitter, without_each
+from sysid.verdict.agreement import beside
+from sysid.verdict.falsifiers import QUIET, SPLITS, Course, Tested
+from whill_mjx.effects import card_of
+from whill_mjx.effects.card import Falsifier
+
+ALPHA = 0.01
+"""Of all predictions of one effect together."""
+POWER = 0.8
+"""Least power with which drives must show the opposite for a prediction to count as tested."""
+LEFT = 1.0
+"""Largest share of what effects gain that may be left where one does nothing: with more it is not what stands out."""
+
+
+def put_to_test(
+    fit: Refit, refitter: Refitter, trials: Sequence[Trial], groups: Sequence[Sequence[int]], track: float,
+    p_excess: Callable[[float], float],
+) -> list[list[Tested]]:
+    """Every prediction of every effect in a joint fit, effect by effect.
+
+    Args:
+        groups: trials of each manoeuvre; errors count them as what is independent.
+        p_excess: probability that a day with nothing in it leaves as much above the noise.
+    """
+    features = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
+    course = course_of(trials, features[0], refitter.drives.features.width, track)
+    seen = refitter.drives.mask > 0
+    out: list[list[Tested]] = []
+    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
+        change = features[0] - features[1 + number]  # (B, K, C)
+        energy = np.square(refitter.white(change)).reshape(seen.shape).sum(-1)
+        tested = card_of(one.effect).forbids
+        out.append([])
+        for falsifier in tested:
+            alpha = ALPHA / len(tested)
+            if falsifier.kind == "absent":
+                quiet = QUIET[falsifier.by](course)[..., None] & seen
+                out[-1].append(_absent(one.effect, falsifier, fit, part, refitter.precision, quiet, p_excess, alpha))
+                continue
+            sides = SPLITS[falsifier.by](course, energy)
+            parts = np.stack([change * (sides == which)[..., None] for which in (-1.0, 1.0, 0.0)], axis=-1)
+            size, covariance = sizes_in_parts(fit, part, refitter.white(parts), refitter, groups)
+            out[-1].append(_same(one.effect, falsifier, size[:2], covariance[:2, :2], len(groups) - 1, alpha))
+    return out
+
+
+def sizes_in_parts(
+    fit: Refit, part: slice, signatures: np.ndarray, refitter: Refitter, groups: Sequence[Sequence[int]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(S,) sizes of the parts of an effect, as factors on the joint fit, and their covariance (S, S).
+
+    A linear step from the joint fit, beside base parameters within their spread and all other effects. The covariance
+    is the larger, part by part, of that of white noise and of one that takes manoeuvres as what is independent: the
+    form of an effect is never quite the catalogue's.
+
+    Args:
+        part: the effect's coordinates within q, which the parts take the place of.
+        signatures: (B, n, S) white change of the features by each part of the effect.
+    """
+    size, count = len(fit.u), signatures.shape[-1]
+    own = np.arange(size + part.start, size + part.stop)
+    columns = np.concatenate([np.delete(fit.jacobian, own, axis=-1), signatures], axis=-1)
+    flat, residual = columns.reshape(-1, columns.shape[-1]), fit.residual.reshape(-1)
+    matrix, right = flat.T @ flat, flat.T @ residual
+    matrix[:size, :size] += refitter.precision
+    right[:size] -= refitter.precision @ (fit.u - refitter.reference.u)
+    matrix[np.diag_indices(len(matrix))] += 1e-9 * max(float(np.diag(matrix).max()), 1e-12)
+    step, inverse = np.linalg.solve(matrix, right), np.linalg.inv(matrix)
+    left = fit.residual - columns @ step
+    scores = np.stack([np.einsum("bni,bn->i", columns[list(group)], left[list(group)]) for group in groups])
+    robust = inverse @ (scores.T @ scores) @ inverse * len(groups) / max(len(groups) - 1, 1)
+    usual, clustered = inverse[-count:, -count:], robust[-count:, -count:]
+    scale = np.sqrt(np.maximum(np.diag(clustered) / np.diag(usual), 1.0))
+    return 1 + step[-count:], usual * scale[:, None] * scale
+
+
+def _same(effect: str, falsifier: Falsifier, size: np.ndarray, covariance: np.ndarray, freedom: int, alpha: float
+          ) -> Tested:
+    """Whether the weaker part is surely below `least` of the stronger one."""
+    weak = int(np.argmin(size))
+    contrast = np.full(2, -falsifier.least)
+    contrast[weak] = 1.0
+    error = float(np.sqrt(contrast @ covariance @ contrast))
+    told = stats.t(max(freedom, 1))
+    p = float(min(2 * told.cdf(float(contrast @ size) / error), 1.0))  # the weaker of two was picked
+    power = float(told.cdf((falsifier.least - falsifier.else_) / error + told.ppf(alpha / 2)))
+    outcome = "falsified" if p < alpha else "holds" if power >= POWER else "untold"
+    return Tested(effect, falsifier, outcome, tuple(size.tolist()), error, p, power)
+
+
+def _absent(
+    effect: str, falsifier: Falsifier, fit: Refit, part: slice, precision: np.ndarray, quiet: np.ndarray,
+    p_excess: Callable[[float], float], alpha: float,
+) -> Tested:
+    """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
+    count = float(quiet.sum())
+    left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
+    gain = _gain(moved_last(fit, fit.parts.index(part)), part.stop - part.start, precision)
+    p = float(p_excess(left / count)) if count else 1.0
+    share = left / _gain(fit, len(fit.q), precision)
+    told = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
+    outcome = "falsified" if p < alpha and share > LEFT else "holds" if told else "untold"
+    return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
+                  1.0 if told else 0.0)
+
+
+def _gain(fit: Refit, count: int, precision: np.ndarray) -> float:
+    """By how much the last `count` coordinates lower the cost of a joint fit, beside all others. Linear."""
+    q = fit.q[-count:]
+    return max(float(q @ beside(fit.products(precision), count) @ q), 1e-9)
+
+
+def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> Course:
+    """The course of trials, from simulated features (B, K, 5) and their commands."""
+    bins = simulated.shape[1]
+    t = (np.arange(bins) + 0.5) * width
+    measured = np.stack([np.arange(bins) * width < trial.duration for trial in trials])
+    v, omega = np.where(measured, simulated[..., 0], 0.0), np.where(measured, simulated[..., 1], 0.0)
+    start = np.array([trial.start.yaw for trial in trials])[:, None]
+    heading = start + np.cumsum(omega * width, axis=1) - omega * width / 2
+    rows = [_changes(trial, t, track) for trial in trials]
+    asked, step, rising, since = (np.stack([row[k] for row in rows]) for k in range(4))
+    return Course(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
+
+
+def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Turning that is commanded at times t (K,), size of the command's last change before, 1 or -1 by whether it led
+    away from rest, and time since."""
+    command = np.stack([trial.command.v, trial.command.omega * track / 2], axis=-1)
+    change = np.diff(command, axis=0, prepend=command[:1])
+    size = np.linalg.norm(change, axis=-1)
+    grown = np.sign(np.diff(np.linalg.norm(command, axis=-1), prepend=np.linalg.norm(command[0])))
+    held = np.maximum(command_in_force(trial.command, t), 0)
+    moved = np.where(size > 1e-6, np.arange(len(size)), -1)
+    last = np.maximum.accumulate(moved)[held]
+    known = last >= 0
+    return (command[held, 1], np.where(known, size[last], 0.0), np.where(known, grown[last], 0.0),
+            np.where(known, t - trial.command.t[last], t))

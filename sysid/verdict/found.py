@@ -1,0 +1,228 @@
+"""What the search for effects decides by, and what it found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sysid.intervals.statistics import upper_rate
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.joint_fit import Refit
+
+LARGEST = 4  # members of a class
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
+
+    alpha: float = 0.005
+    """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
+    the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
+    alarms."""
+    share: float = 0.6
+    """Least share of the excess residual that named effects explain together."""
+    most: float = 0.5
+    """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
+    excess: float = 0.06
+    """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
+    excess_alone: float = 1e-3
+    """p-value of the excess below which something without a name is missing, whatever the search says."""
+    search_alone: float = 1e-10
+    """The same of the search, whatever the excess. Small p-values come more often than they say, so otherwise both must
+    be below alpha: on 420 days with nothing missing the least one with no such excess was 8e-10."""
+    quiet: float = 0.05
+    """p-value of the excess that is left from which it passes for a day's own."""
+    second: float = 0.25
+    """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
+    step: float = 0.15
+    """Least further share of the excess that it explains."""
+    own: float = 0.3
+    """Least share of what the effects before it left that a smaller one must explain."""
+    rest: float = 0.9
+    """The same from which no more is asked of one that is needed beside them: what mends their form leaves a rest."""
+    agree: float = 0.6
+    """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
+    of it, at which it is there for its own sake."""
+    alone: float = 1.8
+    """Largest factor by which its gain may then change."""
+    differ: float = 0.35
+    """Largest disagreement of manoeuvres on its size."""
+    half: float = 0.5
+    """Least share of what the effects before it left that one must explain whose columns other forms of them do not
+    imitate (`sysid.verdict.forms`)."""
+    slight: float = 0.05
+    """Least gain of such an effect, as a share of the first one's."""
+    unlike: float = 0.75
+    """Least share of its signature that such forms do not imitate."""
+    instead: float = 0.7
+    """Most that they may gain instead of it, as a share of what it gains."""
+    little: float = 0.1
+    """What one must explain of it that manoeuvres tell of each other."""
+    foretold: float = 0.7
+    """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
+    same: float = 0.2
+    """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
+    loss: float = 0.1
+    """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
+    scatter: float = 1.0
+    """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
+    more one in six would find the opposite."""
+    rounds: int = 3
+    pairs: int = 3
+    """Pairs of effects that are refitted."""
+    worthwhile: float = 0.15
+    """Least scanned gain of an effect that is refitted, as a share of the best one's."""
+    candidates: int = 4
+    """Effects refitted in a round, of each scan."""
+    close: float = 0.5
+    """Share of the best refit's gain from which another one is polished too."""
+    rival: float = 0.4
+    """|cos| of two effects' signatures above which one is not named before the other was refitted."""
+    between: float = 0.5
+    """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
+    alike: float = 0.9
+    """|cos| of two effects' signatures above which they are not told apart."""
+
+
+@dataclass
+class Candidate:
+    """One refitted hypothesis of a round."""
+
+    hypothesis: Hypothesis
+    gain: float
+    """By how much it lowers the cost, refitted."""
+    p: float
+    """Family-wise, of that gain."""
+    share: float
+    refit: Refit
+    own: bool = False
+    """Small beside the first, but as large and as useful without it, and most of what the others left."""
+
+
+@dataclass
+class Search:
+    """What the search found."""
+
+    verdict: str
+    base: Refit
+    final: Refit
+    scan: Scan
+    rounds: list[list[Candidate]] = field(default_factory=list)
+    accepted: list[Candidate] = field(default_factory=list)
+    classes: list[list[str]] = field(default_factory=list)
+    crowd: list[str] = field(default_factory=list)
+    """Effects that look alike too, beyond the `LARGEST` nearest of a class."""
+    share: float = 0.0
+    excess: tuple[float, float] = (0.0, 0.0)
+    """Squared white residual over its number, less 1: before and after."""
+    reason: str = ""
+    pairs: PairScan | None = None
+    together: float | None = None
+    """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
+
+    @property
+    def p_value(self) -> float:
+        """Of "nothing is missing": that of the scan and, where refits were tried, of the best of them."""
+        if self.together is not None:
+            return self.together
+        refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
+        return max(self.scan.p_family, refitted)
+
+
+def excess_of(fit: Refit, count: float) -> float:
+    """Squared white residual of a fit over its number of values, less 1."""
+    return float(np.square(fit.residual).sum()) / count - 1
+
+
+def explained_share(base: Refit, count: float, thresholds: Thresholds, fit: Refit) -> float:
+    """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
+    before = excess_of(base, count)
+    return float(np.clip((before - excess_of(fit, count)) / max(before, thresholds.excess), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Gains of H hypotheses, each at the level of its highest worth."""
+
+    gain: np.ndarray  # (H,)
+    worth: np.ndarray  # (H,)
+    q: tuple[np.ndarray, ...]  # (k,) per hypothesis
+    null: np.ndarray  # (N, H) worth on simulated nulls
+    p: np.ndarray  # (H,) p-value of each by itself
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return family(self.smallest, float(self.p.min()))
+
+    def p_of(self, h: int, worth: float) -> float:
+        """Family-wise p-value of hypothesis h if this is its worth."""
+        return family(self.smallest, float(tail(self.null[:, h], worth)))
+
+
+def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:
+    """P(null >= value), beyond the draws by an exponential tail through their upper tenth."""
+    from scipy import stats
+
+    value = np.asarray(value, float)
+    ordered = np.sort(null)
+    count = len(ordered)
+    empirical = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
+    top = ordered[int(0.9 * count) :]
+    start = top[0]
+    excess = np.maximum(top - start, 0.0)
+    scale = max(float(excess.mean()), 1e-9)
+    far = 0.1 * stats.expon.sf(value - start, scale=scale)
+    return np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical)
+
+
+def family(smallest: np.ndarray, p: float) -> float:
+    """p-value of the smallest p among dependent tests, from its null sample; extrapolated as p x effective number."""
+    count = len(smallest)
+    if p >= np.quantile(smallest, 0.05):
+        return float((np.sum(smallest <= p) + 1) / (count + 1))
+    number = 0.05 / np.quantile(smallest, 0.05)
+    return float(min(1.0, number * p))
+
+
+@dataclass(frozen=True)
+class PairScan:
+    """M pairs of hypotheses, each at the levels of its highest worth."""
+
+    members: tuple[tuple[int, int], ...]
+    gain: np.ndarray  # (M,)
+    worth: np.ndarray  # (M,)
+    q: tuple[np.ndarray, ...]  # coordinates of the first member, then of the second
+    p: np.ndarray  # (M,) p-value of each pair by itself
+    smallest: np.ndarray  # (N,) smallest p-value of each null
+    null: np.ndarray  # (N, M) worth on simulated nulls
+
+    @property
+    def p_family(self) -> float:
+        """p-value of the smallest p-value."""
+        return self.p_of(float(self.p.min())) if len(self.p) else 1.0
+
+    def p_of(self, p: float) -> float:
+        """Family-wise p-value of a pair's own."""
+        return family(self.smallest, p)
+
+
+@dataclass(frozen=True)
+class NullRefits:
+    """What was found in N simulated days with nothing missing."""
+
+    p: np.ndarray  # (N,) what `Search.p_value` would be
+    alarms: int
+    """How many of them would not have been called `none`."""
+
+    def p_of(self, p: float) -> float:
+        """Share of days with nothing in them whose p-value is as small, the drives in question counted in."""
+        return float((np.sum(self.p <= p) + 1) / (len(self.p) + 1))
+
+    @property
+    def upper(self) -> float:
+        """Upper end of the one-sided 95 % interval of the false-alarm rate."""
+        return upper_rate(self.alarms, len(self.p))

@@ -1,0 +1,117 @@
+"""Days with nothing missing, put through the same fits as the drives in question.
+
+The nulls of `sysid.verdict.scan` are linear: they move along the columns of the base parameters. Those here are
+drives of
+the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
+day is added, and base fit, scan and refits see it as they see measured drives. They tell how often this very set of
+drives would raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Wander, alike
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.joint_fit import Refit, Start
+from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
+from sysid.missing.signatures import white_leftover
+from sysid.replay.cores import on_processor
+from sysid.search.result import Progress
+from sysid.verdict.classes import imitation
+from sysid.verdict.found import NullRefits, PairScan, Scan, Search, Thresholds, excess_of, explained_share, family, tail
+from sysid.verdict.pairs import scan_again
+from sysid.verdict.rounds import pair_round, refitted
+from sysid.verdict.scan import best, drawn_away
+
+TOGETHER, ACCELERATED = 16, 100
+"""Days whose base fits advance side by side on a processor, and on an accelerator."""
+
+
+def run(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
+    thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
+    pairs: PairScan | None = None,
+) -> NullRefits:
+    """Simulate and judge `count` days.
+
+    Args:
+        evidence: of the drives in question around the reference, as `gather` made it.
+        scan: of the drives in question: its linear nulls are what the first look at each day is held against.
+        pairs: likewise of pairs of effects; None where pairs do not decide.
+    """
+    reference, measured = refitter.reference, float((refitter.drives.mask > 0).sum())
+    rng = np.random.default_rng((seed, 1))
+    factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
+    similar = imitation(evidence, hypotheses)
+    p, alarms = np.ones(count), 0
+    for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
+        around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
+        looked = best(Solver(around), hypotheses, wander)
+        p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
+        if p[n] < thresholds.alpha:
+            candidates = refitted(one, base, around, hypotheses, wander, scan, [looked], thresholds, similar,
+                                  lambda _: 0.0, lambda _: None)
+            p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
+        excess = excess_of(base, measured)
+        alarm = p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha
+        if not alarm and pairs is not None:
+            again = scan_again(pairs, around, hypotheses, wander)
+            if again.p_family < thresholds.alpha:
+                day = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
+                             pairs=again)
+                pair_round(day, around, hypotheses, one, wander, similar, thresholds,
+                           partial(explained_share, base, measured, thresholds), set())
+                alarm = bool(day.accepted)
+                p[n] = min(p[n], day.p_value) if alarm else p[n]
+        alarms += bool(alarm)
+        if progress is not None:
+            progress(1, f"null refits, {alarms} of {n + 1} alarms")
+    return NullRefits(p, alarms)
+
+
+def _days(
+    refitter: Refitter, factor: np.ndarray, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Refitter, Refit]]:
+    """Simulated days, each with its base fit; `factor` (P, P) is that of the day-to-day spread. Several are replayed
+    together: alone they would leave most rows of a replay unused."""
+    reference = refitter.reference
+    start = Start((), reference.u, np.zeros(0))
+    together = TOGETHER if on_processor() else ACCELERATED
+    for first in range(0, count, together):
+        drawn = [(np.clip(reference.u + drawn_away(factor, rng), 0.0, 1.0), _noise(refitter, rng))
+                 for _ in range(min(together, count - first))]
+        seen = refitter.white_of(np.stack([u for u, _ in drawn]))
+        days = [refitter.aimed(white + noise) for white, (_, noise) in zip(seen, drawn, strict=True)]
+        yield from zip(days, side_by_side([(day, start) for day in days], ITERATIONS), strict=True)
+
+
+def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresholds) -> Search:
+    """The verdict, taken back where simulated days with nothing in them often look the same."""
+    if (found.verdict != "none" and len(nulls.p) >= 1 / thresholds.alpha
+            and nulls.p_of(found.p_value) >= thresholds.alpha and wander.p_excess(found.excess[0]) >= thresholds.alpha):
+        found.verdict, found.accepted, found.classes, found.final = "none", [], [], found.base
+        found.share, found.excess = 0.0, (found.excess[0], found.excess[0])
+        found.reason = f"stands out no more than in {nulls.p_of(found.p_value):.1%} of simulated days without anything"
+    return found
+
+
+def _noise(refitter: Refitter, rng: np.random.Generator) -> np.ndarray:
+    """(B, n) white: what the model left of the drives of one reference day, with either sign."""
+    reference, drives = refitter.reference, refitter.drives
+    day = int(rng.choice(sorted({one.day for one in reference.leftovers})))
+    mine = [one for one in reference.leftovers if one.day == day]
+    rows, taken = [], dict.fromkeys(range(len(mine)), 0)
+    for trial, mask in zip(drives.trials, drives.mask, strict=True):
+        like = ([i for i, one in enumerate(mine) if alike(one.trial, trial)]
+                or [i for i, one in enumerate(mine) if one.trial.manoeuvre == trial.manoeuvre] or list(taken))
+        least = min(taken[i] for i in like)
+        chosen = int(rng.choice([i for i in like if taken[i] == least]))  # each drive once before one comes again
+        taken[chosen] += 1
+        rows.append(white_leftover(reference, mine[chosen], mask))
+    return float(rng.choice((-1.0, 1.0))) * np.stack(rows)

@@ -1,0 +1,135 @@
+"""Two effects at once: how much each pair of hypotheses explains that neither explains alone.
+
+Effects may hide one another: where two change the same motion in opposite ways, neither stands out, or a third one that
+resembles their sum does. The scan therefore asks pairs as it asks single hypotheses: gain of both together beside the
+base model, worth with what each wanders from day to day, and p-values from the same simulated nulls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Wander
+from sysid.missing.evidence import RIDGE, Columns, Evidence, Solver
+from sysid.verdict.found import PairScan
+from sysid.verdict.scan import REACH, null_moments
+
+DRAWS = 300
+"""Simulated nulls for the p-values of pairs: each is asked of some ten thousand columns."""
+TOGETHER = 256
+"""Pairs of columns that are solved in one call."""
+CHI_SQUARED = 2.0
+"""Size over which the tail of chi-squared falls by e."""
+
+
+class Bench:
+    """Scores and information of all columns beside the base, of the drives (row 0) and of simulated nulls."""
+
+    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, moments: np.ndarray,
+                 share: np.ndarray):
+        """`moments` (N, P + S) of the nulls; `share` (N, D) of the reference days' apparent effects in each."""
+        solver, self.size = Solver(evidence), evidence.base_size
+        size = self.size
+        self.left = solver.products[size:, size:] - solver.products[:size, size:].T @ solver.project[:, size:]
+        self.left[np.diag_indices(len(self.left))] += RIDGE * np.maximum(np.diag(solver.products)[size:], 1e-12)
+        every = np.concatenate([solver.moments[None], moments])
+        self.score = every[:, size:] - every[:, :size] @ solver.project[:, size:]  # (1 + N, S)
+        self.columns, self.wander = evidence.columns, wander.covariance
+        away = [wander.away(number, share) for number in range(len(wander.shapes))]
+        self.away = [np.concatenate([np.zeros((1, one.shape[1])), one]) for one in away]  # the drives' own is 0
+        self.ends = [_ends(one, hypotheses[one.hypothesis]) for one in evidence.columns]
+
+    def look(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gain (M, 1 + N), worth (M, 1 + N) and coordinates (M, 1 + N, k) of M pairs of columns' hypotheses together; 0
+        where one of them would go where it cannot. The `first` (M,) all have as many coordinates, the `second` too."""
+        sides = (first, second)
+        index = np.concatenate([np.array([self.columns[i].index for i in one]) for one in sides], axis=1) - self.size
+        information = self.left[index[:, :, None], index[:, None, :]]  # (M, k, k)
+        q = np.linalg.solve(information, np.moveaxis(self.score[:, index], 0, -1)).swapaxes(1, 2)
+        q = q + np.concatenate([np.stack([self.away[i] for i in one]) for one in sides], axis=2)
+        wide, cut = np.zeros_like(information), len(self.columns[first[0]].index)
+        for one, part in zip(sides, (slice(cut), slice(cut, None)), strict=True):
+            wide[:, part, part] = np.stack([self.wander[i] for i in one])
+        low, upper = (np.concatenate([np.stack([self.ends[i][end] for i in one]) for one in sides], axis=1)[:, None]
+                      for end in (0, 1))
+        kept = ((q >= low) & (np.abs(q) <= upper)).all(2)
+        whole = np.linalg.inv(np.linalg.inv(information) + wide)
+        return ((q @ information * q).sum(2) * kept, (q @ whole * q).sum(2) * kept, q)
+
+
+def _ends(columns: Columns, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) least coordinates, and largest sizes at which columns found at their level are trusted."""
+    low = np.array([-axis.limit if axis.signed else 0.0 for axis in hypothesis.axes])
+    return low - 1e-9, np.array([axis.limit if axis.signed else REACH * columns.level for axis in hypothesis.axes])
+
+
+def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray:
+    """P(null >= value); beyond the upper tenth of the draws (N,) at most as steep as that of chi-squared, because the
+    worth of many pairs is 0 on nearly all of them."""
+    value, ordered = np.asarray(value, float), np.sort(null)
+    count = len(ordered)
+    p = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
+    top = ordered[int(0.9 * count) :]
+    far = 0.1 * np.exp(-(value - top[0]) / max(float(top.mean() - top[0]), CHI_SQUARED))
+    return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), p))
+
+
+def scan_pairs(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, similar: np.ndarray,
+    alike: float, draws: int = DRAWS, seed: int = 0,
+) -> PairScan:
+    """Scan all pairs of different effects that these drives tell apart, and calibrate on simulated nulls.
+
+    Args:
+        spread: (P, P) day-to-day covariance of the base parameters.
+        similar: (H, H) |cos| of signatures; pairs above `alike` are one class, not two effects.
+    """
+    rng = np.random.default_rng((seed, 2))
+    moments = null_moments(evidence, spread, draws, rng)
+    share = wander.draw_shares(draws, rng)
+    members = tuple((i, j) for i, j in combinations(range(len(hypotheses)), 2)
+                    if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike)
+    gain, worth, found, null = _looked(Bench(evidence, hypotheses, wander, moments, share), hypotheses, members)
+    p, smallest = np.ones(len(members)), np.ones(draws)
+    for m in range(len(members)):
+        p[m] = float(tail(null[:, m], worth[m]))
+        smallest = np.minimum(smallest, tail(null[:, m], null[:, m]))
+    return PairScan(members, gain, worth, found, p, smallest, null)
+
+
+def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander) -> PairScan:
+    """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
+    nothing = np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0])))
+    gain, worth, found, _ = _looked(Bench(evidence, hypotheses, wander, *nothing), hypotheses, first.members)
+    p = np.array([float(tail(first.null[:, m], worth[m])) for m in range(len(first.members))])
+    return replace(first, gain=gain, worth=worth, q=found, p=p)
+
+
+def _looked(
+    bench: Bench, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
+    """Gain (M,), worth (M,) and coordinates of pairs at the levels of their highest worth; worth (N, M) on nulls."""
+    placed: list[list[int]] = [[] for _ in hypotheses]
+    for number, one in enumerate(bench.columns):
+        placed[one.hypothesis].append(number)
+    gain, worth = np.zeros(len(members)), np.zeros(len(members))
+    found = [np.zeros(len(hypotheses[i].axes) + len(hypotheses[j].axes)) for i, j in members]
+    null = np.zeros((len(bench.score) - 1, len(members)))
+    alike: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+    for number, (i, j) in enumerate(members):
+        sizes = len(hypotheses[i].axes), len(hypotheses[j].axes)
+        alike.setdefault(sizes, []).extend((number, a, b) for a in placed[i] for b in placed[j])
+    for tried in alike.values():
+        for begin in range(0, len(tried), TOGETHER):
+            numbers, first, second = np.array(tried[begin : begin + TOGETHER]).T
+            gains, worths, q = bench.look(first, second)
+            np.maximum.at(null.T, numbers, worths[:, 1:])
+            for m, number in enumerate(numbers):
+                if worths[m, 0] > worth[number]:
+                    gain[number], worth[number], found[number] = gains[m, 0], worths[m, 0], q[m, 0]
+    return gain, worth, tuple(found), null

@@ -1,0 +1,146 @@
+"""The result of a closed loop: settings, the vehicle with its catalogue, and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import compress
+from typing import Any, Literal
+
+import numpy as np
+
+from sysid.logs.log import Log
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Reference, Wander
+from sysid.missing.evidence import Evidence, column_layout
+from sysid.replay.records import Plant
+from sysid.replay.rollout import PathReplay
+from sysid.verdict.agreement import Heterogeneity
+from sysid.verdict.falsifiers import Tested, in_words
+from sysid.verdict.found import NullRefits, Search, Thresholds
+
+
+@dataclass(frozen=True)
+class Stood:
+    """What speaks for one effect of a joint fit, and against it."""
+
+    effect: str
+    sizes: np.ndarray  # (G,) that each manoeuvre by itself asks for, as a factor on the joint fit
+    errors: np.ndarray  # (G,) their standard errors
+    agreement: Heterogeneity
+    foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
+    interval: tuple[float, float]
+    """95 % of the sum of it, manoeuvres drawn anew."""
+    falsifiers: tuple[Tested, ...]
+
+    def against(self, thresholds: Thresholds) -> list[str]:
+        """What contradicts the effect, in words."""
+        out = [in_words(one) for one in self.falsifiers if one.outcome == "falsified"]
+        seen = int(self.agreement.asked.sum())
+        if self.agreement.outcome == "differ" and self.agreement.least > thresholds.scatter:
+            out.append(f"the {seen} manoeuvres that excite {self.effect} differ on its size by "
+                       f"{self.agreement.scatter:.0%} of it (at least {self.agreement.least:.0%})")
+        if seen > 1 and self.interval[1] <= 0:
+            out.append(f"{self.effect} is wrong about manoeuvres that were held back")
+        return out
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How the loop is closed."""
+
+    preset: Literal["paper", "physical"] = "physical"
+    """Base model."""
+    iterations: int = 15
+    """Iterations of the base fit."""
+    draws: int = 1000
+    """Simulated nulls that the decision is calibrated on."""
+    seed: int = 0
+    """Of the simulated nulls."""
+    refit_nulls: int = 0
+    """Simulated days with nothing missing that are refitted as the drives are; from 100 they decide too."""
+    quick: bool = False
+    """Fewer iterations, nulls and candidates."""
+    physics_dt: float = 0.005
+    """Physics step [s]."""
+    with_effects: tuple[str, ...] = ()
+    """Effects of the catalogue that the base model has as well, fitted like its own."""
+    held: tuple[str, ...] = ()
+    """Base parameters that keep their value; an effect that is one of them is then looked for, not fitted before;
+    `pose_delay.delay` is what it is."""
+    pose_delay: bool = False
+    """Look for a late outside pose too: where its stamps are those of receipt. Logs whose loader says so
+    (`fields["pose_stamps"]`) are always asked."""
+    poses: bool = True
+    """After the verdict, refit the vehicle to whole poses."""
+    without: tuple[str, ...] = ()
+    """Effects of the catalogue that are not looked for."""
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    """When something counts as found."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All of a vehicle that does not depend on the drives in question; its compiled replay serves many logs."""
+
+    reference: Reference
+    plant: Plant
+    hypotheses: tuple[Hypothesis, ...]
+    full: Any
+    """The vehicle with the whole catalogue at neutral."""
+    names: tuple[str, ...]
+    paths: PathReplay
+    wander: Wander
+    others: dict[Any, PathReplay] = field(default_factory=dict)
+    """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
+
+    def without(self, effects: Sequence[str]) -> Prepared:
+        """The same without some effects of the catalogue; nothing is compiled or simulated again."""
+        known = {one.effect for one in self.hypotheses}
+        if unknown := sorted(set(effects) - known):
+            raise ValueError(f"without: there is no effect {unknown[0]!r} (known: {', '.join(sorted(known))}).")
+        kept = [one.effect not in effects for one in self.hypotheses]
+        columns = column_layout(self.hypotheses, self.reference.space.size)
+        return replace(self, hypotheses=tuple(compress(self.hypotheses, kept)),
+                       wander=self.wander.of([kept[one.hypothesis] for one in columns]))
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A closed loop before the held-out trials are opened."""
+
+    log: Log
+    references: tuple[Log, ...]
+    config: LoopConfig
+    prepared: Prepared
+    search: Search
+    evidence: Evidence
+    seconds: dict[str, float]
+    null_refits: NullRefits | None = None
+    stood: tuple[Stood, ...] = ()
+    """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
+
+    @property
+    def reference(self) -> Reference:
+        """The vehicle as it was."""
+        return self.prepared.reference
+
+    @property
+    def plant(self) -> Plant:
+        """What replays it."""
+        return self.prepared.plant
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """What was tried."""
+        return self.prepared.hypotheses
+
+    @property
+    def full(self) -> Any:
+        """The vehicle with the whole catalogue at neutral."""
+        return self.prepared.full
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its parameters."""
+        return self.prepared.names

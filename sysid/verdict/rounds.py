@@ -1,0 +1,236 @@
+"""One round of the search: what looks best is refitted jointly with what is accepted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.joint_fit import Refit, Start, moved_last
+from sysid.missing.refit import Refitter
+from sysid.verdict.agreement import beside, disagreement, foretold, interval_of_sum
+from sysid.verdict.found import Candidate, Scan, Search, Thresholds
+from sysid.verdict.scan import best
+
+FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
+ELSEWHERE = (1.0, 3.0)
+"""Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
+Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
+"""Gain (H,), worth (H,) and coordinates of every hypothesis."""
+
+
+def refitted(
+    refitter: Refitter, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
+    first: Scan, scans: Sequence[Looked], thresholds: Thresholds, similar: np.ndarray,
+    explained: Callable[[Refit], float], report: Callable[[str], None],
+) -> list[Candidate]:
+    """One round: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and so is
+    what might imitate the best; in order of gain."""
+    taken = {one.effect for one in current.hypotheses}
+    chosen = _starts(hypotheses, scans, first, taken, thresholds)
+    at = Start.at(current)
+
+    def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
+        return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
+
+    fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
+    report("refits")
+    least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
+    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
+    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
+        fits[i] = fit
+    for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
+        again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
+        fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
+    report("polish")
+    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
+    chosen += [(h, _best_start(scans, h)) for h in rivals]
+    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
+    report("rivals")
+    candidates = [candidate_of(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
+                  for (h, _), fit in zip(chosen, fits, strict=True)]
+    return sorted(candidates, key=lambda one: -one.gain)
+
+
+def rescan(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], current: Refit, refitter: Refitter, wander: Wander
+) -> Looked:
+    """Of every hypothesis given what is accepted so far."""
+    return best(Solver(at_fit(evidence, current.residual, current.jacobian, current.u - refitter.reference.u)),
+                hypotheses, wander)
+
+
+def _starts(
+    hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, taken: set[str], thresholds: Thresholds
+) -> list[tuple[int, np.ndarray]]:
+    """Hypotheses to refit and where to start.
+
+    Of each scan those that gain most of what stands out, what gains most whether it does or not, and of the last the
+    one that stands out most. A large effect shows best in the scan around the reference, a small one in that around the
+    base refitted to these drives. What wanders from day to day stands out less than what imitates it.
+    """
+    left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
+    order: dict[str, tuple[int, np.ndarray]] = {}
+    for number, (gain, worth, q) in enumerate(scans):
+        standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
+        chosen = sorted(standing, key=lambda h: -gain[h])
+        chosen = [h for h in chosen if gain[h] >= thresholds.worthwhile * gain[chosen[0]]]
+        if number == len(scans) - 1:
+            chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
+        new = 0
+        most = [h for h in sorted(left, key=lambda h: -gain[h])[:1] if gain[h] > 0]
+        for h in [*chosen, *most]:
+            wide, start = _widest(hypotheses, h, q, standing)
+            if hypotheses[wide].key not in order and (new < thresholds.candidates or h not in chosen):
+                order[hypotheses[wide].key] = (wide, start)
+                new += 1
+    return list(order.values())
+
+
+def _rivals(
+    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
+    thresholds: Thresholds,
+) -> list[int]:
+    """What might imitate the best fit, or be imitated by it, and was not tried: it must have had its chance before
+    another is named."""
+    if not fits:
+        return []
+    winner = tried[int(np.argmin([fit.cost for fit in fits]))]
+    done = {hypotheses[h].effect for h in tried} | taken
+    out: list[int] = []
+    alike = np.maximum(similar[winner], similar[:, winner])
+    for h in np.argsort(-alike):
+        if alike[h] > thresholds.rival and hypotheses[h].effect not in done:
+            done.add(hypotheses[h].effect)
+            out.append(int(h))
+    return out[: thresholds.candidates]
+
+
+def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
+    """Other starts of a fit whose last effect comes behind `before` coordinates: the base parameters as they were, and
+    what only changes the effect at 0, so that the effect itself has the first chance."""
+    q = fit.q.copy()
+    axes = fit.hypotheses[-1].axes
+    q[before:] = [0.0 if axis.dependent else size for axis, size in zip(axes, q[before:], strict=True)]
+    limits = np.array([axis.limit for axis in axes])
+    out = []
+    for factor in ELSEWHERE:
+        start = q.copy()
+        start[before:] = np.clip(factor * q[before:], -limits, limits)
+        out.append(Start(fit.hypotheses, refitter.reference.u, start))
+    return out
+
+
+def _best_start(scans: Sequence[Looked], h: int) -> np.ndarray:
+    """Coordinates from the scan in which a hypothesis gains most; a small size where it gains nothing."""
+    gain, _, q = max(scans, key=lambda scan: scan[0][h])
+    return q[h] if gain[h] > 0 else np.full(len(q[h]), 0.5)
+
+
+def _widest(
+    hypotheses: Sequence[Hypothesis], h: int, q: Sequence[np.ndarray], standing: Sequence[int]
+) -> tuple[int, np.ndarray]:
+    """The hypothesis of the same effect that has all axes of h and more, started where those alone were found."""
+    mine = {axis.parameter for axis in hypotheses[h].axes}
+    wider = [i for i, one in enumerate(hypotheses) if one.effect == hypotheses[h].effect
+             and mine < {axis.parameter for axis in one.axes}]
+    if not wider:
+        return h, q[h]
+    most = max(wider, key=lambda i: len(hypotheses[i].axes))
+    alone = {hypotheses[i].axes[0].parameter: float(q[i][0]) for i in standing
+             if hypotheses[i].effect == hypotheses[h].effect and len(hypotheses[i].axes) == 1}
+    return most, np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[most].axes])
+
+
+def candidate_of(
+    h: int, fit: Refit, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
+    first: Scan, share: float,
+) -> Candidate:
+    """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
+    one = hypotheses[h]
+    gain = max(current.cost - fit.cost, 0.0)
+    q = fit.q[-len(one.axes) :]
+    inside = beside(fit.products(evidence.precision), len(q))
+    moved = np.abs(q) > 1e-9
+    inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
+    alone = float(q[moved] @ inside @ q[moved])
+    whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
+    worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
+    return Candidate(one, gain, first.p_of(h, worth), share, fit)
+
+
+def pair_round(
+    found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
+    similar: np.ndarray, thresholds: Thresholds, explained: Callable[[Refit], float], tried: set[str],
+) -> None:
+    """Two effects instead of what was accepted, where only together they explain the drives.
+
+    Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
+    another, and together they must explain more than what was accepted one by one.
+
+    Args:
+        tried: effects whose pairs had their chance, with the other one as a further effect.
+    """
+    pairs = found.pairs
+    assert pairs is not None
+    least = float(found.scan.gain.max()) if len(found.scan.gain) else 0.0
+    order, seen = [], set()
+    for m in np.argsort(-pairs.gain):
+        names = frozenset(hypotheses[h].effect for h in pairs.members[m])
+        if (names not in seen and not names & tried and pairs.gain[m] > least
+                and pairs.p_of(float(pairs.p[m])) < thresholds.alpha):
+            seen.add(names)
+            order.append(int(m))
+    starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
+              for m in order[: thresholds.pairs]]
+    if not starts:
+        return
+    fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
+    both = min(fits, key=lambda fit: fit.cost)
+    alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
+                             POLISH)
+    if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
+        both, alone = moved_last(both, 0), alone[::-1]
+    if explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
+        return
+    members = []
+    for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
+        h = hypotheses.index(fit.hypotheses[-1])
+        one = candidate_of(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
+        part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
+        told = foretold(fit, part, evidence.groups, refitter.precision)
+        if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
+                or disagreement(fit, part, evidence.groups, refitter.precision) > thresholds.differ
+                or interval_of_sum(told)[0] <= 0):
+            return
+        members.append(replace(one, own=True))
+    members[0] = replace(members[0], refit=alone[0], share=explained(alone[0]))
+    found.accepted = members
+    found.classes = [_class_of(one, [one], hypotheses, similar, thresholds) for one in members]
+    found.rounds += [[one] for one in members]
+    found.together = max(pairs.p_family, *(one.p for one in members))
+
+
+def _class_of(
+    best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
+    thresholds: Thresholds,
+) -> list[str]:
+    """Effects that these drives do not tell from the best: nearly as good a fit, alike signatures, or a
+    fit so much better than imitating the best would bring that the truth may lie between the two."""
+    mine = hypotheses.index(best.hypothesis)
+    near: dict[str, float] = {}
+    for other in candidates:
+        imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
+        ratio = other.gain / best.gain
+        own = (ratio - imitated) / max(1 - imitated, 1e-9)
+        if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
+            near[other.hypothesis.effect] = ratio
+    for j, one in enumerate(hypotheses):
+        if similar[mine, j] > thresholds.alike:
+            near[one.effect] = max(near.get(one.effect, 0.0), float(similar[mine, j]))
+    near.pop(best.hypothesis.effect, None)
+    return [best.hypothesis.effect, *sorted(near, key=lambda name: -near[name])]

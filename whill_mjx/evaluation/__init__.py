@@ -1,0 +1,1 @@
+"""Evaluation of drivers: episodes, baselines, sweeps, intervals, and pages."""

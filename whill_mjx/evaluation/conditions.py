@@ -1,0 +1,109 @@
+"""What an evaluation may change in an episode: obstacle, start, light, camera pose, latency. One value per instance."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.env import Env, State
+from whill_mjx.tasks.tasks import goal_position
+from whill_mjx.vehicle.dynamics import place
+from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose, rotation_from_quaternion
+from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.world.scene import Scene
+
+WALLS = 3
+"""The first boxes of either task are its walls; those after them are obstacles."""
+
+
+@struct.dataclass
+class Condition:
+    """Changes to one episode; `nominal()` changes nothing."""
+
+    obstacle_x: jax.Array  # () m, puts all obstacles' centre there; NaN leaves them where they were drawn
+    obstacle_y: jax.Array  # () m, the same across
+    obstacle_shift_y: jax.Array  # () m, added to the obstacles' places
+    start_x: jax.Array  # () m, added to the start
+    start_y: jax.Array  # () m
+    start_yaw_deg: jax.Array  # () degrees
+    light: jax.Array  # () factor on all light, sky included
+    camera_x: jax.Array  # () m, ahead of where the camera was in the training
+    camera_y: jax.Array  # () m, to the left
+    camera_z: jax.Array  # () m, up
+    camera_pitch_deg: jax.Array  # () degrees, downwards
+    camera_yaw_deg: jax.Array  # () degrees, to the left
+    latency: jax.Array  # () control periods by which the image is late, a whole number
+
+
+def nominal() -> Condition:
+    """No change."""
+    values = {field.name: jnp.zeros(()) for field in dataclasses.fields(Condition)}
+    return Condition(**{**values, "light": jnp.ones(()), "obstacle_x": jnp.nan * jnp.ones(()),
+                        "obstacle_y": jnp.nan * jnp.ones(())})
+
+
+NAMES = tuple(field.name for field in dataclasses.fields(Condition))
+
+
+def begin_under(condition: Condition, env: Env, params: VehicleParams, state: State) -> State:
+    """State of an episode that begins, with start, obstacles and light of the condition."""
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    x, y = x + condition.start_x, y + condition.start_y
+    scene = _lit(condition, _with_obstacles(condition, state.scene))
+    return dataclasses.replace(
+        state,
+        vehicle=place(env.model, params, x, y, yaw + jnp.deg2rad(condition.start_yaw_deg)),
+        scene=scene,
+        goal_distance=jnp.linalg.norm(goal_position(scene) - jnp.stack([x, y])),
+    )
+
+
+def _with_obstacles(condition: Condition, scene: Scene) -> Scene:
+    centre = scene.boxes.centre
+    obstacle = (jnp.arange(centre.shape[0]) >= WALLS)[:, None]
+    wanted = jnp.stack([condition.obstacle_x, condition.obstacle_y, jnp.nan * jnp.ones(())])
+    moved = jnp.where(jnp.isnan(wanted), centre, wanted) + jnp.array([0.0, 1.0, 0.0]) * condition.obstacle_shift_y
+    boxes = dataclasses.replace(scene.boxes, centre=jnp.where(obstacle, moved, centre))
+    return dataclasses.replace(scene, boxes=boxes)
+
+
+def _lit(condition: Condition, scene: Scene) -> Scene:
+    looks, light = scene.looks, condition.light
+    return dataclasses.replace(
+        scene,
+        looks=dataclasses.replace(
+            looks,
+            ambient=looks.ambient * light,
+            diffuse=looks.diffuse * light,
+            sky_horizon=jnp.clip(looks.sky_horizon * light, 0.0, 1.0),
+            sky_zenith=jnp.clip(looks.sky_zenith * light, 0.0, 1.0),
+        ),
+    )
+
+
+def seen_under(condition: Condition, env: Env, state: State) -> State:
+    """State to take the picture of: the chassis is moved so that its camera gets to where the condition has it.
+
+    The camera is fixed to the chassis, which is not in its own picture, so that moving the one moves the other.
+    """
+    mount = env.model.spec.camera
+    qpos = state.vehicle.qpos
+    turn = quaternion_from_angles(
+        jnp.zeros(()), jnp.deg2rad(condition.camera_pitch_deg), jnp.deg2rad(condition.camera_yaw_deg)
+    )
+    at = jnp.array([mount.x, 0.0, mount.z])
+    shift = jnp.stack([condition.camera_x, condition.camera_y, condition.camera_z])
+    # Turned about the camera, which then is displaced: chassis' = chassis * move(at + shift) * turn * move(-at).
+    offset = at + shift - rotation_from_quaternion(turn) @ at
+    position = qpos[:3] + rotation_from_quaternion(qpos[3:7]) @ offset
+    moved = qpos.at[:3].set(position).at[3:7].set(_product(qpos[3:7], turn))
+    return dataclasses.replace(state, vehicle=dataclasses.replace(state.vehicle, qpos=moved))
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Quaternion (4,) of turning by `b` in the frame that `a` has turned."""
+    scalar = a[0] * b[0] - jnp.dot(a[1:], b[1:])
+    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])

@@ -1,0 +1,162 @@
+"""A policy file (docs/policy_file.md) as a JAX function of one instance, and the camera that a policy file describes.
+
+The file itself is read and checked by `bridge.policy`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bridge.policy import EXPORT_AGAIN, CheckedPolicy, Contract, PolicyFileError, make_session, read_policy
+from whill_mjx.effects.base import apply_chain
+from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.vehicle.dynamics import nominal_world, place
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.vehicle.model import VehicleModel
+from whill_mjx.vehicle.types import VehicleParams
+
+RUNTIMES = ("jax", "onnxruntime")
+RUN_FILE = "run.json"
+"""In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
+OTHER_RUNTIME = "Evaluate with the runtime 'onnxruntime' instead."
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyFile:
+    """A policy and what it was trained for."""
+
+    path: Path
+    task: str
+    low: tuple[float, float]
+    """Command at action -1: v [m/s], omega [rad/s]."""
+    high: tuple[float, float]
+    height: int
+    width: int
+    rate_hz: float
+    action_repeat: int
+    sha256: str
+    """Of the network."""
+    vehicle: Path | None
+    """Vehicle file it was trained with, if it is inside."""
+    carry: dict[str, jax.ShapeDtypeStruct]
+    step: Callable[[dict[str, jax.Array], jax.Array], tuple[dict[str, jax.Array], jax.Array]]
+    """(carry, image (H, W, 3) uint8) -> carry, action (2,); traceable, and so is its vmap."""
+    unpacked: tempfile.TemporaryDirectory | None = None
+    """Folder of the vehicle file of a zip; it lives as long as this record."""
+
+    def start(self) -> dict[str, jax.Array]:
+        """Recurrent state at the start of an episode: all zeros."""
+        return {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in self.carry.items()}
+
+
+def load_policy(path: str | Path, runtime: str = "jax") -> PolicyFile:
+    """Policy of a folder, or of a zip of it.
+
+    Args:
+        path: folder or zip that holds policy.json and policy.onnx.
+        runtime: "jax" compiles the network with everything else; "onnxruntime" calls it on the host for one instance
+            after the other: slow, but it is what runs on the vehicle.
+
+    Raises:
+        PolicyFileError: a part is missing, damaged or of another version; names file, field, value, rule and remedy.
+        ValueError: unknown runtime.
+    """
+    path = Path(path)
+    if runtime not in RUNTIMES:
+        raise ValueError(f"unknown runtime {runtime!r}; use one of {RUNTIMES}.")
+    checked = read_policy(path)
+    contract = checked.contract
+    assert isinstance(contract, Contract)
+    carry = {entry.name: jax.ShapeDtypeStruct(entry.shape, np.dtype(entry.dtype)) for entry in contract.carry}
+    session = make_session(checked)
+    run = _jax_network(checked) if runtime == "jax" else _host_network(session, contract, carry)
+
+    def step(state: dict[str, jax.Array], image: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        action, *values = run(image, *(state[name] for name in carry))
+        after = {name: value.astype(carry[name].dtype) for name, value in zip(carry, values, strict=True)}
+        return after, action
+
+    vehicle, unpacked = _vehicle_file(path, checked)
+    return PolicyFile(
+        path=path, task=contract.task, low=contract.low, high=contract.high, height=contract.height,
+        width=contract.width, rate_hz=contract.rate_hz, action_repeat=contract.action_repeat,
+        sha256=checked.files["policy.onnx"], vehicle=vehicle, carry=carry, step=step, unpacked=unpacked,
+    )  # fmt: skip
+
+
+def camera_contract(model: VehicleModel, params: VehicleParams) -> dict[str, Any]:
+    """Camera of a policy file: its pose over level ground while the vehicle stands, and its field of view.
+
+    The vehicle file gives the camera in the chassis frame, but the chassis sinks and tilts on its suspension. What
+    somebody measures on the standing vehicle, and what the policy saw, is the pose in `base_footprint`: origin on the
+    ground below the reference point (middle of the driven axle), x forward, y left, z up.
+    """
+    level = dataclasses.replace(params, effects=tuple(e for e in params.effects if not _is_ground(model, e)))
+    position, rotation = camera_pose(model, place(model, level, 0.0, 0.0, 0.0).qpos)
+    right, _, forward = np.asarray(rotation, np.float64).T
+    pitch = np.arcsin(-forward[2])
+    angles = {"roll": np.arcsin(-right[2] / np.cos(pitch)), "pitch": pitch, "yaw": np.arctan2(forward[1], forward[0])}
+    lengths = dict(zip("xyz", np.asarray(position, np.float64), strict=True))
+    return {
+        "frame": "base_footprint",
+        **{name: round(float(value), 6) + 0.0 for name, value in {**lengths, **angles}.items()},
+        "fov_y": model.spec.camera.fov_y,
+    }
+
+
+def _is_ground(model: VehicleModel, effect: Any) -> bool:
+    """Whether an effect is a surface on the ground, such as a ramp."""
+    _, world = apply_chain((effect,), (effect.init(),), "world", nominal_world(model))
+    return bool(world.ground)
+
+
+def _vehicle_file(path: Path, checked: CheckedPolicy) -> tuple[Path | None, tempfile.TemporaryDirectory | None]:
+    """The vehicle file beside the policy; that of a zip is unpacked."""
+    if checked.vehicle is None:
+        return None, None
+    if path.is_dir():
+        return path / "vehicle.toml", None
+    unpacked = tempfile.TemporaryDirectory()
+    file = Path(unpacked.name) / "vehicle.toml"
+    file.write_bytes(checked.vehicle)
+    return file, unpacked
+
+
+def _jax_network(checked: CheckedPolicy) -> Callable:
+    """The network as a JAX function, after a step on shapes alone."""
+    file, contract = f"{checked.path}/policy.onnx", checked.contract
+    names = list(contract.inputs), list(contract.outputs)
+    inputs, outputs = contract.tensors()
+    try:
+        network = Network(checked.network, file)
+        shapes = [jax.ShapeDtypeStruct(tensor.shape, np.dtype(tensor.dtype)) for tensor in inputs]
+        results = jax.eval_shape(network, *shapes) if (network.inputs, network.outputs) == names else ()
+    except Exception as error:  # an operator that is not known, or a model that only onnxruntime accepts
+        cause = str(error)[:300].removeprefix(f"{file}: ").removesuffix(f" {OTHER_RUNTIME}")
+        raise PolicyFileError(f"{file}: {cause} {OTHER_RUNTIME}") from error
+    found, wanted = [result.shape for result in results], [tensor.shape for tensor in outputs]
+    if found != wanted:
+        raise PolicyFileError(f"{file}: tensors {network.inputs} -> {network.outputs} of shapes {found}, but "
+                              f"policy.json says {names[0]} -> {names[1]} of {wanted}. Order and shapes must agree. "
+                              f"{EXPORT_AGAIN}.")
+    return network
+
+
+def _host_network(session: Any, contract: Contract, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
+    """The network in onnxruntime, called from JAX."""
+    shapes = (jax.ShapeDtypeStruct((2,), jnp.float32), *carry.values())
+
+    def on_host(*values: Any) -> tuple[np.ndarray, ...]:
+        feed = {name: np.asarray(value) for name, value in zip(contract.inputs, values, strict=True)}
+        return tuple(session.run(list(contract.outputs), feed))
+
+    return lambda *values: jax.pure_callback(on_host, shapes, *values, vmap_method="sequential")

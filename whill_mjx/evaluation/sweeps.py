@@ -1,0 +1,232 @@
+"""Evaluations over a grid: one or two things are varied, each cell gets the same episodes.
+
+A sweep is written `NAME=VALUES` or `NAME=VALUES NAME=VALUES`, where VALUES is `a,b,c` or `low:high:count`. Names are
+those of `conditions.py`, with `latency_s` for the latency; `EFFECT.PARAMETER` and `body.PARAMETER` of the vehicle,
+whose values are absolute or, written `0.5x`, relative to the vehicle's own; and `vehicle`, with files or presets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.evaluation.conditions import NAMES, Condition, nominal
+from whill_mjx.evaluation.drivers import Driver
+from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures
+from whill_mjx.evaluation.intervals import wilson_interval
+from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
+
+CONDITIONS = tuple(name for name in NAMES if name != "latency") + ("latency_s",)
+_CAMERA = "camera_pitch_deg=-6:6:5 camera_z=-0.1:0.1:5"
+_COMMON = (
+    "start_y=-0.4:0.4:5 start_yaw_deg=-20:20:5",
+    "light=0.4:1.6:5 latency_s=0,0.1,0.2,0.3",
+    _CAMERA,
+    "body.mass=0.75x,1x,1.25x,1.5x command_delay.delay=0,0.1,0.2,0.3",
+)
+STANDARD = {
+    "corridor": ("obstacle_x=2,3 obstacle_y=-0.4:0.4:5", *_COMMON),
+    "obstacle_course": ("obstacle_shift_y=-0.3:0.3:7", *_COMMON),
+}
+"""What is looked at for each task if nothing else is asked for; the first row is the paper's, where it has one."""
+PATHS_KEPT = 40
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that is varied."""
+
+    name: str
+    values: tuple[Any, ...]
+    relative: bool = False
+    """The values are factors on the vehicle's own parameter."""
+
+    @property
+    def labels(self) -> list[str]:
+        """The values as text."""
+        if self.name == "vehicle":
+            return [str(value).rsplit("/", 1)[-1] for value in self.values]
+        return [f"{value:g}{'x' if self.relative else ''}" for value in self.values]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Figures of every cell; arrays have one axis per `Axis`."""
+
+    axes: tuple[Axis, ...]
+    episodes: int
+    """Per cell."""
+    figures: dict[str, np.ndarray]
+    intervals: dict[str, np.ndarray]
+    """(..., 2) Wilson intervals of the shares."""
+    paths: list[tuple[np.ndarray, Any]]
+    """Of each cell in row order: paths (n, T + 1, 2) and the scene of the first episode."""
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON data."""
+        axes = [{"name": axis.name, "relative": axis.relative, "values": list(axis.values)} for axis in self.axes]
+        return {
+            "axes": axes, "episodes_per_cell": self.episodes,
+            **{name: _finite(value) for name, value in self.figures.items()},
+            **{f"{name}_interval_95": _finite(value) for name, value in self.intervals.items()},
+        }  # fmt: skip
+
+
+def parse_sweep(text: str) -> tuple[Axis, ...]:
+    """Axes of a sweep, one or two.
+
+    Raises:
+        ValueError: unknown name, no value, or too many axes; names the rule.
+    """
+    axes = tuple(_parse_axis(part) for part in text.split())
+    if not 1 <= len(axes) <= 2:
+        raise ValueError(f"sweep {text!r} has {len(axes)} axes; give one or two: 'light=0.5,1 latency_s=0,0.1'.")
+    if len({axis.name for axis in axes}) < len(axes):
+        raise ValueError(f"sweep {text!r} varies {axes[0].name} twice; name two different things.")
+    return axes
+
+
+def _parse_axis(text: str) -> Axis:
+    name, equals, values = text.partition("=")
+    if not equals or not values:
+        raise ValueError(f"{text!r} is no axis of a sweep; write NAME=a,b,c or NAME=low:high:count.")
+    if name == "vehicle":
+        return Axis(name, tuple(values.split(",")))
+    _check_name(name)
+    parts = values.replace(":", ",").split(",")
+    relative = parts[0].endswith("x")
+    if relative and "." not in name:
+        raise ValueError(f"{text!r}: {name} is no parameter of the vehicle, so it has no factor; leave out the x.")
+    try:
+        if ":" in values:
+            low, high, count = values.split(":")
+            numbers = np.linspace(float(low.removesuffix("x")), float(high.removesuffix("x")), int(count))
+        else:
+            if any(part.endswith("x") != relative for part in parts):
+                raise ValueError("factors and absolute values are mixed")
+            numbers = np.array([float(part.removesuffix("x")) for part in parts])
+    except ValueError as error:
+        raise ValueError(f"{text!r}: {error}; write NAME=a,b,c or NAME=low:high:count.") from error
+    if not np.isfinite(numbers).all() or (name in ("light", "latency_s") and numbers.min() < 0):
+        raise ValueError(f"{text!r}: values must be finite, and light and latency_s not negative.")
+    return Axis(name, tuple(float(np.round(number, 9)) for number in numbers), relative)
+
+
+def _check_name(name: str) -> None:
+    holder, dot, field = name.partition(".")
+    if not dot:
+        if name not in CONDITIONS:
+            raise ValueError(f"unknown axis {name!r} (known: {', '.join(CONDITIONS)}, vehicle, EFFECT.PARAMETER and "
+                             "body.PARAMETER).")
+        return
+    if holder != "body" and holder not in EFFECTS:
+        raise ValueError(f"axis {name!r}: no effect {holder!r} (known: body, {', '.join(sorted(EFFECTS))}).")
+    known = parameters_of(Body if holder == "body" else EFFECTS[holder])
+    if field not in known:
+        raise ValueError(f"axis {name!r}: {holder} has no parameter {field!r} (known: {', '.join(known)}).")
+
+
+def with_parameter(params: VehicleParams, name: str, value: jax.Array, relative: bool) -> VehicleParams:
+    """The parameters of one vehicle with one value changed; an effect that it does not have is added.
+
+    Args:
+        params: of one instance.
+        name: `EFFECT.PARAMETER` or `body.PARAMETER`.
+        value: () new value, or factor on the old one.
+        relative: whether it is a factor.
+    """
+    holder, _, field = name.partition(".")
+
+    def changed(owner: Any) -> Any:
+        new = getattr(owner, field) * value if relative else value
+        return dataclasses.replace(owner, **{field: jnp.asarray(new, jnp.result_type(float))})
+
+    if holder == "body":
+        return dataclasses.replace(params, body=changed(params.body))
+    effects = params.effects
+    if not any(effect.name == holder for effect in effects):
+        effects = (*effects, make_effect(holder))
+    return dataclasses.replace(params, effects=tuple(
+        changed(effect) if effect.name == holder else effect for effect in effects
+    ))
+
+
+def run_sweep(
+    axes: tuple[Axis, ...],
+    keys: jax.Array,
+    course: Callable[[str | None], Course],
+    driver: Callable[[Course], Driver],
+) -> Sweep:
+    """Drive the same episodes in every cell of a grid.
+
+    Args:
+        axes: what is varied.
+        keys: (E,) of the episodes.
+        course: vehicle file or name -> course with that vehicle; None gives the evaluation's own.
+        driver: course -> who drives it.
+    """
+    cells = list(itertools.product(*(axis.values for axis in axes)))
+    by_vehicle: dict[str | None, list[int]] = {}
+    names = [axis.name for axis in axes]
+    for index, cell in enumerate(cells):
+        vehicle = cell[names.index("vehicle")] if "vehicle" in names else None
+        by_vehicle.setdefault(vehicle, []).append(index)
+    found: dict[int, Episodes] = {}
+    for vehicle, indices in by_vehicle.items():
+        here = course(vehicle)
+        episodes = _drive_cells(here, driver(here), axes, [cells[index] for index in indices], keys)
+        for place, index in enumerate(indices):
+            found[index] = episodes.some(np.arange(place * len(keys), (place + 1) * len(keys)))
+    shape = tuple(len(axis.values) for axis in axes)
+    rows = [_cell(found[index]) for index in range(len(cells))]
+    figures = {name: np.array([row[0][name] for row in rows]).reshape(shape) for name in rows[0][0]}
+    intervals = {name: np.array([row[1][name] for row in rows]).reshape(*shape, 2) for name in rows[0][1]}
+    return Sweep(axes, len(keys), figures, intervals, [row[2] for row in rows])
+
+
+def _drive_cells(
+    course: Course, driver: Driver, axes: tuple[Axis, ...], cells: list[tuple], keys: jax.Array
+) -> Episodes:
+    """Episodes of all cells, those of a cell one after the other."""
+    each = len(keys)
+    values = {axis.name: np.repeat([cell[i] for cell in cells], each) for i, axis in enumerate(axes)}
+    condition = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(cells) * each,)), nominal())
+    condition = _condition(condition, values, course.env.model.config.control_dt)
+    repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(cells), *[1] * (leaf.ndim - 1))), course.vehicles(keys))
+    for axis in axes:
+        if "." in axis.name:
+            change = jax.vmap(lambda p, value, axis=axis: with_parameter(p, axis.name, value, axis.relative))
+            repeated = change(repeated, jnp.asarray(values[axis.name], jnp.result_type(float)))
+    return course.drive(driver, jnp.tile(keys, len(cells)), condition, repeated)
+
+
+def _condition(condition: Condition, values: dict[str, np.ndarray], control_dt: float) -> Condition:
+    changes = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in values.items() if name in NAMES}
+    if "latency_s" in values:
+        changes["latency"] = jnp.asarray(values["latency_s"] / control_dt, jnp.result_type(float))
+    return dataclasses.replace(condition, **changes)
+
+
+def _cell(episodes: Episodes) -> tuple[dict[str, float], dict[str, tuple[float, float]], tuple[np.ndarray, Any]]:
+    figures = episode_figures(episodes)
+    means = {name: float(value[np.isfinite(value)].mean()) if np.isfinite(value).any() else np.nan
+             for name, value in figures.items()}
+    shares = {name: wilson_interval(int((figures[name] > 0.5).sum()), episodes.count)
+              for name in ("success", "collision", "timeout")}
+    paths = np.stack([episodes.channel("x"), episodes.channel("y")], -1)[:PATHS_KEPT]
+    return means, shares, (paths, jax.tree.map(lambda leaf: leaf[0], episodes.scene))
+
+
+def _finite(values: np.ndarray) -> Any:
+    """Nested lists with None for what is not a number, since JSON has no NaN."""
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()

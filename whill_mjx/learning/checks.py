@@ -1,0 +1,91 @@
+"""Evaluations inside a training: their figures, the best one kept, and an early end."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dreamer import checkpoint, parallel
+from whill_mjx.learning.setup import Preset
+from whill_mjx.logs.dataset import write_json
+
+Evaluate = Callable[[Any, int], dict[str, float]]
+"""(parameters, environment steps) -> figures."""
+
+
+def mean_figures(episodes: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means of an evaluation inside the run."""
+    success = np.asarray(episodes["success"]) > 0.5
+    figures = {name: float(np.mean(episodes[name])) for name in ("return", "success", "collision", "timeout")}
+    if success.any():
+        figures["arrival_s"] = float(np.mean(np.asarray(episodes["time_s"])[success]))
+    return figures
+
+
+def keep_best(out: Path, preset: Preset, evaluate: Evaluate) -> Evaluate:
+    """The evaluation, which now also saves the parameters in RUN/best when they are the best so far.
+
+    The best has the highest share of successes, and among equals the highest return. These episodes are not those of
+    the final evaluation, so choosing by them does not flatter it.
+    """
+
+    def run(params: Any, env_steps: int) -> dict[str, float]:
+        figures = evaluate(params, env_steps)
+        before = read_best(out)
+        # A run that goes on from an older checkpoint comes by the same steps again.
+        if before is None or _rank(figures) > _rank(before) or before["env_steps"] == env_steps:
+            checkpoint.save(out / "best", {"params": params}, preset.learner, env_steps)
+            if parallel.is_first_process():
+                write_json(out / "best.json", {"env_steps": env_steps, **figures})
+        return figures
+
+    return run
+
+
+def _rank(figures: dict[str, float]) -> tuple[float, float]:
+    return figures["success"], figures["return"]
+
+
+def read_best(out: Path) -> dict[str, float] | None:
+    """RUN/best.json, if there is one."""
+    path = out / "best.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+class Stopper:
+    """Ends a run after two good evaluations in a row, or when there is a file RUN/stop."""
+
+    def __init__(self, out: Path, success: float | None):
+        self._out, self._success, self._good = out, success, 0
+
+    def total_steps(self, planned: int) -> int:
+        """Steps to train: those at which an earlier start has ended for its success, if it asked the same."""
+        path = self._out / "stopped.json"
+        if self._success is None or not path.is_file():
+            return planned
+        told = json.loads(path.read_text())
+        return min(planned, int(told["env_steps"])) if told["success"] == self._success else planned
+
+    def __call__(self, line: dict[str, float]) -> bool:
+        """Whether the run ends after this line."""
+        if parallel.agree((self._out / "stop").exists()):
+            say(f"stopped, since {self._out / 'stop'} exists; remove it to go on.")
+            return True
+        reached = self._success is not None and line.get("eval/success", 0.0) >= self._success
+        self._good = self._good + 1 if reached else 0
+        if self._good < 2:
+            return False
+        if parallel.is_first_process():
+            write_json(self._out / "stopped.json", {"env_steps": line["env_steps"], "success": self._success})
+        say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
+        return True
+
+
+def say(text: str) -> None:
+    """Tell the user how far the run is."""
+    print(text, file=sys.stderr, flush=True)

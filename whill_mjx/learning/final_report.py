@@ -1,0 +1,71 @@
+"""The final report of a training: figures of the policy and its baselines in unseen episodes, pictures and videos."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whill_mjx.evaluation.drivers import Driver
+from whill_mjx.evaluation.episodes import Course, Episodes, episode_keys, summarise
+from whill_mjx.evaluation.rollouts import CHANNELS
+
+
+def evaluate_drivers(course: Course, drivers: dict[str, Driver], seed: int, episodes: int) -> dict[str, Episodes]:
+    """The same episodes with each driver."""
+    keys = episode_keys(seed, episodes)
+    return {name: course.drive(driver, keys) for name, driver in drivers.items()}
+
+
+def write_report(
+    out: Path, course: Course, driver: Driver, driven: dict[str, Episodes], videos: int, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Figures of all drivers; pictures, videos and drives.npz of the policy in `out`.
+
+    Pictures: drives.png and failures.png from above; camera.mp4 shows the first episodes, failures.mp4 the first that
+    failed, `videos` of each at most. What needs a package that is missing is left out and said.
+    """
+    from whill_mjx.evaluation import pages
+
+    episodes = driven["policy"]
+    failed = np.flatnonzero(episodes.ends["success"] < 0.5)
+    first = np.arange(min(videos, episodes.count))
+    radius, rate = course.env.task.goal_radius, 1.0 / episodes.control_dt
+
+    def films() -> None:
+        import imageio_ffmpeg  # noqa: F401  before the episodes are driven again for nothing
+
+        shown = np.concatenate([first, failed[:videos]])
+        again, frames, above = course.film(driver, episodes.keys[shown])
+        for name, part in (("camera.mp4", slice(0, len(first))), ("failures.mp4", slice(len(first), None))):
+            if len(shown[part]):
+                chosen = again.some(np.arange(len(shown))[part])
+                pages.episode_video(chosen, frames[part], above[part], out / name, rate)
+
+    jobs: dict[str, Callable[[], Any]] = {
+        "drives.png": lambda: pages.paths_from_above(episodes, radius, out / "drives.png"),
+    }
+    if videos:
+        jobs["videos"] = films
+    if len(failed):
+        jobs["failures.png"] = lambda: pages.paths_from_above(episodes.some(failed), radius, out / "failures.png")
+    for name, job in jobs.items():
+        try:
+            job()
+        except ImportError as error:
+            say(f"{name} are left out: {error}. Install the base package for them.")
+    save_drives(out / "drives.npz", episodes)
+    return {name: summarise(one) for name, one in driven.items()}
+
+
+def save_drives(path: Path, episodes: Episodes) -> None:
+    """Traces, lengths and endings of the episodes as plain arrays; `channels` names the columns of the trace."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as file:
+        arrays: dict[str, Any] = {"trace": episodes.trace, "length": episodes.length, "channels": np.array(CHANNELS)}
+        arrays.update(episodes.ends)
+        np.savez_compressed(file, **arrays)
+    os.replace(temporary, path)

@@ -1,0 +1,1 @@
+"""Driving logs that the simulator writes: manoeuvres, simulated sensors, and the dataset."""

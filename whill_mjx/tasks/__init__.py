@@ -1,0 +1,1 @@
+"""Tasks: where episodes start, what is rewarded, and when they end."""

@@ -1,0 +1,1 @@
+"""The vehicle: its spec, parameters, rigid bodies and one physics step."""

@@ -1,0 +1,292 @@
+"""The camera in jnp, for any device: scene and camera pose of one instance -> image, depth, labels, normals.
+
+Written so that XLA fuses the loop over boxes into one kernel on CPUs and GPUs. A flat face has one colour under a
+distant sun; it is looked up after the loop. There is no [P, H, W] array and no division in the loop.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from whill_mjx.world.render import visibility
+from whill_mjx.world.render.camera import Intrinsics
+from whill_mjx.world.render.culling import strip_lists, upright_bounds
+from whill_mjx.world.render.shading import Quality, View, cast, face_normal, pack_channels, pixel_colours, pixel_view
+from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
+from whill_mjx.world.render.textures import whole
+from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays
+from whill_mjx.world.scene import Scene
+
+UNROLL = 8
+"""Boxes tested in one loop round."""
+PLAIN = Quality()
+
+
+@struct.dataclass
+class Frame:
+    """Image, depth and labels of one pass."""
+
+    rgb: jax.Array  # (H, W, 3) uint8
+    depth: jax.Array  # (H, W) m along the optical axis, inf for the sky
+    label: jax.Array  # (H, W) uint8, or uint16 with more than 256 labels
+    normal: jax.Array | None = None  # (H, W, 3) unit vector in the world, 0 for the sky; on request
+
+
+def render(
+    position: jax.Array,
+    rotation: jax.Array,
+    intrinsics: Intrinsics,
+    scene: Scene,
+    height: int = 64,
+    width: int = 64,
+    quality: Quality = PLAIN,
+) -> jax.Array:
+    """Image (H, W, 3) uint8 of one instance.
+
+    Args:
+        position: (3,) camera centre in the world [m].
+        rotation: (3, 3) camera axes to world axes.
+        intrinsics: focal lengths, principal point and distortion.
+        scene: what is to be seen.
+        height, width: static image size.
+        quality: static: anti-aliasing, shadows, culling.
+
+    Returns:
+        The image. A camera inside a box sees that box at depth 0; a pose that is not finite gives a black image.
+
+    Raises:
+        ValueError: more primitives than labels, or a finish of another scene.
+    """
+    view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality)
+    row, column = _grid(height, width)
+    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
+    return unpack_colours(jnp.where(finite, word, jnp.uint32(0)))
+
+
+def render_frame(
+    position: jax.Array,
+    rotation: jax.Array,
+    intrinsics: Intrinsics,
+    scene: Scene,
+    height: int = 64,
+    width: int = 64,
+    quality: Quality = PLAIN,
+    normals: bool = False,
+) -> Frame:
+    """Image, depth and labels of one instance from the same pass; arguments as `render`.
+
+    Depth, labels and, with `normals`, normals are those at the pixel centres. A pose that is not finite is labelled sky
+    at depth inf.
+    """
+    view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality, normals)
+    row, column = _grid(height, width)
+    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
+    rays = pixel_view(view, stage, row, column)
+    hit = cast(view, stage, rays)
+    label = jnp.where(hit.solid, hit.code >> 2, jnp.where(hit.seen, GROUND, SKY))
+    kind = jnp.uint8 if stage.labels <= 256 else jnp.uint16
+    normal = None
+    if normals:
+        depth = jnp.where(hit.seen, hit.depth, 0.0)
+        point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
+        code = jnp.where(hit.solid, hit.code, jnp.where(hit.seen, 4 * GROUND, 0))
+        normal = jnp.stack(face_normal(stage.row(code), *point), -1)
+        normal = jnp.where(finite, normal, 0.0)
+    return Frame(
+        unpack_colours(jnp.where(finite, word, jnp.uint32(0))),
+        jnp.where(finite, hit.depth, jnp.inf),
+        jnp.where(finite, label, SKY).astype(kind),
+        normal,
+    )
+
+
+def make_view(position, rotation, intrinsics: Intrinsics, scene: Scene) -> tuple[View, jax.Array]:
+    """Numbers of one image, and whether its pose is finite; the pose of another is replaced."""
+    finite = jnp.all(jnp.isfinite(position)) & jnp.all(jnp.isfinite(rotation))
+    position = jnp.where(finite, position, jnp.array([0.0, 0.0, 1.0]))
+    rotation = jnp.where(finite, rotation, jnp.eye(3))
+    finish = scene.finish
+    if finish is not None:
+        finish = dataclasses.replace(finish, texture=None, scale=None, atlas=None)  # type: ignore[arg-type]
+    return View(position, rotation, intrinsics, scene.looks, finish), finite
+
+
+def unpack_colours(word: jax.Array) -> jax.Array:
+    """(H, W, 3) uint8 of words (H, W). The barrier keeps the ray casting from being repeated for each channel."""
+    word = jax.lax.optimization_barrier(word)
+    return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
+
+
+def _grid(height: int, width: int) -> tuple[jax.Array, jax.Array]:
+    return (jax.lax.broadcasted_iota(jnp.float32, (height, width), axis) for axis in (0, 1))  # type: ignore[return-value]
+
+
+def _prepare(position, rotation, intrinsics, scene: Scene, width: int, quality: Quality, rows: bool = False):
+    view, finite = make_view(position, rotation, intrinsics, scene)
+    parts = parts_of(scene)
+    tables = make_tables(view, parts, scene, quality.shadows, rows)
+    # The barrier keeps XLA from computing the numbers of a box again in every pixel.
+    tables = jax.lax.optimization_barrier(tables)
+    lists = None
+    if quality.keep is not None and quality.keep < parts.boxes.yaw.shape[0]:
+        bounds = upright_bounds(view, parts.boxes)
+        lists = jax.lax.optimization_barrier(strip_lists(bounds, view, width, quality.strips, quality.keep))
+    atlas = None if scene.finish is None else scene.finish.atlas
+    return view, Arrays(parts, tables, lit_words(scene), lists, atlas), finite
+
+
+@dataclass(frozen=True, eq=False)
+class Arrays:
+    """The stage of the jnp renderer: tables are arrays, and every pixel meets every primitive of its strip."""
+
+    parts: Parts
+    tables: Tables
+    lit_words: bool
+    lists: jax.Array | None  # (strips, keep) boxes of each strip, or None: all
+    atlas: jax.Array | None
+
+    @property
+    def bits(self) -> int:
+        return self.parts.bits
+
+    @property
+    def labels(self) -> int:
+        return self.parts.labels
+
+    @property
+    def first_bent(self) -> int | None:
+        return None if self.tables.bent is None else 4 * self.parts.first_round
+
+    @property
+    def picture(self) -> Any:
+        return None if self.atlas is None else self._picture
+
+    def nearest(self, rays: Rays) -> jax.Array:
+        parts, tables, bits = self.parts, self.tables, self.bits
+        if self.lists is None:
+            key = _nearest_upright(rays, tables.upright, None, bits)
+        else:
+            key = _nearest_in_strips(rays, tables.upright, self.lists, bits)
+        if tables.block is not None:
+
+            def block_key(numbers, index):
+                return visibility.block_key(rays, numbers, 4 * (parts.first_block + index), bits)
+
+            key = _least(key, block_key, tables.block)
+        if tables.round is not None:
+            square = visibility.ray_square(rays)
+
+            def round_key(numbers, index):
+                return visibility.round_key(rays, square, numbers, 4 * (parts.first_round + index), bits)
+
+            key = _least(key, round_key, tables.round)
+        return key
+
+    def invert(self, x) -> jax.Array:
+        return visibility.reciprocal(x)
+
+    def ratio(self, x, y) -> jax.Array:
+        return x / y
+
+    def whole(self, x) -> jax.Array:
+        return whole(x)
+
+    def small(self, integer) -> jax.Array:
+        return integer.astype(jnp.float32)
+
+    def level(self, value) -> jax.Array:
+        return (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32)
+
+    def settle(self, values) -> Any:
+        return jax.lax.optimization_barrier(values)
+
+    def word(self, code) -> jax.Array:
+        return self.tables.words.reshape(-1)[code]
+
+    def dark_word(self, code) -> jax.Array:
+        return self.tables.dark.reshape(-1)[code]  # type: ignore[union-attr]
+
+    def row(self, code) -> list:
+        return list(jnp.moveaxis(self.tables.rows[code], -1, 0))  # type: ignore[index]
+
+    def bent(self, place) -> list:
+        return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]
+
+    def shadow(self, x, y, z) -> jax.Array:
+        tables = self.tables
+        dark = _any_shadow(visibility.upright_shadow, tables.upright_shadow, x, y, z)
+        if tables.block_shadow is not None:
+            dark = dark | _any_shadow(visibility.block_shadow, tables.block_shadow, x, y, z)
+        if tables.round_shadow is not None:
+            dark = dark | _any_shadow(visibility.round_shadow, tables.round_shadow, x, y, z)
+        return dark
+
+    def _picture(self, number, s, t) -> list:
+        count, size, _ = self.atlas.shape  # type: ignore[union-attr]
+        row, column = ((jnp.clip(jnp.floor(c * size), 0, size - 1)).astype(jnp.int32) for c in (1.0 - t, s))
+        index = jnp.clip(number.astype(jnp.int32), 0, count - 1)
+        word = self.atlas.reshape(-1)[(index * size + row) * size + column]  # type: ignore[union-attr]
+        return [(word >> (8 * channel) & 255).astype(jnp.float32) * (1.0 / 255.0) for channel in range(3)]
+
+
+def _nearest_upright(rays: Rays, table, order, bits: int) -> jax.Array:
+    """Key (H, W) int32 of the nearest upright box, FAR where there is none: a minimum over boxes in a few rounds.
+
+    `order` (P,) int32 gives the box of each line of the table; None: its own place.
+    """
+    rounds = max(2, -(-table.shape[0] // UNROLL))  # at least 2: a loop of one round is inlined, and no longer a kernel
+    size = -(-table.shape[0] // rounds)
+    padding = jnp.zeros((rounds * size - table.shape[0], table.shape[1])).at[:, 9:].set(-1.0)
+    table = jnp.concatenate([table, padding])
+    if order is not None:
+        order = jnp.concatenate([order, jnp.zeros(padding.shape[0], order.dtype)])
+    reach_z = jnp.abs(rays.inverse_z)
+
+    def one_round(index, key):
+        first = index * size
+        part = jax.lax.dynamic_slice(table, (first, 0), (size, table.shape[1]))
+        places = None if order is None else jax.lax.dynamic_slice(order, (first,), (size,))
+        for offset in range(size):
+            place = first + offset if places is None else places[offset]
+            code = 4 * (place + MARKER)
+            key = jnp.minimum(key, visibility.upright_key(rays, reach_z, part[offset], code, bits))
+        return key
+
+    return jax.lax.fori_loop(0, rounds, one_round, jnp.full(rays.u.shape, FAR, jnp.int32))
+
+
+def _least(key, key_of_one, table) -> jax.Array:
+    """Minimum of `key` and the keys of all lines of a table, as a loop that XLA does not unroll."""
+
+    def one(index, least):
+        return jnp.minimum(least, key_of_one(table[index], index))
+
+    return jax.lax.fori_loop(0, table.shape[0], one, key)
+
+
+def _nearest_in_strips(rays: Rays, table, lists, bits: int) -> jax.Array:
+    """The same, with the boxes of `lists` (strips, keep) alone in each upright strip; -1 is no box."""
+    shape, width = rays.u.shape, rays.u.shape[-1]
+    strips = lists.shape[0]
+    unused = jnp.zeros(table.shape[1]).at[9:].set(-1.0)
+    tables = jnp.where((lists >= 0)[..., None], table[lists], unused)
+
+    def cut(array):
+        padded = jnp.pad(array.reshape(-1, width), ((0, 0), (0, -width % strips)), mode="edge")
+        return jnp.moveaxis(padded.reshape(padded.shape[0], strips, -1), 1, 0)
+
+    parts = jax.tree.map(cut, rays)
+    keys = jax.vmap(lambda one, table, order: _nearest_upright(one, table, order, bits))(parts, tables, lists)
+    return jnp.moveaxis(keys, 0, 1).reshape(keys.shape[1], -1)[:, :width].reshape(shape)
+
+
+def _any_shadow(test, table, x, y, z) -> jax.Array:
+    """Whether any primitive of a table (P, ...) hides the points from the sun."""
+    none = jnp.zeros(x.shape, bool)
+    return jax.lax.fori_loop(0, table.shape[0], lambda index, dark: dark | test(x, y, z, table[index]), none)

@@ -1,0 +1,418 @@
+"""The camera as a Pallas kernel for NVIDIA GPUs (Triton): the same definition as `image.render`, with culling.
+
+One program draws one tile. It compares the tile with the rectangles of 32 primitives at a time, one per lane, which
+gives the bits of one integer; then it meets only the primitives whose bit is set. Of more than 32, those that lie
+behind all that the tile already shows are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from whill_mjx.world.render import culling, visibility
+from whill_mjx.world.render.camera import Intrinsics, pixel_rays
+from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
+from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
+from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
+from whill_mjx.world.render.textures import whole
+from whill_mjx.world.render.visibility import FAR, MARKER, Rays, key_of
+from whill_mjx.world.scene import Scene
+
+CHUNK = 32
+"""Rectangles compared at once: the bits of an integer."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How the image is cut for the kernel. Static."""
+
+    rows: int = 8
+    """Rows of a tile; a power of two."""
+    columns: int = 16
+    """Columns of a tile; a power of two."""
+    warps: int = 1
+    """Warps of 32 threads that share a tile."""
+    stages: int = 1
+    """Software pipelining of the loads."""
+    cull: bool = True
+    """Compare tiles with rectangles; False meets every primitive."""
+    fast: bool = True
+    """Use the GPU's approximate reciprocal (1 unit in the last place), and sums instead of conversions to integers."""
+    sort: bool = False
+    """Bring more than 32 primitives of a kind into front-to-back order before. The images are the same; on an H200 the
+    order costs more than it saves with 200 walls."""
+    words: bool = False
+    """Write four-byte words that XLA unpacks, instead of three bytes per pixel."""
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "columns", "warps"):
+            value = getattr(self, name)
+            if value < 1 or value & (value - 1):
+                raise ValueError(f"tiling: {name} is {value}; Triton needs a power of two.")
+
+
+@struct.dataclass
+class Listed:
+    """Primitives of one kind: their numbers, and the rectangles that the tiles are compared with."""
+
+    table: Any  # (P, n)
+    bounds: Any  # (5, P padded to CHUNK): low u, high u, low v, high v, near
+    order: Any  # (P padded,) int32 place in the table, front to back; None: as they are
+    shadow: Any  # (P, m) numbers of the shadow test, or None
+    shadow_bounds: Any  # (4, P padded) or None
+
+
+@struct.dataclass
+class Inputs:
+    """Everything that the kernel reads."""
+
+    floats: Any  # numbers of the view
+    integers: Any  # (2,) seed, and whether the pose is finite
+    words: Any  # (labels * 4,)
+    dark: Any
+    rows: Any  # (labels * 4 * 18,)
+    bent: Any  # (K * 4 * 8,)
+    atlas: Any  # (A * S * S,)
+    kinds: dict[str, Listed]
+
+
+def render_pallas(
+    position: jax.Array,
+    rotation: jax.Array,
+    intrinsics: Intrinsics,
+    scene: Scene,
+    height: int = 64,
+    width: int = 64,
+    quality: Quality = PLAIN,
+    tiling: Tiling | None = None,
+    interpret: bool = False,
+) -> jax.Array:
+    """Image (H, W, 3) uint8 of one instance, as `render` draws it; batch it by `vmap`.
+
+    Args:
+        position, rotation, intrinsics, scene, height, width, quality: as `render`; `quality.keep` has no meaning here,
+            for nothing is left out.
+        tiling: how the image is cut.
+        interpret: run on any device, slowly, to test.
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton as plt
+
+    tiling = tiling or Tiling()
+    inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
+    leaves, tree = jax.tree.flatten(inputs)
+    static: dict[str, Any] = {
+        "bits": parts_of(scene).bits,
+        "lit_words": lit_words(scene),
+        "atlas_shape": None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.shape,
+        "starts": _first_labels(scene),
+        "fast": tiling.fast and not interpret,
+        "interpret": interpret,
+        "cull": tiling.cull,
+    }
+    down, across = -(-height // tiling.rows), -(-width // tiling.columns)
+    whole = height % tiling.rows == 0 and width % tiling.columns == 0
+
+    def kernel(*refs):
+        *read, out = refs
+        tile = pl.program_id(0)
+        top, left = tile // across * tiling.rows, tile % across * tiling.columns
+        shape = (tiling.rows, tiling.columns)
+        row = top + jax.lax.broadcasted_iota(jnp.int32, shape, 0)
+        column = left + jax.lax.broadcasted_iota(jnp.int32, shape, 1)
+        data = jax.tree.unflatten(tree, read)
+        view = rebuild(data)
+        rows, columns = row.astype(jnp.float32), column.astype(jnp.float32)
+        limits = _tile_limits(view, quality, rows, columns, top, left, shape)
+        stage = Refs(data, limits, view, **static)
+        colours = pixel_colours(view, stage, quality, rows, columns)
+        word = jnp.where(data.integers[1] != 0, pack_channels(stage, colours), np.uint32(0))
+        inside = None if whole else (row < height) & (column < width)
+        here = (pl.ds(top, tiling.rows), pl.ds(left, tiling.columns))
+        if tiling.words:
+            plt.store(out.at[here], word, mask=inside)
+            return
+        for channel in range(3):
+            level = (word >> np.uint32(8 * channel) & np.uint32(255)).astype(jnp.int32).astype(jnp.uint8)
+            mask = None if inside is None else inside[..., None]
+            plt.store(out.at[(*here, pl.ds(channel, 1))], level[..., None], mask=mask)
+
+    drawn = jax.ShapeDtypeStruct((height, width) if tiling.words else (height, width, 3),
+                                 jnp.uint32 if tiling.words else jnp.uint8)
+    call = pl.pallas_call(
+        kernel,
+        out_shape=drawn,
+        grid=(down * across,),
+        compiler_params=plt.CompilerParams(num_warps=tiling.warps, num_stages=tiling.stages),
+        interpret=interpret,
+        name="camera",
+    )
+    image = call(*leaves)
+    return unpack_colours(image) if tiling.words else image
+
+
+def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort: bool) -> tuple[Inputs, Callable]:
+    """Arrays for the kernel, and the function that makes the view of them there."""
+    view, finite = make_view(position, rotation, intrinsics, scene)
+    parts = parts_of(scene)
+    tables = make_tables(view, parts, scene, quality.shadows)
+    sun, corners = scene.looks.sun, {}
+    kinds = {"upright": (tables.upright, parts.boxes.mask, tables.upright_shadow)}
+    corners["upright"] = culling.upright_corners(parts.boxes)
+    if parts.blocks is not None:
+        kinds["block"] = (tables.block, parts.blocks.mask, tables.block_shadow)  # type: ignore[assignment]
+        corners["block"] = culling.block_corners(parts.blocks)
+    if parts.rounds is not None:
+        kinds["round"] = (tables.round, parts.rounds.mask, tables.round_shadow)  # type: ignore[assignment]
+        corners["round"] = culling.round_corners(parts.rounds)
+    listed = {name: _listed(view, corners[name], sun, *rest, sort) for name, rest in kinds.items()}
+
+    seed = view.looks.seed.astype(jnp.uint32)
+    integers = jnp.stack([jax.lax.bitcast_convert_type(seed, jnp.int32), finite.astype(jnp.int32)])
+    leaves, tree = jax.tree.flatten(view)
+    where_seed = next(i for i, leaf in enumerate(leaves) if leaf is view.looks.seed)
+    shapes = [() if i == where_seed else jnp.shape(leaf) for i, leaf in enumerate(leaves)]
+    leaves[where_seed] = jnp.zeros(())
+    flat = [jnp.ravel(jnp.asarray(leaf, jnp.float32)) for leaf in leaves]
+
+    def rebuild(data: Inputs) -> View:
+        values, offset = [], 0
+        for index, shape in enumerate(shapes):
+            size = int(np.prod(shape))
+            scalars = [data.floats[offset + i] for i in range(size)]
+            offset += size
+            if index == where_seed:
+                values.append(data.integers[0].astype(jnp.uint32))
+            elif shape == ():
+                values.append(scalars[0])
+            else:
+                array = np.empty(size, object)
+                for place, scalar in enumerate(scalars):  # a slice would ask the scalars for their values
+                    array[place] = scalar
+                values.append(array.reshape(shape))
+        return jax.tree.unflatten(tree, values)
+
+    atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
+    dark = None if tables.dark is None else tables.dark.reshape(-1)
+    rows = None if lit_words(scene) or tables.rows is None else tables.rows.reshape(-1)
+    bent = None if tables.bent is None else tables.bent.reshape(-1)
+    return Inputs(jnp.concatenate(flat), integers, tables.words.reshape(-1), dark, rows, bent, atlas, listed), rebuild
+
+
+def _listed(view: View, corners, sun, table, mask, shadow, sort: bool) -> Listed:
+    """Rectangles of one kind, padded to whole chunks; with `sort` in front-to-back order where there are several."""
+    count = table.shape[0]
+    extra = -count % CHUNK
+    boxes = culling.bounds(view, corners, mask, culling.EDGES)
+    order = None
+    if sort and count > CHUNK:
+        order = jnp.argsort(boxes.near)
+        boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
+        order = jnp.pad(order.astype(jnp.int32), (0, extra))
+
+    def pad(values):
+        empty = [culling.NOTHING, -culling.NOTHING, culling.NOTHING, -culling.NOTHING, culling.NOTHING]
+        return jnp.stack([jnp.pad(v, (0, extra), constant_values=e) for v, e in zip(values, empty, strict=False)])
+
+    sides = (boxes.low_u, boxes.high_u, boxes.low_v, boxes.high_v)
+    dark = None
+    if shadow is not None:
+        cast = culling.bounds(view, culling.shadow_corners(corners, sun), mask, culling.SHADOW_EDGES)
+        dark = pad((cast.low_u, cast.high_u, cast.low_v, cast.high_v))
+    return Listed(table, pad((*sides, boxes.near)), order, shadow, dark)
+
+
+def _first_labels(scene: Scene) -> dict[str, int]:
+    parts = parts_of(scene)
+    return {"upright": MARKER, "block": parts.first_block, "round": parts.first_round}
+
+
+def _tile_limits(view: View, quality: Quality, row, column, top, left, shape) -> tuple:
+    """Smallest and largest u and v of a tile: of its edges, or of its very rays where the lens distorts."""
+    intrinsics = view.intrinsics
+    if intrinsics.distortion is None:
+        inverse_x, inverse_y = 1.0 / intrinsics.fx, 1.0 / intrinsics.fy
+        u = [(left + offset - intrinsics.cx) * inverse_x for offset in (0, shape[1])]
+        v = [(top + offset - intrinsics.cy) * inverse_y for offset in (0, shape[0])]
+        return (*u, *v)
+    limits = None
+    for shift in SAMPLES if quality.antialias else ((0.5, 0.5),):
+        ray_u, ray_v = pixel_rays(intrinsics, row, column, shift)
+        new = (jnp.min(ray_u), jnp.max(ray_u), jnp.min(ray_v), jnp.max(ray_v))
+        pairs = zip((jnp.minimum, jnp.maximum) * 2, limits or new, new, strict=True)
+        limits = tuple(pick(old, other) for pick, old, other in pairs)
+    return limits  # type: ignore[return-value]
+
+
+def _fast_reciprocal(x):
+    """1 / x of the special-function unit; also right where the shared one overflows."""
+    from jax.experimental.pallas import triton as plt
+
+    [inverse] = plt.elementwise_inline_asm(
+        "rcp.approx.ftz.f32 $0, $1;",
+        args=[x],
+        constraints="=f,f",
+        pack=1,
+        result_shape_dtypes=[jax.ShapeDtypeStruct(x.shape, x.dtype)],
+    )
+    return inverse
+
+
+def fast_whole(x):
+    """Largest integer not above x (|x| < 2^22), by the mantissa of x + 1.5 * 2^23.
+
+    Conversions run at a quarter of the rate of a sum. Wrong for whole x, and only for compilers that keep the order of
+    the sums, as Triton does.
+    """
+    shifted = (x - 0.5) + np.float32(1.5 * 2.0**23)
+    return jax.lax.bitcast_convert_type(shifted, jnp.int32) - np.int32(0x4B400000)
+
+
+def fast_small(integer):
+    """An integer below 2^23 as float, by its place in the mantissa."""
+    return visibility.bits_to_float(integer.astype(jnp.int32) | np.int32(0x4B000000)) - np.float32(2.0**23)
+
+
+def fast_level(value):
+    """The integer nearest to a value in [0, 255]."""
+    return jax.lax.bitcast_convert_type(value + np.float32(2.0**23), jnp.int32) & np.int32(255)
+
+
+@dataclass(frozen=True, eq=False)
+class Refs:
+    """The stage of the kernel: tables are references to global memory, and a tile meets only what it can show."""
+
+    data: Inputs
+    limits: tuple
+    view: View
+    bits: int
+    lit_words: bool
+    atlas_shape: tuple | None
+    starts: dict[str, int]
+    fast: bool
+    interpret: bool
+    cull: bool
+
+    @property
+    def picture(self) -> Any:
+        return None if self.atlas_shape is None else self._picture
+
+    @property
+    def first_bent(self) -> int | None:
+        return None if self.data.bent is None else 4 * self.starts["round"]
+
+    def nearest(self, rays: Rays) -> jax.Array:
+        bits, invert = self.bits, self.invert
+        reach_z = jnp.abs(rays.inverse_z)
+        square = visibility.ray_square(rays)
+        tests = {
+            "upright": partial(visibility.upright_key, rays, reach_z),
+            "block": partial(visibility.block_key, rays),
+            "round": partial(visibility.round_key, rays, square),
+        }
+        key = jnp.full(rays.u.shape, FAR, jnp.int32)
+        for name, kind in self.data.kinds.items():
+
+            def meet(place, least, name=name, kind=kind):
+                numbers = [kind.table[place, j] for j in range(kind.table.shape[-1])]
+                return jnp.minimum(least, tests[name](numbers, 4 * (self.starts[name] + place), bits, invert))
+
+            key = self._visit(kind.bounds, kind.order, meet, key, partial(self._farthest, rays))
+        return key
+
+    def _farthest(self, rays: Rays, key) -> jax.Array:
+        """Key behind which the tile shows nothing more."""
+        ground = -self.view.position[2] * rays.inverse_z
+        ground_key = jnp.where(ground > 0, key_of(ground, 0, self.bits), np.int32(FAR))
+        return jnp.max(jnp.minimum(key, ground_key))
+
+    def _visit(self, bounds, order, meet, carry, farthest=None):
+        """`carry` after `meet(place, carry)` for each primitive whose rectangle overlaps the tile."""
+        from jax.experimental import pallas as pl
+
+        chunks = bounds.shape[-1] // CHUNK
+        low_u, high_u, low_v, high_v = self.limits
+        lane = jax.lax.iota(jnp.int32, CHUNK)
+
+        def one_chunk(chunk, carry):
+            lanes = pl.ds(chunk * CHUNK, CHUNK)
+            hit = bounds[0, lanes] < 0.5 * culling.NOTHING
+            if self.cull:
+                hit = (bounds[0, lanes] <= high_u) & (bounds[1, lanes] >= low_u)
+                hit = hit & (bounds[2, lanes] <= high_v) & (bounds[3, lanes] >= low_v)
+            if self.cull and farthest is not None and chunks > 1:
+                near = jax.lax.bitcast_convert_type(bounds[4, lanes], jnp.int32)
+                hit = hit & (near <= farthest(carry))
+            waiting = jnp.sum(jnp.where(hit, np.int32(1) << lane, np.int32(0)))
+
+            def one(state):
+                waiting, carry = state
+                lowest = waiting & -waiting
+                place = chunk * CHUNK + jax.lax.population_count(lowest - 1)
+                return waiting ^ lowest, meet(place if order is None else order[place], carry)
+
+            return jax.lax.while_loop(lambda state: state[0] != 0, one, (waiting, carry))[1]
+
+        if chunks == 1:
+            return one_chunk(0, carry)
+        return jax.lax.fori_loop(0, chunks, one_chunk, carry)
+
+    def word(self, code) -> jax.Array:
+        return self.data.words[code]
+
+    def dark_word(self, code) -> jax.Array:
+        return self.data.dark[code]
+
+    def row(self, code) -> list:
+        return [self.data.rows[code * 18 + index] for index in range(18)]
+
+    def bent(self, place) -> list:
+        return [self.data.bent[place * 8 + index] for index in range(8)]
+
+    def ratio(self, x, y) -> jax.Array:
+        if jnp.ndim(y) == 0:
+            return x * (1.0 / y)
+        return x * self.invert(y)
+
+    def invert(self, x) -> jax.Array:
+        return _fast_reciprocal(x) if self.fast else visibility.reciprocal(x)
+
+    def whole(self, x) -> jax.Array:
+        return fast_whole(x) if self.fast else whole(x)
+
+    def small(self, integer) -> jax.Array:
+        return fast_small(integer) if self.fast else integer.astype(jnp.float32)
+
+    def level(self, value) -> jax.Array:
+        value = jnp.clip(value, 0.0, 1.0) * 255.0
+        return fast_level(value) if self.fast else (value + 0.5).astype(jnp.int32)
+
+    def settle(self, values) -> Any:
+        return jax.lax.optimization_barrier(values) if self.interpret else values  # Triton needs none
+
+    def shadow(self, x, y, z) -> jax.Array:
+        tests = {name: getattr(visibility, f"{name}_shadow") for name in self.data.kinds}
+        dark = jnp.zeros(x.shape, jnp.int32)
+        for name, kind in self.data.kinds.items():
+
+            def meet(place, dark, name=name, kind=kind):
+                numbers = [kind.shadow[place, j] for j in range(kind.shadow.shape[-1])]
+                return jnp.maximum(dark, tests[name](x, y, z, numbers).astype(jnp.int32))
+
+            dark = self._visit(kind.shadow_bounds, None, meet, dark)
+        return dark > 0
+
+    def _picture(self, number, s, t) -> list:
+        count, size, _ = self.atlas_shape  # type: ignore[misc]
+        row, column = ((jnp.clip(jnp.floor(c * size), 0, size - 1)).astype(jnp.int32) for c in (1.0 - t, s))
+        index = jnp.clip(number.astype(jnp.int32), 0, count - 1)
+        word = self.data.atlas[(index * size + row) * size + column]
+        return [(word >> (8 * channel) & 255).astype(jnp.float32) * (1.0 / 255.0) for channel in range(3)]
