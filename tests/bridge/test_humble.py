@@ -27,6 +27,8 @@ def test_module_is_python_3_10(path):
         if isinstance(node, ast.Import | ast.ImportFrom):
             names |= {alias.name for alias in node.names} | {getattr(node, "module", None) or ""}
     assert not names & LATER
+    constants = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert "-P" not in constants  # an option of the interpreter from 3.11 on
 
 
 def test_modules_compile_under_python_3_10_where_there_is_one(tmp_path):
