@@ -188,7 +188,7 @@ class DriveNode:
             command = self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
                                                message.step, message.data)
         self._publish(command)
-        self._last_frame = now
+        self._last_frame, self._incompatible = now, False
         digest = -self.supervisor.counts["unusable"] if self.controller.unusable else self.controller.digest
         self._frames.frame(now, stamp, age, digest)
 
