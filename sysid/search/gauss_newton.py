@@ -16,10 +16,10 @@ def normal_sums(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Half the gradients (N, P) and half the Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...)
     with the derivatives (N, ..., P)."""
-    count, size = len(jacobian), jacobian.shape[-1]
-    rows, columns = residual.reshape(count, -1, 1), jacobian.reshape(count, -1, size)
-    pulled = columns if weight is None else columns * weight.reshape(rows.shape)
-    return (pulled.swapaxes(1, 2) @ rows)[..., 0], pulled.swapaxes(1, 2) @ columns
+    axes, residual = "abcd"[: jacobian.ndim - 2], residual.reshape(jacobian.shape[:-1])
+    pulls, columns = (residual, jacobian) if weight is None else (residual * weight, jacobian * weight[..., None])
+    return (np.einsum(f"n{axes}p,n{axes}->np", jacobian, pulls),
+            np.einsum(f"n{axes}p,n{axes}q->npq", jacobian, columns))
 
 
 @dataclass(frozen=True)
