@@ -10,9 +10,9 @@ import dataclasses
 import json
 import os
 import shutil
-import tempfile
 import warnings
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer import parallel
-from dreamer.config import DreamerConfig
 
 KEEP = 2
+UNFINISHED = ".unfinished-"
 SCHEMA = 1
 
 
@@ -37,7 +37,7 @@ Rows = tuple[str, int, int]
 def save(
     folder: Path,
     state: Any,
-    config: DreamerConfig,
+    config: Any,
     env_steps: int,
     wall_s: float = 0.0,
     rows: Rows | None = None,
@@ -48,7 +48,7 @@ def save(
     Args:
         folder: of all checkpoints.
         state: pytree of arrays; typed random keys are allowed.
-        config: saved beside it and compared on reading.
+        config: dataclass with a default for every field; saved beside it and compared on reading.
         env_steps: names the checkpoint.
         wall_s: time trained so far [s].
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
@@ -58,11 +58,13 @@ def save(
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
+    _remove_unfinished(folder)
     target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
     if not parallel.is_first_process():
         return target
-    temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
+    temporary = folder / f"{UNFINISHED}{target.name}"
+    temporary.mkdir()  # with the user's own rights: colleagues resume and evaluate too
     try:
         with _checkpointer(ocp) as writer:
             writer.save((temporary / "state").resolve(), {k: v for k, v in arrays.items() if v.size})
@@ -75,13 +77,27 @@ def save(
         }
         (temporary / "meta.json").write_text(json.dumps(meta, indent=1))
         if target.exists():
-            shutil.rmtree(target)
+            os.replace(target, temporary.with_name(f"{temporary.name}.old"))
         os.replace(temporary, target)
+        _remove_unfinished(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     for old in complete(folder)[:-KEEP]:
         shutil.rmtree(old, ignore_errors=True)
     return target
+
+
+def save_if_whole(save: Callable[[], Any], state: Any) -> None:
+    """Save an interrupted run, unless the interrupt came while its arrays were being replaced by the next ones."""
+    if not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in jax.tree.leaves(state)):
+        save()
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove what a killed process has left; one process at a time writes checkpoints."""
+    if parallel.is_first_process():
+        for path in folder.glob(f"{UNFINISHED}*"):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def complete(folder: Path) -> list[Path]:
@@ -94,7 +110,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path)
 
 
-def restore(folder: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]] | None:
+def restore(folder: Path, template: Any, config: Any) -> tuple[Any, dict[str, Any]] | None:
     """State and meta.json of the newest usable checkpoint, or None where there is none at all.
 
     A damaged checkpoint is passed over with a warning if an older one is whole.
@@ -123,7 +139,7 @@ class Damaged(CheckpointError):
     """A checkpoint whose files are not what was written."""
 
 
-def load(path: Path, template: Any, config: DreamerConfig) -> tuple[Any, dict[str, Any]]:
+def load(path: Path, template: Any, config: Any) -> tuple[Any, dict[str, Any]]:
     """Read one checkpoint. Arguments and errors as for `restore`."""
     import orbax.checkpoint as ocp
 
@@ -164,10 +180,10 @@ def _read_meta(path: Path) -> dict[str, Any]:
     raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")
 
 
-def _check_config(path: Path, saved: dict[str, Any], config: DreamerConfig) -> None:
+def _check_config(path: Path, saved: dict[str, Any], config: Any) -> None:
     current = json.loads(json.dumps(dataclasses.asdict(config)))
     # A field that is newer than the checkpoint had the value that is now its default.
-    saved = {**json.loads(json.dumps(dataclasses.asdict(DreamerConfig()))), **saved}
+    saved = {**json.loads(json.dumps(dataclasses.asdict(type(config)()))), **saved}
     names = sorted(set(saved) | set(current))
     changed = [f"{n}: saved {saved.get(n)}, now {current.get(n)}" for n in names if saved.get(n) != current.get(n)]
     if changed:

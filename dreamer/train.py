@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -10,11 +11,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, ParamSpec
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from filelock import FileLock, Timeout
 from jax.sharding import Mesh
 
 from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
@@ -31,6 +33,7 @@ __all__ = ["TrainResult", "TrainState", "evaluate", "init_state", "train", "trai
 EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
 StopFn = Callable[[dict[str, float]], bool]
+P = ParamSpec("P")
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
@@ -98,6 +101,25 @@ class Meter:
         return line
 
 
+def alone(function: Callable[P, TrainResult]) -> Callable[P, TrainResult]:
+    """A training that holds its folder `out`, its third argument, until it ends; a kill leaves no lock behind."""
+
+    @functools.wraps(function)
+    def held(*args: P.args, **named: P.kwargs) -> TrainResult:
+        out = Path(named["out"] if "out" in named else args[2])  # type: ignore[arg-type]
+        if not parallel.is_first_process():
+            return function(*args, **named)
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            with FileLock(out / ".training.lock", timeout=0):
+                return function(*args, **named)
+        except Timeout:
+            raise ValueError(f"{out}: another process trains there. Wait for its end or give another folder.") from None
+
+    return held
+
+
+@alone
 def train(
     env: FunctionalEnv,
     config: DreamerConfig,
@@ -121,7 +143,7 @@ def train(
     """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
 
     `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
-    again goes on from its last checkpoint as if nothing had happened.
+    again goes on from its last checkpoint as if nothing had happened. One process at a time trains in a folder.
 
     Where the configuration asks for pretraining, it comes first. Its lines have `env_steps` 0, say in `pretrain_steps`
     and `pretrain_updates` how far it is, and all their figures are named pretrain/...
@@ -151,10 +173,11 @@ def train(
 
     Raises:
         ImportError: tensorboard is asked for and tensorboardX is not installed.
-        ValueError: environment and configuration do not fit, the checkpoint does not belong to them, or a replay in the
-            host's memory is asked for with several seeds or devices.
+        ValueError: environment and configuration do not fit, the checkpoint does not belong to them or to the seed, a
+            replay in the host's memory is asked for with several seeds or devices, or another process trains there.
     """
     out = Path(out)
+    _check_seed(out, seed, resume)
     out.mkdir(parents=True, exist_ok=True)
     mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
     if mesh is not None and not isinstance(seed, int):
@@ -250,13 +273,28 @@ def train(
             try:
                 write_waiting(at_once=True)
             finally:  # interrupted again, say
-                save_state(out, state, config, wall_s())
+                checkpoint.save_if_whole(lambda: save_state(out, state, config, wall_s()), state)
         raise
     finally:
         bar.close()
         log.close()
     updates = int(state.agent.updates) if counted else 0
     return TrainResult(out, state.agent, env_steps, updates, wall_s(), log.last)
+
+
+def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
+    """Raise ValueError where a run would go on with another seed than it was begun with."""
+    path = out / "config.json"
+    if not resume or not path.exists() or not checkpoint.complete(out / "checkpoints"):
+        return
+    try:
+        begun = json.loads(path.read_text())["seed"]
+    except (ValueError, KeyError, TypeError):
+        return  # the checkpoint has the configuration, and its keys those of the seed
+    asked = seed if isinstance(seed, int) else list(seed)
+    if begun != asked:
+        raise ValueError(f"{out}: the run there was begun with seed {begun}, not {asked}. Give that seed, or another "
+                         "folder.")
 
 
 def _in_thread(call: Callable[[Params], Any], params: Params) -> Future:
@@ -393,3 +431,9 @@ def _write_atomically(path: Path, text: str) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
     os.replace(temporary, path)
+
+
+if __name__ == "__main__":
+    print("dreamer.train is a function for programs: train(env, config, out, total_steps, seed), see docs/dreamer.md.\n"
+          "The command that trains the vehicle is python -m whill_mjx.train --help.")  # fmt: skip
+    sys.exit(0 if {"-h", "--help"} & set(sys.argv[1:]) else 2)

@@ -1,28 +1,26 @@
-"""What the commands of this package share: reading options, ending on bad input, showing the progress of long work."""
+"""What the commands of this package share beyond `whill_mjx.command_line`: kept programs, progress of long work."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import platform
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sysid.search.result import Progress
+from whill_mjx import command_line
 
 
-def run(options: type, main: Callable[[Any], Any], description: str | None) -> None:
-    """Read `options` from the command line and call `main`: errors in the input end with one line, not a traceback."""
-    import tyro
+def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
+    """`whill_mjx.command_line.run` with compiled programs kept for later runs."""
 
-    chosen: Any = tyro.cli(options, description=description, config=(tyro.conf.PositionalRequiredArgs,))
-    keep_compiled()
-    try:
+    def cached(chosen: Any) -> None:
+        keep_compiled()
         main(chosen)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+
+    command_line.run(options, cached, description, **more)
 
 
 def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Progress, Callable[[], None]]:

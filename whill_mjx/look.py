@@ -8,7 +8,6 @@ motion; depth, labels and normals; its video is a walk. `--scene all` writes eve
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +19,7 @@ import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
+from whill_mjx.folders import whole_file, write_whole
 from whill_mjx.tasks.tasks import TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
@@ -108,10 +108,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
     ok, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not ok:
         raise ValueError(f"{path}: an image of shape {image.shape} and type {image.dtype} cannot be written as PNG.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_bytes(data.tobytes())
-    os.replace(temporary, path)
+    write_whole(path, data.tobytes())
 
 
 def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
@@ -179,12 +176,10 @@ def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10
     """Write frames (H, W, 3) uint8 as a video, whole or not at all."""
     import imageio.v2 as imageio
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.stem}.part{path.suffix}")
     large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
     options = {"duration": 1000 / rate, "loop": 0} if path.suffix == ".gif" else {"fps": rate, "macro_block_size": 2}
-    imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:

@@ -1,18 +1,37 @@
 """The main job: fit the vehicle to a driving log, train a policy in its simulator, evaluate it and export it.
 
-    python -m whill_mjx.train --out RUN [--vehicle RUN/vehicle.toml] [--task obstacle_course] [--preset auto]
+    python -m whill_mjx.train --out RUN [--vehicle FIT/vehicle.toml] [--task obstacle_course] [--preset auto]
 
-A run that was interrupted goes on where it stopped when the same command is given again.
+A run that was interrupted goes on where it stopped when the same command is given again. RUN is a folder of its own: a
+command with another vehicle, seed, learner or setting is refused there (docs/reliability.md).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from whill_mjx.command_line import (
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    SHARE,
+    OptionError,
+    Range,
+    check_known,
+    listen,
+    refusing,
+    run,
+)
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 
@@ -23,10 +42,12 @@ from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
-from whill_mjx.evaluation.policy_file import RUN_FILE
 from whill_mjx.evaluation.rollouts import rollout
+from whill_mjx.folders import Claim, claim_folder, write_whole
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best, say
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
+from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
+from whill_mjx.learning.ppo import check_minibatches
 from whill_mjx.learning.ppo_training import train_ppo
 from whill_mjx.learning.prediction import write_prediction
 from whill_mjx.learning.setup import (
@@ -42,11 +63,22 @@ from whill_mjx.learning.setup import (
     with_repeat,
     with_settings,
 )
-from whill_mjx.learning.shaping import Step, find_safety
-from whill_mjx.logs.dataset import plain, write_json, write_text
+from whill_mjx.learning.shaping import SAFETY, Step, find_safety
+from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.tasks.tasks import LAYOUTS, TASKS
+from whill_mjx.vehicle.presets import preset as vehicle_preset
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
+STOPPED = "stopped; give the same command again to go on from the last checkpoint."
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
+LEAST_FREE = 32_000_000
+"""Bytes that must be free for a training's folder; a checkpoint of the smallest preset takes some of them."""
+PRESETS = ("auto", "paper", "wallclock", "cpu", "smoke")
+Vehicle = tuple[VehicleSpec, VehicleParams, dict[str, Any]]
+"""Spec, parameters and provenance."""
 
 
 @dataclass(frozen=True)
@@ -67,51 +99,51 @@ class TrainOptions:
     """The world model, or the model-free baseline with as many environment steps."""
     layout: str = "randomised"
     """randomised (a new world in each episode) or fixed."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Seed of the training."""
-    steps: int | None = None
+    steps: Annotated[int | None, COUNT] = None
     """Environment steps to train; none takes the preset's."""
-    eval_every: int | None = None
+    eval_every: Annotated[int | None, COUNT] = None
     """Environment steps between evaluations inside the run; none takes the preset's."""
-    episodes: int = 100
+    episodes: Annotated[int, COUNT] = 100
     """Episodes of the final evaluation, of the policy, the planner and a random one."""
     planner: bool = True
     """Whether the planner that knows the truth drives the final evaluation too."""
-    videos: int = 4
+    videos: Annotated[int, NOT_NEGATIVE] = 4
     """Episodes, and failures, of the final evaluation shown as videos."""
-    checkpoint_every_s: float = 60.0
+    checkpoint_every_s: Annotated[float, NOT_NEGATIVE] = 60.0
     """Time between checkpoints [s]."""
-    lr: float | None = None
+    lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
-    train_ratio: float | None = None
+    train_ratio: Annotated[float | None, POSITIVE] = None
     """Replayed steps per environment step; none takes the preset's."""
     change: tuple[str, ...] = ()
     """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""
-    action_repeat: int | None = None
+    action_repeat: Annotated[int | None, COUNT] = None
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
     """Let the world model also tell goal, speeds and free distances, which the simulator knows
     (`whill_mjx.learning.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
-    exploring_starts: float | None = None
+    exploring_starts: Annotated[float | None, SHARE] = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
     and a real course cannot; evaluations always begin at the start. None takes the preset's."""
-    second_tries: float | None = None
+    second_tries: Annotated[float | None, SHARE] = None
     """Share of the training episodes without an arrival after which the same world is begun again, which a simulator
     can do; evaluations never do. None takes the preset's."""
-    instances: int | None = None
+    instances: Annotated[int | None, COUNT] = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
     """none (the task's reward alone), smooth (gentle commands) or safe (gentle commands and a distance kept)."""
-    stop_success: float | None = None
+    stop_success: Annotated[float | None, SHARE] = None
     """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
     export: Literal["last", "best"] = "best"
     """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run. The others
     become RUN/policy_best or RUN/policy_last, where they differ."""
     tensorboard: bool = False
     """Write the curves of the world model's training for TensorBoard too, to RUN/tensorboard (needs tensorboardX)."""
-    devices: int | None = None
+    devices: Annotated[int | None, COUNT] = None
     """Devices over which instances and batches are split; none takes all."""
 
 
@@ -129,16 +161,59 @@ def main(options: TrainOptions) -> dict[str, Any]:
     """Do the whole job and return the evaluation; everything is left in `options.out`."""
     started = time.perf_counter()
     processes = join()
+    with refusing():
+        preset = choose_preset(options)
+        check(options, preset, processes)
     say(f"devices: {', '.join(str(device) for device in jax.devices())}")
-    preset = choose_preset(options)
+    with begin(options, preset) as vehicle:
+        return finish(options, preset, vehicle, started)
+
+
+def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
+    """Raise ValueError for what would end the training later; nothing is written yet."""
+    if options.log is not None and options.vehicle is not None:
+        raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
+    if options.log is not None and not options.log.exists():
+        raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
     if processes > 1 and options.learner == "ppo":
         raise ValueError("the baseline trains in one process; start it alone or choose --learner dreamer.")
-    options.out.mkdir(parents=True, exist_ok=True)
-    vehicle = options.out / "vehicle.toml"
-    if parallel.is_first_process():
-        write_json(options.out / RUN_FILE, {"command": plain(options), "preset": plain(preset)})
-        prepare_vehicle(options)
-    parallel.agree(True)  # the others wait for the vehicle file
+    devices = choose_devices(options.devices)
+    if options.learner == "ppo":
+        check_minibatches(preset.ppo, preset.instances)
+    elif devices:
+        parallel.make_mesh(devices, preset.instances, preset.learner.batch_size)
+    if options.tensorboard:
+        try:
+            import tensorboardX  # noqa: F401
+        except ImportError:
+            raise ValueError("--tensorboard: tensorboardX is missing. Install it or leave the option out.") from None
+
+
+@contextmanager
+def begin(options: TrainOptions, preset: Preset) -> Iterator[Path]:
+    """Hold RUN as this training's and yield its vehicle file; of several processes, the first does.
+
+    Raises:
+        FolderRefused: RUN holds another training or somebody's files, or another process writes there.
+    """
+    with refusing():
+        given = given_vehicle(options)
+    if not parallel.is_first_process():
+        parallel.agree(True)  # wait for the vehicle file
+        yield options.out / "vehicle.toml"
+        return
+    with claim_folder(options.out, KIND, OUTPUTS, LEAST_FREE) as claim:
+        try:
+            prepare_vehicle(options, preset, claim, given)
+            parallel.agree(True)
+            yield options.out / "vehicle.toml"
+        except OSError as error:
+            error.add_note(f"What was trained is in {options.out / 'checkpoints'}; the same command goes on there.")
+            raise
+
+
+def finish(options: TrainOptions, preset: Preset, vehicle: Path, started: float) -> dict[str, Any]:
+    """Train, evaluate and export."""
     result = train_policy(options, preset, vehicle) if options.learner == "dreamer" else train_baseline(
         options, preset, vehicle
     )
@@ -175,6 +250,10 @@ def preset_name(name: str) -> str:
 
 def choose_preset(options: TrainOptions) -> Preset:
     """The preset with the options' changes put in."""
+    check_known("--preset", options.preset, PRESETS)
+    check_known("--task", options.task, TASKS)
+    check_known("--layout", options.layout, LAYOUTS)
+    check_known("--safety", options.safety, SAFETY)
     name = preset_name(options.preset)
     preset = with_layout(find_preset(name, options.task), options.layout)
     if options.action_repeat is not None:
@@ -198,9 +277,9 @@ def choose_preset(options: TrainOptions) -> Preset:
         preset,
         learner=learner,
         ppo=baseline,
-        total_steps=options.steps or preset.total_steps,
-        instances=options.instances or preset.instances,
-        eval_every=options.eval_every or preset.eval_every,
+        total_steps=preset.total_steps if options.steps is None else options.steps,
+        instances=preset.instances if options.instances is None else options.instances,
+        eval_every=preset.eval_every if options.eval_every is None else options.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
         safety=find_safety(options.safety),
@@ -208,40 +287,79 @@ def choose_preset(options: TrainOptions) -> Preset:
     )
 
 
-def prepare_vehicle(options: TrainOptions) -> Path:
-    """RUN/vehicle.toml: a copy of the given file, a preset, or fitted to the log."""
-    from whill_mjx.vehicle.presets import preset
-    from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
+def given_vehicle(options: TrainOptions) -> Vehicle | None:
+    """The vehicle that the options name; None if they name none. A bad file is refused before anything is written."""
+    if options.vehicle is None:
+        return None
+    if options.vehicle.suffix == ".toml":
+        return load_vehicle(options.vehicle)
+    return *vehicle_preset(str(options.vehicle)), {"preset": str(options.vehicle)}
 
-    target = options.out / "vehicle.toml"
-    if options.vehicle is not None:
-        if options.vehicle.suffix == ".toml":
-            spec, params, provenance = load_vehicle(options.vehicle)  # a bad file is refused before anything is written
-        else:
-            spec, params = preset(str(options.vehicle))
-            provenance = {"preset": str(options.vehicle)}
-        return save_vehicle(target, spec, params, provenance=provenance)
-    if target.exists():
-        load_vehicle(target)
-        say(f"vehicle: {target} from an earlier run")
-        return target
+
+def prepare_vehicle(options: TrainOptions, preset: Preset, claim: Claim, given: Vehicle | None = None) -> None:
+    """Settle what RUN is and write RUN/vehicle.toml: the given vehicle, that of the run so far, or one fitted to a log.
+
+    Raises:
+        FolderRefused: RUN holds a training that differs in anything that changes its result.
+    """
+    target, known = options.out / "vehicle.toml", claim.identity
+    here = load_vehicle(target) if target.exists() else None
+    begun = bool(checkpoint.complete(options.out / "checkpoints")) or _has_lines(options.out / "metrics.jsonl")
+    vehicle, data, fitted = given or here, known["data"] if known else None, None
+    if given is not None and not (known and known["vehicle"] == vehicle_label(*given[:2])):
+        data = None
+    elif given is None and (options.log or not known):
+        log = options.log or _shipped_log()
+        data = _hash_of(log)
+        if not known or (not begun and known["data"] != data):
+            fitted = _fitted(log, options.out / "fit")
+            vehicle = load_vehicle(fitted)
+    if vehicle is None:
+        raise OptionError(f"--out {options.out}: its vehicle.toml is missing. Give the vehicle by --vehicle.")
+    identity = identity_of(preset, options.learner, options.seed, vehicle_label(*vehicle[:2]), data)
+    claim.settle(identity, begun, command=plain(options), preset=plain(preset))
+    if here is not None and vehicle_label(*here[:2]) == identity["vehicle"]:
+        return
+    if here is not None and begun:
+        raise OptionError(f"{target}: holds {vehicle_label(*here[:2])}, but the run was begun with "
+                          f"{identity['vehicle']}. Put the old file back or choose another --out.")
+    if fitted is not None:
+        write_whole(target, fitted.read_text())
+    else:
+        save_vehicle(target, *vehicle[:2], provenance=vehicle[2])
+
+
+def _shipped_log() -> Path:
     import sysid
+
+    return Path(sysid.__file__).parent / "data" / SHIPPED_LOG
+
+
+def _hash_of(log: Path) -> str:
+    from sysid.logs.log import hash_files
+
+    return hash_files(log)
+
+
+def _has_lines(path: Path) -> bool:
+    return path.exists() and path.stat().st_size > 0
+
+
+def _fitted(log: Path, out: Path) -> Path:
+    """Vehicle file fitted to a driving log."""
     from sysid import fit_dataset
     from sysid.command_line import progress_bar
     from sysid.search.fitting import expected_steps
     from sysid.search.settings import FitConfig
 
-    log = options.log or Path(sysid.__file__).parent / "data" / SHIPPED_LOG
     say(f"vehicle: fitting to {log.name}")
     config = FitConfig(quick=True)
     progress, close = progress_bar(expected_steps(config))
     try:
-        fit_dataset(log, options.out / "fit", config=config, progress=progress)
+        fit_dataset(log, out, config=config, progress=progress)
     finally:
         close()
-    text = (options.out / "fit" / "vehicle.toml").read_text()
-    write_text(target, text)
-    return target
+    return out / "vehicle.toml"
 
 
 def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
@@ -295,6 +413,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trai
     return Trained(*train_ppo(
         functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
         preset.eval_every, Stopper(options.out, preset.stop_success), say, eval_ahead=not devices,
+        checkpoint_every_s=options.checkpoint_every_s,
     ))  # fmt: skip
 
 
@@ -364,8 +483,6 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
     """Write a policy file."""
-    from whill_mjx.vehicle.vehicle_file import load_vehicle
-
     task = preset.task
     spec, _, _ = load_vehicle(vehicle)
     contract = PolicyContract(
@@ -386,14 +503,7 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
 
 def cli() -> None:
     """Command line."""
-    import tyro
-
-    try:
-        main(tyro.cli(TrainOptions, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("stopped; give the same command again to go on from the last checkpoint.")
+    run(TrainOptions, main, __doc__, stopped=STOPPED)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import itertools
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from whill_mjx.evaluation.episodes import Episodes
 from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
+from whill_mjx.folders import whole_file, write_whole
 
 ENDINGS = {"success": "tab:green", "collision": "tab:red", "timeout": "tab:orange", "diverged": "black"}
 
@@ -137,12 +137,13 @@ def episode_video(
     import imageio.v2 as imageio
     import imageio_ffmpeg  # noqa: F401  without it imageio would take another writer for the file
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}")
     writer: Any  # its type stub lacks append_data
     colours = {"success": (40, 160, 60), "collision": (210, 40, 40), "timeout": (240, 150, 30), "diverged": (0, 0, 0)}
     fps = max(1, round(rate_hz))
-    with imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer:
+    with (
+        whole_file(out) as temporary,
+        imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer,
+    ):
         for step in range(int(episodes.length.max()) + round(rate_hz)):
             tiles = []
             for index, length in enumerate(episodes.length):
@@ -153,7 +154,6 @@ def episode_video(
                         tile[edge] = colours[ending(episodes, index)]
                 tiles.append(tile)
             writer.append_data(np.concatenate(tiles, axis=1))
-    os.replace(temporary, out)
     return out
 
 
@@ -180,9 +180,7 @@ def page(title: str, evaluation: dict[str, Any], pictures: list[Path], videos: l
         f"<h1>{html.escape(title)}</h1><p>{next(iter(drivers.values()))['episodes']} episodes each; brackets are 95 % "
         f"intervals.</p><table><tr><th></th>{head}</tr>{''.join(rows)}</table>{images}{links}\n"
     )
-    temporary = out.with_name(out.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, out)
+    write_whole(out, text)
     return out
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from whill_mjx.folders import whole_file
+
 
 def reward_curve(metrics: Path, out: Path, action_repeat: int, reference: dict[str, float] | None = None) -> Path:
     """Return and success against control steps, from a metrics.jsonl; `reference` adds horizontal lines of return."""
@@ -52,7 +54,7 @@ def _pyplot():
 
 
 def _save(figure, out: Path) -> Path:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
+    with whole_file(out) as temporary:
+        figure.savefig(temporary, dpi=130)
     _pyplot().close(figure)
     return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.rollouts import CHANNELS
+from whill_mjx.folders import whole_file
 
 
 def evaluate_drivers(course: Course, drivers: dict[str, Driver], seed: int, episodes: int) -> dict[str, Episodes]:
@@ -63,9 +63,7 @@ def write_report(
 
 def save_drives(path: Path, episodes: Episodes) -> None:
     """Traces, lengths and endings of the episodes as plain arrays; `channels` names the columns of the trace."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
+    with whole_file(path) as temporary, temporary.open("wb") as file:
         arrays: dict[str, Any] = {"trace": episodes.trace, "length": episodes.length, "channels": np.array(CHANNELS)}
         arrays.update(episodes.ends)
         np.savez_compressed(file, **arrays)
-    os.replace(temporary, path)

@@ -138,11 +138,7 @@ def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) ->
     Raises:
         ValueError: the minibatches do not divide a rollout.
     """
-    if env.num_envs * config.rollout % config.minibatches:
-        raise ValueError(
-            f"{env.num_envs} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
-            "change PpoConfig.rollout or minibatches."
-        )
+    check_minibatches(config, env.num_envs)
     env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
     env_state, step = env.reset(env_key)
     height, width, channels = env.obs_shape
@@ -154,6 +150,15 @@ def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) ->
         params, optimiser(config, total_iterations).init(params), env_state, step, push(empty, step.obs, step.is_first),
         scale, key, jnp.zeros((), jnp.int32),
     )  # fmt: skip
+
+
+def check_minibatches(config: PpoConfig, instances: int) -> None:
+    """Raise ValueError unless the minibatches divide a rollout of so many instances."""
+    if instances * config.rollout % config.minibatches:
+        raise ValueError(
+            f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
+            "change PpoConfig.rollout or minibatches."
+        )
 
 
 def optimiser(config: PpoConfig, total_iterations: int) -> optax.GradientTransformation:

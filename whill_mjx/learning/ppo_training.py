@@ -1,18 +1,20 @@
-"""The host's side of a PPO training: dispatch, evaluate, and log in the same words as the other learner."""
+"""The host's side of a PPO training: dispatch, evaluate, log in the same words as the other learner, and resume."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.learning.ppo import PpoConfig, init_state, iterate
+from dreamer import checkpoint
+from whill_mjx.folders import write_whole
+from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
 
 
 def train_ppo(
@@ -26,56 +28,99 @@ def train_ppo(
     stop: Callable[[dict[str, float]], bool] | None = None,
     say: Callable[[str], None] = lambda text: None,
     eval_ahead: bool = False,
+    checkpoint_every_s: float = 60.0,
 ) -> tuple[Any, int, int, float]:
     """Train until `total_steps` environment steps, summed over instances, are done, or until `stop` says so.
 
-    It starts anew each time: a baseline of minutes keeps no checkpoints.
+    A run that was interrupted goes on from its last checkpoint in `out`, as if nothing had happened.
 
     Args:
         env: vector environment.
         config: hyperparameters.
-        out: folder that gets metrics.jsonl.
-        total_steps: rounded up to whole rollouts.
+        out: folder that gets metrics.jsonl and checkpoints/.
+        total_steps: rounded up to whole rollouts; a resumed run must get the same, since its learning rate spans them.
         seed: of everything random.
         eval_fn: (params, env_steps) -> figures, logged as eval/...
         eval_every: environment steps between evaluations; one more happens at the end.
         stop: called with every line that holds an evaluation; True ends the run.
-        say: told each evaluation.
+        say: gets a line for each evaluation.
         eval_ahead: call `eval_fn` once in a thread at the start, so that it is compiled beside the run's own program.
             Not with several devices.
+        checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
     """
     out.mkdir(parents=True, exist_ok=True)
-    began, each = time.monotonic(), env.num_envs * config.rollout
+    each, updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
     iterations = -(-total_steps // each)
-    state = jax.jit(lambda: init_state(env, config, iterations, seed))()
-    threads = ThreadPoolExecutor(1)
-    params = jax.tree.map(jnp.copy, state.params)  # the run's own are donated
-    ready = [threads.submit(eval_fn, params, 0)] if eval_ahead and eval_fn is not None else []
-    threads.shutdown(wait=False)
+    state, wall_before = _first_state(env, config, out, iterations, seed)
+    done, began = int(state.updates), time.monotonic()
+    _keep_lines(out / "metrics.jsonl", done * each)
+    ready = _ahead(eval_fn, state.params) if eval_ahead and eval_fn is not None and done < iterations else []
     run = jax.jit(lambda state: iterate(env, config, iterations, state), donate_argnums=0)
-    evaluated_at = 0
-    with (out / "metrics.jsonl").open("w") as file:
-        for iteration in range(1, iterations + 1):
-            state, metrics = run(state)
-            env_steps = iteration * each
-            due = iteration == iterations or env_steps // eval_every > evaluated_at
-            if not due:
-                continue
-            evaluated_at = env_steps // eval_every
-            line = _line(jax.device_get(metrics), env_steps, iteration * config.epochs * config.minibatches)
-            line["wall_s"] = time.monotonic() - began
-            if eval_fn is not None:
-                wait(ready)
-                line |= {f"eval/{name}": value for name, value in eval_fn(state.params, env_steps).items()}
+    saved_at, evaluated_at = time.monotonic(), done * each // eval_every
+
+    def wall_s() -> float:
+        return wall_before + time.monotonic() - began
+
+    def save() -> None:
+        checkpoint.save(out / "checkpoints", state, config, done * each, wall_s())
+
+    def evaluated(metrics: dict[str, Any]) -> dict[str, float]:
+        line = _line(jax.device_get(metrics), done * each, done * updates_each)
+        line["wall_s"] = wall_s()
+        if eval_fn is not None:
+            wait(ready)
+            line |= {f"eval/{name}": value for name, value in eval_fn(state.params, done * each).items()}
+        with (out / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(line) + "\n")
-            file.flush()
-            say(f"{env_steps} steps: " + ", ".join(f"{name} {line[name]:.3g}" for name in line if "eval/" in name))
-            if stop is not None and stop(line):
-                break
-    return state.params, env_steps, iteration * config.epochs * config.minibatches, time.monotonic() - began
+        say(f"{done * each} steps: " + ", ".join(f"{name} {line[name]:.3g}" for name in line if "eval/" in name))
+        return line
+
+    stopped = False
+    try:
+        while done < iterations and not stopped:
+            state, metrics = run(state)
+            done += 1
+            if done == iterations or done * each // eval_every > evaluated_at:
+                evaluated_at = done * each // eval_every
+                line = evaluated(metrics)
+                stopped = stop is not None and stop(line)
+            if done == iterations or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
+                save()
+                saved_at = time.monotonic()
+    except KeyboardInterrupt:
+        checkpoint.save_if_whole(save, state)
+        raise
+    return state.params, done * each, done * updates_each, wall_s()
+
+
+def _first_state(env: Any, config: PpoConfig, out: Path, iterations: int, seed: int) -> tuple[PpoState, float]:
+    """State to start from and the time [s] already spent."""
+    state = jax.jit(lambda: init_state(env, config, iterations, seed))()
+    restored = checkpoint.restore(out / "checkpoints", state, config)
+    return (state, 0.0) if restored is None else (restored[0], float(restored[1]["wall_s"]))
+
+
+def _keep_lines(path: Path, env_steps: int) -> None:
+    """Drop the lines of a log that a resumed run is about to write again, and one that a kill has cut off."""
+    kept = []
+    for text in path.read_text().splitlines() if path.exists() else []:
+        try:
+            if json.loads(text)["env_steps"] <= env_steps:
+                kept.append(text)
+        except (ValueError, KeyError, TypeError):
+            continue
+    write_whole(path, "".join(text + "\n" for text in kept))
+
+
+def _ahead(eval_fn: Callable[[Any, int], Any], params: Any) -> list[Future]:
+    """An evaluation in a thread, with a copy of the parameters: the run's own are donated."""
+    threads = ThreadPoolExecutor(1)
+    ready = [threads.submit(eval_fn, jax.tree.map(jnp.copy, params), 0)]
+    threads.shutdown(wait=False)
+    return ready
 
 
 def _line(metrics: dict[str, Any], env_steps: int, updates: int) -> dict[str, float]:

@@ -1,0 +1,142 @@
+"""Folders and files of a command: whole or not at all, one process at a time, never over another's."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from whill_mjx.folders import FolderRefused, check_place, claim_folder, new_folder, write_whole
+
+pytestmark = pytest.mark.quick
+KIND = "whill_mjx.test"
+ROOT = Path(__file__).parents[2]
+
+
+def contents(folder):
+    """Every file below a folder and its bytes."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_another_run_is_refused_with_both_values_and_nothing_is_touched(tmp_path):
+    with claim_folder(tmp_path, KIND) as claim:
+        assert claim.identity is None
+        claim.settle({"seed": 0, "task": "corridor", "limits": (0.0, 0.3)}, command={"episodes": 4})
+    before = contents(tmp_path)
+    assert json.loads(before["run.json"])["command"] == {"episodes": 4}
+    with claim_folder(tmp_path, KIND) as claim:
+        claim.settle({"seed": 0, "task": "corridor", "limits": (0.0, 0.3), "newer": 1}, command={"episodes": 9})
+        with pytest.raises(FolderRefused, match=r"seed is 0 there and 7 here; task is corridor .* here. Choose"):
+            claim.settle({"seed": 7, "task": "course", "limits": (0.0, 0.3)})
+    after = contents(tmp_path)
+    assert {**after, ".lock": b""} == {**before, ".lock": b""}
+
+
+@pytest.mark.parametrize("name", ["report.html", "vehicle.toml", "policy/", "mine.csv"])
+def test_a_folder_with_files_of_somebody_else_is_refused(tmp_path, name):
+    path = tmp_path / name
+    path.mkdir() if name.endswith("/") else path.write_text("mine")
+    before = contents(tmp_path)
+    with pytest.raises(FolderRefused, match=f"holds {name.strip('/')} of something else"):
+        with claim_folder(tmp_path, KIND, ("mine.csv",)):
+            pytest.fail("claimed")
+    assert contents(tmp_path) == before
+
+
+def test_files_that_no_command_writes_may_lie_in_the_folder(tmp_path):
+    (tmp_path / "log.txt").write_text("")
+    with claim_folder(tmp_path, KIND):
+        pass
+
+
+def test_a_folder_of_another_command_or_without_a_readable_identity_is_refused(tmp_path):
+    with claim_folder(tmp_path, "sysid.fit") as claim:
+        claim.settle({})
+    with pytest.raises(FolderRefused, match="holds results of sysid.fit, not of whill_mjx.test"):
+        with claim_folder(tmp_path, KIND):
+            pytest.fail("claimed")
+    for text in ("{", "[]", '{"command": {}}', '{"kind": "whill_mjx.test", "identity": 3}'):
+        (tmp_path / "run.json").write_text(text)
+        with pytest.raises(FolderRefused, match="damaged, or of an earlier version"):
+            with claim_folder(tmp_path, KIND):
+                pytest.fail("claimed")
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from whill_mjx.folders import claim_folder
+with claim_folder(Path(sys.argv[1]), "whill_mjx.test"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_second_process_is_refused_by_name_and_a_killed_one_leaves_no_lock(tmp_path, number):
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True,
+                              cwd=ROOT)  # fmt: skip
+    assert holder.stdout.readline() == "held\n"
+    try:
+        with pytest.raises(FolderRefused, match=rf"process {holder.pid} on .*, since 2.*, writes there"):
+            with claim_folder(tmp_path, KIND):
+                pytest.fail("claimed")
+    finally:
+        holder.send_signal(number)
+        holder.wait()
+    with claim_folder(tmp_path, KIND) as claim:
+        claim.settle({})
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "below" / "x"):
+        with pytest.raises(FolderRefused, match="is a file, not a folder"):
+            with claim_folder(path, KIND):
+                pytest.fail("claimed")
+    with pytest.raises(FolderRefused, match="MB are free there and at least 9000000000000000 MB are needed"):
+        check_place("--out", tmp_path / "new", least_free=9_000_000_000_000_000 * 1_000_000)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser may write everywhere
+    with pytest.raises(FolderRefused, match="cannot be written"):
+        check_place("--out", tmp_path / "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_file_is_whole_or_absent_and_no_part_of_it_stays(tmp_path):
+    write_whole(tmp_path / "new" / "a.json", "one")
+    assert contents(tmp_path) == {"new/a.json": b"one"}
+    limited = f"""
+import resource
+from pathlib import Path
+from whill_mjx.folders import write_whole
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    write_whole(Path({str(tmp_path / "new" / "a.json")!r}), "x" * 5000)
+except OSError as error:
+    print(error.filename)
+"""
+    found = subprocess.run([sys.executable, "-c", limited], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert found.stdout.strip() == str(tmp_path / "new" / "a.json")
+    assert contents(tmp_path) == {"new/a.json": b"one"}
+
+
+def test_a_new_folder_appears_whole_and_leftovers_of_killed_processes_are_removed(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    with pytest.raises(ValueError, match="bad"):
+        with new_folder(tmp_path / "out") as partial:
+            (partial / "a").write_text("1")
+            (partial.with_name(partial.name.replace(str(os.getpid()), str(gone.pid)))).mkdir()
+            raise ValueError("bad")
+    assert len(list(tmp_path.iterdir())) == 1
+    with new_folder(tmp_path / "out") as partial:
+        (partial / "a").write_text("1")
+    assert contents(tmp_path) == {"out/a": b"1"} and len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(FolderRefused, match="exists already"):
+        with new_folder(tmp_path / "out"):
+            pytest.fail("begun")

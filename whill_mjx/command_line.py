@@ -1,0 +1,278 @@
+"""What all commands share: options in their ranges, errors as one line, and an end within two seconds when asked for.
+
+Exit codes: 0 done; 1 a file or the machine is at fault; 2 the command is, and nothing was touched; 130 stopped by a
+signal; 141 nobody reads the output any more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import math
+import os
+import select
+import signal
+import sys
+import threading
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+GRACE_S = 1.2
+"""Time from a signal to the end of the process, whatever it computes meanwhile."""
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+STOPPED = "stopped; every file is whole or absent. Give the same command again."
+DONE, FAILED, REFUSED, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+REMEDIES = {
+    errno.ENOSPC: "Free some space or choose another place.",
+    errno.EDQUOT: "Free some space or choose another place.",
+    errno.EFBIG: "The limit on file sizes is reached; raise it or choose another place.",
+    errno.EACCES: "Choose a place that you may read and write.",
+    errno.EPERM: "Choose a place that you may read and write.",
+    errno.EROFS: "Choose a place that can be written.",
+    errno.EISDIR: "Give a file, not a folder.",
+    errno.ENOTDIR: "A part of the path is a file; choose another place.",
+    errno.EEXIST: "Choose another place.",
+    errno.ENAMETOOLONG: "Choose a shorter name.",
+    errno.ENOENT: "Correct the path.",
+}
+
+WRITING = threading.RLock()
+"""Held while a file or a folder gets its final name; the process does not end meanwhile."""
+
+
+class OptionError(ValueError):
+    """A command that cannot be meant: it names the option, its value, the rule and the remedy."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a numeric option must lie; for `typing.Annotated`. Every number must be finite, with or without a range."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    """The lower limit itself is excluded."""
+    below: bool = False
+    """The upper limit itself is excluded."""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies within."""
+        if not math.isfinite(value):
+            return False
+        low = self.low < value if self.above else self.low <= value
+        return low and (value < self.high if self.below else value <= self.high)
+
+    def __str__(self) -> str:
+        low = f"{'above' if self.above else 'at least'} {self.low:g}" if math.isfinite(self.low) else ""
+        high = f"{'below' if self.below else 'at most'} {self.high:g}" if math.isfinite(self.high) else ""
+        return " and ".join(part for part in (low, high) if part) or "a finite number"
+
+
+COUNT = Range(1)
+"""At least one of something."""
+NOT_NEGATIVE = Range(0)
+POSITIVE = Range(0, above=True)
+SHARE = Range(0, 1)
+SEED = Range(0, 2_000_000_000)
+"""Seeds are added to others in 32 bits."""
+
+
+def check_range(option: str, value: Any, allowed: Range, default: Any = None) -> None:
+    """Raise OptionError unless the number, or every number of the sequence, lies within; None and text pass."""
+    for number in value if isinstance(value, (tuple, list)) else (value,):
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or allowed.holds(number):
+            continue
+        hint = "" if default in (None, ()) else f" for {default}"
+        raise OptionError(f"{option} {number}: must be {allowed}. Correct it, or leave the option out{hint}.")
+
+
+def check_known(option: str, value: str, known: Iterable[str]) -> None:
+    """Raise OptionError, with all known names, for another one."""
+    names = list(known)
+    if value not in names:
+        raise OptionError(f"{option} {value}: unknown (known: {', '.join(names)}). Correct the name.")
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Turn a ValueError or FileNotFoundError of the block into OptionError: nothing was touched yet."""
+    try:
+        yield
+    except OptionError:
+        raise
+    except (ValueError, FileNotFoundError) as error:
+        raise OptionError(one_line(error)) from error
+
+
+def check_options(options: Any, prefix: str = "") -> None:
+    """Raise OptionError for the first number of an options dataclass that is not finite or not in its `Range`."""
+    hints = typing.get_type_hints(type(options), include_extras=True)
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        name = prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            check_options(value, f"{name}.")
+            continue
+        marks = getattr(hints[field.name], "__metadata__", ())
+        allowed = next((mark for mark in marks if isinstance(mark, Range)), Range())
+        default = None if field.default is dataclasses.MISSING else field.default
+        check_range(f"--{name}", value, allowed, default)
+
+
+def run(
+    options: type, main: Callable[[Any], Any], description: str | None, *, stopped: str = STOPPED,
+    positional: bool = True, args: list[str] | None = None,
+) -> None:  # fmt: skip
+    """Read `options` from the command line, check them and call `main`; what goes wrong ends with one line.
+
+    Args:
+        options: dataclass of the options; numbers may be Annotated with a `Range`.
+        main: gets the options.
+        description: the command's help.
+        stopped: the line after a signal, which says how to go on.
+        positional: options without a default are given without their names.
+        args: words instead of those of the command line.
+    """
+    import tyro
+
+    listen()
+    _State.working, _State.stopped = True, stopped
+    config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
+    try:
+        chosen: Any = tyro.cli(options, description=description, config=config, args=args)
+        check_options(chosen)
+        main(chosen)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        leave(stopped)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains about it at its end
+        raise SystemExit(UNREAD) from None
+    except OptionError as error:
+        _end(REFUSED, error)
+    except (ValueError, OSError, MemoryError) as error:
+        _end(FAILED, error)
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # XLA's word for a device without memory
+            raise
+        _end(FAILED, MemoryError())
+    finally:
+        _State.working = False
+        _stop_listening()
+
+
+def one_line(error: BaseException) -> str:
+    """An error as one line: what is wrong, where, and what to do; notes of the error follow."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename is not None else ""
+        text = f"{place}{error.strerror}. {REMEDIES.get(error.errno or 0, 'Try again or choose another place.')}"
+    elif isinstance(error, MemoryError):
+        text = "out of memory. Ask for less at a time."
+    return " ".join(" ".join([text, *getattr(error, "__notes__", ())]).split())
+
+
+def _end(code: int, error: BaseException) -> None:
+    line = f"error: {one_line(error)}"
+    print(line, file=sys.stderr, flush=True)
+    ended = SystemExit(line)
+    ended.code = code
+    raise ended from None
+
+
+class _State:
+    """Of this process: signals are the process's own."""
+
+    working = False
+    """`run` has begun; before, a signal ends the imports at once."""
+    stopped = "stopped before the work began."
+    before: dict[int, Any] = {}
+    """Handlers that were there before."""
+    wakeup: tuple[int, int] | None = None
+    leaving = threading.Lock()
+
+
+def listen() -> None:
+    """Let a signal end this process with one line and exit code 130, also while no Python code runs.
+
+    The handler raises KeyboardInterrupt, so that the work can keep what it has. A thread, woken by the operating system
+    itself, ends the process after `GRACE_S`, or at a second signal. A command calls this before its slow imports.
+    """
+    if _State.wakeup is not None or threading.current_thread() is not threading.main_thread():
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    for number in SIGNALS:
+        before = signal.getsignal(number)
+        if number == getattr(signal, "SIGHUP", None) and before == signal.SIG_IGN:
+            continue  # nohup
+        _State.before[number] = before
+        signal.signal(number, _interrupt)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    _State.wakeup = reader, writer
+    threading.Thread(target=_watch, args=(reader,), daemon=True, name="signals").start()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if not _State.working:
+        leave(_State.stopped)
+    raise KeyboardInterrupt
+
+
+def _watch(reader: int) -> None:
+    """End the process some time after the first signal that comes through the pipe; 0 ends the watch."""
+    while (received := os.read(reader, 1)) and received[0] not in SIGNALS:
+        if received[0] == 0:
+            os.close(reader)
+            return
+    select.select([reader], [], [], GRACE_S)
+    WRITING.acquire(timeout=0.2)
+    leave(_State.stopped, flush=False)
+
+
+def leave(line: str, flush: bool = True) -> None:
+    """Print the line and end the process with exit code 130, without waiting for other threads or for XLA."""
+    if not _State.leaving.acquire(blocking=False):
+        threading.Event().wait()  # the other thread ends the process
+    if flush:
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except (OSError, ValueError):
+            pass  # nobody reads them
+    if "multiprocessing" in sys.modules:
+        for child in sys.modules["multiprocessing"].active_children():
+            child.kill()
+    try:
+        os.write(2, f"\n{line}\n".encode())
+    finally:
+        os._exit(INTERRUPTED)
+
+
+def _stop_listening() -> None:
+    """Give the signals back: `run` may be one call of several in a process, as in tests."""
+    if _State.wakeup is None:
+        return
+    _, writer = _State.wakeup
+    signal.set_wakeup_fd(-1)
+    for number, before in _State.before.items():
+        signal.signal(number, before)
+    os.write(writer, b"\0")
+    os.close(writer)
+    _State.before, _State.wakeup = {}, None
+
+
+def _forget() -> None:
+    """A forked child has handlers of its own."""
+    if _State.wakeup is not None:
+        signal.set_wakeup_fd(-1)
+        for number in _State.before:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        _State.wakeup = None
+
+
+os.register_at_fork(after_in_child=_forget)
