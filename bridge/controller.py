@@ -8,28 +8,51 @@ when frames do not.
 import time
 import zlib
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
-from bridge.image import ImageError, to_rgb8
+from bridge.image import Crop, ImageError, compressed_to_rgb8, to_rgb8
 from bridge.policy import Policy
-from bridge.safety import Command, SafetyConfig, Supervisor
+from bridge.safety import Command, SafetyConfig, State, Supervisor
 
 BACKSTOP = 1.25
 """Periods without a command after which the last one is sent again (while its frame is young) or zero."""
 BLIND_FRAMES = 5
 """Uniform frames in a row that count as a dark or saturated camera."""
+BLIND = "dark or saturated camera"
+OnBlind = Literal["warn", "slow", "stop"]
 
 
 class Controller:
     """One policy driving one vehicle."""
 
-    def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic,
+                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, crop: Crop | None = None) -> None:
+        """Join a policy and its limits.
+
+        Args:
+            policy: what drives.
+            safety: limits and times.
+            clock: steady clock, read only to time a policy step.
+            on_blind: what a dark or saturated camera causes.
+            pace_by_stamp: run the policy at its rate in the time of the stamps instead of the wall clock's, for a
+                simulator whose time is slower or faster than the wall clock.
+            crop: the part of the camera's image that the policy sees; None: all of it.
+        """
         self.policy = policy
         self.supervisor = Supervisor(safety)
-        self.last_error = ""
-        """Why the last unusable frame was dropped."""
-        self._clock = clock  # only for the duration of a policy step
+        self.unusable = ""
+        """Why the last frame could not be used; empty where it could."""
+        self.image_bytes = 0
+        """Size of the last camera message."""
+        self.digest = 0
+        """Hash of the last usable image."""
+        self._clock = clock
+        self._on_blind = on_blind
+        self._pace_by_stamp = pace_by_stamp
+        self._crop = crop
+        self._size = (policy.contract.height, policy.contract.width)
         self._period = 1 / policy.contract.rate_hz
         self._due = -np.inf
         self._arrived = -np.inf
@@ -48,17 +71,35 @@ class Controller:
             stamp_age: time of receipt minus stamp, on the clock that made the stamp [s].
             height, width, encoding, step, data: the fields of sensor_msgs/Image.
         """
-        contract, supervisor = self.policy.contract, self.supervisor
+        self.image_bytes = height * step
+        return self._on_decoded(now, stamp, stamp_age, lambda: to_rgb8(height, width, encoding, step, data, self._size,
+                                                                       self._crop))
+
+    def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
+        """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""
+        content = bytes(data)  # type: ignore[call-overload]  # any buffer
+        self.image_bytes = len(content)
+        return self._on_decoded(now, stamp, stamp_age, lambda: compressed_to_rgb8(content, self._size, self._crop))
+
+    def _on_decoded(self, now: float, stamp: float, stamp_age: float, decode: Callable[[], np.ndarray]
+                    ) -> Command | None:
         try:
-            image = to_rgb8(height, width, encoding, step, data, (contract.height, contract.width))
+            image = decode()
         except ImageError as error:
-            self.last_error = str(error)
-            supervisor.counts["unusable"] += 1
+            self.unusable = str(error)
+            self.supervisor.counts["unusable"] += 1
             return None
-        if supervisor.frame(now, stamp, zlib.crc32(image.data), stamp_age) != "fresh":
+        self.unusable = ""
+        return self.on_rgb8(now, stamp, stamp_age, image)
+
+    def on_rgb8(self, now: float, stamp: float, stamp_age: float, image: np.ndarray) -> Command | None:
+        """Take one image (H, W, 3) uint8 of the policy's size; times and result as of `on_image`."""
+        contract, supervisor = self.policy.contract, self.supervisor
+        self.digest = zlib.crc32(image.data)
+        if supervisor.frame(now, stamp, self.digest, stamp_age) != "fresh":
             return None
         self._watch_exposure(image)
-        if not self._is_due(now):
+        if not self._is_due(stamp if self._pace_by_stamp else now):
             return None  # a camera faster than the policy
         if supervisor.take_reset():
             self.policy.reset()
@@ -67,7 +108,12 @@ class Controller:
         if not supervisor.may_drive or (self._ticks - 1) % contract.action_repeat:
             return self._send(now, supervisor.tick(now))
         start = self._clock()
-        action = self.policy.step(image)
+        try:
+            action = self.policy.step(image)
+        except Exception as error:  # the runtime's own exception types all derive from Exception directly
+            supervisor.counts["policy error"] += 1
+            self.unusable = f"the policy failed: {error}"
+            action = np.full(2, np.nan)
         return self._send(now, supervisor.action(now, action, self._clock() - start))
 
     def on_tick(self, now: float) -> Command | None:
@@ -78,9 +124,14 @@ class Controller:
             return self._send(now, command)
         return None
 
-    def _send(self, now: float, command: Command) -> Command:
+    def farewell(self) -> bool:
+        """Return whether the vehicle needs zeros before the bridge ends; not where it never drove or yielded."""
+        supervisor = self.supervisor
+        return supervisor.state is not State.YIELDED and supervisor.take_turn()
+
+    def _send(self, now: float, command: Command) -> Command | None:
         self._sent, self._last = now, command
-        return command
+        return command if self.supervisor.take_turn() else None
 
     def _is_due(self, now: float) -> bool:
         """Return whether a policy step may start, and if so plan the next one.
@@ -89,13 +140,23 @@ class Controller:
         policy's rate is never skipped however its clock drifts, and a faster one is thinned out to the policy's rate.
         """
         interval, self._arrived = min(now - self._arrived, self._period), now
-        if now < self._due - interval / 2:
+        if now < self._due - interval / 2 and self._due - now < 2 * self._period:  # else the stamps began again
             return False
-        self._due = (now if now - self._due > self._period else (now + self._due) / 2) + self._period
+        self._due = (now if abs(now - self._due) > self._period else (now + self._due) / 2) + self._period
         return True
 
     def _watch_exposure(self, image: np.ndarray) -> None:
-        """Count runs of images that are uniformly black or saturated; they are shown in the status."""
+        """Count runs of images that are uniformly black or saturated, and do what was asked for while they last."""
         self._uniform = self._uniform + 1 if image.max() <= 2 or image.min() >= 253 else 0
         if self._uniform == BLIND_FRAMES:
             self.supervisor.counts["dark or saturated"] += 1
+        blind = self._uniform >= BLIND_FRAMES
+        if self._on_blind == "stop":
+            self.supervisor.block(BLIND, blind)
+        elif self._on_blind == "slow":
+            (self.supervisor.slow.add if blind else self.supervisor.slow.discard)(BLIND)
+
+    @property
+    def is_blind(self) -> bool:
+        """True while the camera shows one uniform black or white."""
+        return self._uniform >= BLIND_FRAMES

@@ -2,22 +2,31 @@
 
     python -m bridge.guard
 
-The vehicle's driver has no command timeout of its own. The guard listens to the command topic: when the last command
-was a motion and none has followed for SILENCE seconds, it publishes zeros. It never publishes anything else.
+`bridge.drive` starts one by itself. The two exchange heartbeats: the policy node says whether it drives, the guard says
+whom it hears and that its zeros would reach the base; without that the policy node does not drive. When a driving node
+gives no sign of life for SILENCE seconds, the guard publishes zeros. It never publishes anything else.
 """
 
 import argparse
+import json
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 from bridge import ros
+from bridge.commands import CommandTopic
 
-SILENCE = 0.17
-"""[s]; the policy node sends at least every 0.125 s."""
+SILENCE = 0.15
+"""[s]; a driving policy node gives a sign of life at least every 50 ms."""
 WATCH_PERIOD = 0.01
+BEAT_PERIOD = 0.05
 REPEATS = 10
 """Zeros sent per stop, 50 ms apart."""
+FORGET = 2.0
+"""Seconds after which a policy node that fell silent is forgotten; a guard that follows only this one ends."""
+PATIENCE = 30.0
+"""Seconds that a guard waits for the first heartbeat of the node that it follows."""
 
 
 class Watchdog:
@@ -25,63 +34,184 @@ class Watchdog:
 
     def __init__(self) -> None:
         self.stops = 0
-        self.heard = False
-        self._moving = False
-        self._last = 0.0
+        """How often a node was found silent while it drove."""
+        self.zeros = 0
+        """Zeros sent so far."""
+        self.heard: dict[str, float] = {}
+        """Time of the last heartbeat by the session of its node."""
+        self._driving: dict[str, float] = {}  # time of the last sign of life of each session that drives
+        self._stands = False  # whether the last command on the topic was zero
         self._left = 0
         self._next = 0.0
 
-    def command(self, now: float, moves: bool) -> None:
+    def heartbeat(self, now: float, session: str, driving: bool) -> None:
+        """Take a heartbeat of a policy node."""
+        if session not in self._driving and driving:
+            self._stands = False  # until a zero is heard, a driving node counts as moving the vehicle
+        self.heard[session] = now
+        if driving:
+            self._driving[session] = now
+        else:
+            self._driving.pop(session, None)
+
+    def command(self, moves: bool) -> None:
         """Take a command from the topic; the guard's own zeros come back here and change nothing."""
-        self._last, self.heard = now, True
-        self._moving = moves
+        self._stands = not moves
         if moves:
-            self._left = 0
+            self._left = 0  # somebody drives: never fight
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
-        if self._moving and now - self._last > SILENCE:
-            self._moving, self._left, self._next = False, REPEATS, now
-            self.stops += 1
+        for session, alive in list(self._driving.items()):
+            if now - alive > SILENCE:
+                del self._driving[session]
+                if not self._stands:
+                    self._left, self._next = REPEATS, now
+                    self.stops += 1
+        for session, heard in list(self.heard.items()):
+            if now - heard > FORGET:
+                del self.heard[session]
         if self._left and now >= self._next:
-            self._left, self._next = self._left - 1, now + 0.05
+            self._left, self._next, self.zeros = self._left - 1, now + 0.05, self.zeros + 1
             return True
         return False
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Guard until SIGTERM or Ctrl-C."""
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+class GuardNode:
+    """Connects one watchdog to the ROS graph."""
+
+    def __init__(self, node: Any, options: argparse.Namespace) -> None:
+        from std_msgs.msg import String
+
+        self.node, self.watchdog = node, Watchdog()
+        self._follow = options.follow
+        self._missing_since = time.monotonic() + PATIENCE
+        self._ready = False
+        self._type = String
+        self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
+        self._beat = node.create_publisher(String, ros.GUARD_TOPIC, ros.reliable())
+        node.create_subscription(String, ros.HEARTBEAT_TOPIC, self._on_heartbeat, ros.reliable(10))
+        ros.steady_timer(node, WATCH_PERIOD, self._on_watch)
+        ros.steady_timer(node, BEAT_PERIOD, self._on_beat)
+        ros.steady_timer(node, 0.1, self._on_look)
+
+    def finished(self) -> bool:
+        """Return whether the one node that this guard follows is gone."""
+        now = time.monotonic()
+        if self._follow in self.watchdog.heard:
+            self._missing_since = now
+        return bool(self._follow) and now - self._missing_since > FORGET
+
+    def _on_command(self, v: float, omega: float) -> None:
+        self.watchdog.command(v != 0 or omega != 0)  # not-finite values compare unequal to 0: they count as motion
+
+    def _on_heartbeat(self, message: Any) -> None:
+        beat = read_beat(message.data, session=str, driving=bool)
+        if beat and self._follow in ("", beat["session"]):
+            self.watchdog.heartbeat(time.monotonic(), beat["session"], beat["driving"])
+
+    def _on_watch(self) -> None:
+        stops = self.watchdog.stops
+        if self.watchdog.tick(time.monotonic()):
+            self._on_beat()  # first, so that nobody takes the zero for a stranger's
+            self.topic.publish(0.0, 0.0)
+        if self.watchdog.stops != stops:
+            self.node.get_logger().error(f"the policy node gave no sign of life for {SILENCE} s: vehicle stopped")
+
+    def _on_beat(self) -> None:
+        watchdog = self.watchdog
+        beat = {"topic": self.topic.name, "type": self.topic.kind, "ready": self._ready, "zeros": watchdog.zeros,
+                "stops": watchdog.stops, "hears": sorted(watchdog.heard)}
+        self._beat.publish(self._type(data=json.dumps(beat)))
+
+    def _on_look(self) -> None:
+        """Find out whether a zero would reach the base."""
+        before = self._ready
+        listeners = [end for end in self.topic.listeners() if end.type.endswith("/" + self.topic.kind)]
+        self._ready = self.topic.look() and bool(listeners) and self.topic.matched_listeners() >= len(listeners)
+        if self._ready and not before:
+            self.node.get_logger().info(f"guarding {self.topic.name} ({self.topic.kind})")
+
+
+def read_beat(text: str, **fields: type) -> dict[str, Any]:
+    """Return the JSON object of a heartbeat, empty where a field is missing or of another type."""
+    try:
+        beat = json.loads(text)
+    except ValueError:
+        return {}
+    whole = isinstance(beat, dict) and all(isinstance(beat.get(name), kind) for name, kind in fields.items())
+    return beat if whole else {}
+
+
+class GuardLink:
+    """The policy node's side: starts a guard, sends heartbeats and judges those that come back; pure but for `start`.
+
+    All times are of a steady clock.
+    """
+
+    STALE = 0.5
+    """A guard that was not heard for this long [s] is not there."""
+    RESTART = 2.0
+    """Seconds between two starts of a guard that ended."""
+
+    def __init__(self, session: str, topic: str, start: Callable[[], Any] | None) -> None:
+        """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
+        self.session, self.topic = session, topic
+        self.zeros = self.stops = 0
+        self._start, self._process = start, None
+        self._started = -self.RESTART
+        self._heard: float | None = None
+        self._beat: dict[str, Any] = {}
+
+    def keep(self, now: float) -> None:
+        """Start the guard, or start it again where it has ended."""
+        ended = self._process is None or self._process.poll() is not None
+        if self._start is not None and ended and now - self._started >= self.RESTART:
+            self._process, self._started = self._start(), now
+
+    def heard(self, now: float, text: str) -> None:
+        """Take a heartbeat of a guard."""
+        beat = read_beat(text, topic=str, type=str, ready=bool, zeros=int, stops=int, hears=list)
+        if not beat or (beat["topic"] != self.topic and self._beat.get("topic") == self.topic):
+            return  # damaged, or of a second guard of another topic
+        self._heard, self._beat = now, beat
+        self.zeros, self.stops = beat["zeros"], beat["stops"]
+
+    def problem(self, now: float) -> str:
+        """Return why nobody would stop the vehicle if this process died; empty where a guard would."""
+        if self._process is not None and self._process.poll() is not None:
+            return f"the guard ended with code {self._process.returncode}"
+        if self._heard is None or now - self._heard > self.STALE:
+            return "no guard is running"
+        if self._beat["topic"] != self.topic:
+            return f"the guard follows {self._beat['topic']}, not {self.topic}"
+        if self.session not in self._beat["hears"]:
+            return "the guard does not hear this node"
+        return "" if self._beat["ready"] else "the guard's zeros would not reach the base"
+
+    def close(self) -> None:
+        """End the guard that was started."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait(5)
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """Return the options of the command line."""
     parser = argparse.ArgumentParser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
+    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
+    parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
     parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
-    options = parser.parse_args(own)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Guard until SIGTERM, Ctrl-C or the end of the node that is followed."""
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parse_arguments(own)
     with ros.node_session(ros.GUARD_NAME, ros_arguments, options.realtime) as node:
-        from geometry_msgs.msg import Twist
-
-        watchdog = Watchdog()
-        publisher = node.create_publisher(Twist, ros.COMMAND_TOPIC, ros.reliable())
-
-        def on_command(message: Any) -> None:
-            # not-finite values compare unequal to 0, so they count as motion
-            watchdog.command(time.monotonic(), message.linear.x != 0 or message.angular.z != 0)
-
-        def on_watch() -> None:
-            stops = watchdog.stops
-            if watchdog.tick(time.monotonic()):
-                publisher.publish(ros.twist(0.0, 0.0))
-            if watchdog.stops != stops:
-                node.get_logger().error(f"no command for {SILENCE} s after a motion: vehicle stopped")
-
-        def tell() -> None:
-            """Say once that commands are heard and that somebody beside the guard would hear a stop."""
-            if watchdog.heard and publisher.get_subscription_count() > 1:
-                node.get_logger().info(f"guarding {ros.COMMAND_TOPIC}")
-                telling.cancel()
-
-        telling = ros.steady_timer(node, 0.2, tell)
-        node.create_subscription(Twist, ros.COMMAND_TOPIC, on_command, ros.reliable())
-        ros.steady_timer(node, WATCH_PERIOD, on_watch)
-        ros.spin(node)
+        ros.spin(node, GuardNode(node, options).finished)
     return 0
 
 

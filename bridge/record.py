@@ -7,15 +7,18 @@ killed recorder leaves the hidden folder with all rows but the last second's.
 """
 
 import argparse
+import contextlib
 import math
 import os
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 from bridge import ros
+from bridge.commands import CommandListener
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
@@ -78,11 +81,24 @@ class TrialWriter:
             file.flush()
 
     def close(self) -> Path:
-        """End the recording: give the trial its name and return its folder."""
+        """End the recording: give the trial its name and return its folder.
+
+        Raises:
+            OSError: the last rows could not be written; the rest lies in the folder that the message names.
+        """
+        failure = None
         for file in self._files.values():
-            file.flush()
-            os.fsync(file.fileno())
-            file.close()
+            try:
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError as error:
+                failure = error
+            finally:
+                with contextlib.suppress(OSError):
+                    file.close()
+        if failure is not None:
+            raise OSError(failure.errno, f"{failure.strerror}: the recording is cut off; what was written lies in "
+                                         f"{self._partial}. Make room and record again")
         os.replace(self._partial, self.folder)
         return self.folder
 
@@ -137,30 +153,39 @@ class RecordNode:
     """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
 
     def __init__(self, node: Any, writer: TrialWriter, options: argparse.Namespace) -> None:
-        from geometry_msgs.msg import Twist
         from nav_msgs.msg import Odometry
 
         self.writer = writer
+        self.failure: OSError | None = None
+        """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
         self._seconds = options.seconds
-        node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable(10))
+        self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
+        ros.steady_timer(node, 0.1, self._commands.look)
         node.create_subscription(Odometry, options.odometry_topic, self._on_odometry, ros.best_effort())
         node.create_subscription(Odometry, options.ground_truth_topic, self._on_ground_truth, ros.best_effort())
-        ros.steady_timer(node, 1.0, writer.flush)
+        ros.steady_timer(node, 1.0, lambda: self._write(writer.flush))
 
     def finished(self) -> bool:
-        """Return whether the recording time is over."""
-        return bool(self._seconds) and time.monotonic() - self._started > self._seconds
+        """Return whether the recording time is over, or nothing can be written any more."""
+        return self.failure is not None or bool(self._seconds) and time.monotonic() - self._started > self._seconds
 
-    def _on_command(self, message: Any) -> None:
-        self.writer.command(time.monotonic(), message.linear.x, message.angular.z)
+    def _on_command(self, v: float, omega: float) -> None:
+        self._write(self.writer.command, time.monotonic(), v, omega)
 
     def _on_odometry(self, message: Any) -> None:
         speed = message.twist.twist
-        self.writer.odometry(time.monotonic(), *planar_pose(message), speed.linear.x, speed.angular.z)
+        self._write(self.writer.odometry, time.monotonic(), *planar_pose(message), speed.linear.x, speed.angular.z)
 
     def _on_ground_truth(self, message: Any) -> None:
-        self.writer.ground_truth(time.monotonic(), *planar_pose(message))
+        self._write(self.writer.ground_truth, time.monotonic(), *planar_pose(message))
+
+    def _write(self, write: Callable[..., None], *values: float) -> None:
+        """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
+        try:
+            write(*values)
+        except OSError as error:
+            self.failure = self.failure or error
 
 
 def planar_pose(message: Any) -> tuple[float, float, float]:
@@ -176,6 +201,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
     parser.add_argument("trial", help="name of the trial, like circle_1")
     parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
+    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--vehicle", default="WHILL Model CR")
@@ -188,8 +214,22 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def finish(writer: TrialWriter) -> Path | None:
+    """End a recording and say what it holds; return its folder, None where its end could not be written."""
+    try:
+        folder = writer.close()
+    except OSError as error:
+        print(f"bridge.record: {error}", file=sys.stderr)
+        return None
+    print(f"bridge.record: {folder}: rows {writer.rows}", file=sys.stderr)
+    return folder
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Record until the time is over, SIGTERM or Ctrl-C; return 2 where nothing can be written, 3 without odometry."""
+    """Record until the time is over, SIGTERM or Ctrl-C.
+
+    Returns 2 where nothing can be written, 3 without odometry, 4 where writing failed on the way.
+    """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
     try:
@@ -198,12 +238,17 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"bridge.record: {error}", file=sys.stderr)
         return 2
+    failed = False
     try:
-        with ros.node_session("bridge_record", ros_arguments) as node:
-            ros.spin(node, RecordNode(node, writer, options).finished)
+        with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
+            recorder = RecordNode(node, writer, options)
+            ros.spin(node, recorder.finished)
+            failed = recorder.failure is not None
     finally:
-        folder = writer.close()
-        print(f"bridge.record: {folder}: rows {writer.rows}", file=sys.stderr)
+        folder = finish(writer)
+    if failed or folder is None:
+        print("bridge.record: the recording ended early, because nothing could be written any more", file=sys.stderr)
+        return 4
     if not writer.rows["odometry"]:
         print(f"bridge.record: {folder}/odometry.csv: no message came on {options.odometry_topic}, and a fit needs "
               "odometry. Name the vehicle's topic with --odometry-topic.", file=sys.stderr)

@@ -7,21 +7,29 @@ import json
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-IMAGE_TOPIC = "/sensing/camera/front/image_raw"
-GROUND_TRUTH_TOPIC = "/ground_truth/odom"
-ODOMETRY_TOPIC = "/whill/odom"
-COLLISION_TOPIC = "/collision_sensor"
-COMMAND_TOPIC = "/whill/controller/cmd_vel"
-STATUS_TOPIC = "/bridge/status"
-REARM_TOPIC = "/bridge/rearm"
+# All names are relative, so a namespace or a remapping moves them: two bridges on one graph never share a topic.
+IMAGE_TOPIC = "sensing/camera/front/image_raw"
+GROUND_TRUTH_TOPIC = "ground_truth/odom"
+ODOMETRY_TOPIC = "whill/odom"
+COLLISION_TOPIC = "collision_sensor"
+COMMAND_TOPIC = "whill/controller/cmd_vel"
+CHAIR_STATE_TOPIC = "whill/states/model_cr2"
+E_STOP_TOPIC = "e_stop"
+ENABLE_TOPIC = "enable"
+JOY_TOPIC = "joy"
+STATUS_TOPIC = "bridge/status"
+REARM_TOPIC = "bridge/rearm"
+HEARTBEAT_TOPIC = "bridge/heartbeat"
+GUARD_TOPIC = "bridge/guard"
+DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
+RECORD_NAME = "bridge_record"
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -48,11 +56,11 @@ def set_realtime(name: str, priority: int) -> None:
               file=sys.stderr)
 
 
-def best_effort() -> Any:
-    """Sensor data: newest only, losses allowed."""
+def best_effort(depth: int = 1) -> Any:
+    """Sensor data: newest only, losses allowed. A reader of this kind hears every publisher."""
     from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-    return QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def reliable(depth: int = 1) -> Any:
@@ -60,6 +68,51 @@ def reliable(depth: int = 1) -> Any:
     from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def latched() -> Any:
+    """A state that late joiners must get: reliable, and the last value is kept for them."""
+    from rclpy.qos import DurabilityPolicy
+
+    profile = reliable()
+    profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return profile
+
+
+def subscription_events(**callbacks: Any) -> Any:
+    """Callbacks for events of a subscription. The class has another module in Humble than in later releases."""
+    try:
+        from rclpy.event_handler import SubscriptionEventCallbacks
+    except ImportError:  # Humble
+        from rclpy.qos_event import SubscriptionEventCallbacks  # type: ignore[attr-defined, no-redef]
+    return SubscriptionEventCallbacks(**callbacks)
+
+
+def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
+                     incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
+    """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
+    try:
+        from rclpy.event_handler import UnsupportedEventTypeError
+    except ImportError:  # Humble
+        from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
+    try:
+        events = subscription_events(incompatible_qos=incompatible, message_lost=lost)
+        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+    except UnsupportedEventTypeError:
+        events = subscription_events(incompatible_qos=incompatible)
+        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+
+
+def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
+    """Subscribe to a state such as an emergency stop, whatever durability its publisher offers.
+
+    A volatile reader hears all publishers but gets no earlier value; a transient-local one gets the value that was
+    latched before the bridge started, but hears latching publishers only. Each value may come twice.
+    """
+    node.create_subscription(kind, topic, callback, reliable(10))
+    # that a volatile publisher does not fit the second reader is no fault: the first one hears it
+    node.create_subscription(kind, topic, callback, latched(),
+                             event_callbacks=subscription_events(incompatible_qos=lambda _: None))
 
 
 @contextmanager
@@ -78,8 +131,8 @@ def node_session(name: str, arguments: list[str], realtime: int = 0) -> Iterator
         import rclpy
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
-        raise SystemExit(f"{name}: {error}. The nodes need ROS 2 (Jazzy) for Python. "
-                         "Run `pip install -e '.[ros]'` or source your ROS installation.") from error
+        raise SystemExit(f"{name}: {error}. The nodes need ROS 2 (Humble or newer) for Python. "
+                         "Source your ROS installation, or run `pip install -e '.[ros]'` on x86-64.") from error
     rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(name)
     try:
@@ -111,35 +164,30 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
-def steady_timer(node: Any, period: float, callback: Callable[[], None]) -> Any:
+def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> Any:
     """A timer on the steady clock: a node timer would stop with /clock where the simulation's time is used."""
     from rclpy.clock import Clock, ClockType
 
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+def chair_state_type() -> Any:
+    """Return the message class of the WHILL driver's state.
+
+    Raises:
+        SystemExit: the maker's message package is not installed.
+    """
+    try:
+        from whill_msgs.msg import ModelCr2State
+    except ImportError as error:
+        raise SystemExit(f"{error}. The chair's state is a whill_msgs/ModelCr2State. Build the maker's "
+                         "ros2_whill_interfaces in your workspace and source it.") from error
+    return ModelCr2State
+
+
 def stamp_seconds(stamp: Any) -> float:
     """Seconds of a builtin_interfaces/Time."""
     return stamp.sec + stamp.nanosec * 1e-9
-
-
-def twist(v: float, omega: float) -> Any:
-    """geometry_msgs/Twist of a planar command: v [m/s], omega [rad/s]."""
-    from geometry_msgs.msg import Twist
-
-    message = Twist()
-    message.linear.x, message.angular.z = float(v), float(omega)
-    return message
-
-
-def publish_stops(publisher: Any, count: int = 5, interval: float = 0.02) -> None:
-    """Publish `count` zero commands, spaced so that a depth-1 reader gets each, and wait for their delivery."""
-    from rclpy.duration import Duration
-
-    for _ in range(count):
-        publisher.publish(twist(0.0, 0.0))
-        time.sleep(interval)
-    publisher.wait_for_all_acked(Duration(seconds=0.5))
 
 
 def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
@@ -155,3 +203,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(json.dumps(content) + "\n")
     os.replace(temporary, path)
+
+
+def full_name(node: Any) -> str:
+    """Return namespace and name of a node, such as /left/bridge_drive."""
+    return f"{node.get_namespace().rstrip('/')}/{node.get_name()}"

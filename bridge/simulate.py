@@ -30,6 +30,8 @@ LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
+E_STOP_PERIOD = 0.1
+"""Seconds between two heartbeats of the emergency stop, which is never pulled here."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ class SimulateNode:
     """Serves one simulated vehicle on the ROS graph."""
 
     def __init__(self, node: Any, vehicle: SimulatedVehicle, options: argparse.Namespace) -> None:
-        from geometry_msgs.msg import Twist
+        from geometry_msgs import msg as commands
         from nav_msgs.msg import Odometry
         from sensor_msgs.msg import Image
         from std_msgs.msg import Bool
@@ -149,8 +151,11 @@ class SimulateNode:
         self._image = node.create_publisher(Image, ros.IMAGE_TOPIC, ros.best_effort())
         self._truth = node.create_publisher(Odometry, ros.GROUND_TRUTH_TOPIC, ros.best_effort())
         self._odometry = node.create_publisher(Odometry, ros.ODOMETRY_TOPIC, ros.best_effort())
-        self._collision = node.create_publisher(Bool, ros.COLLISION_TOPIC, ros.reliable(10))
-        node.create_subscription(Twist, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
+        self._collision = node.create_publisher(Bool, ros.COLLISION_TOPIC, ros.latched())
+        self._e_stop = node.create_publisher(Bool, ros.E_STOP_TOPIC, ros.latched())
+        kind = getattr(commands, options.command_type)
+        node.create_subscription(kind, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
+        ros.steady_timer(node, E_STOP_PERIOD, lambda: self._e_stop.publish(Bool(data=False)))
         self.episodes: list[Episode] = []
         self.command_log: deque[tuple[float, float, float]] = deque(maxlen=LOG_LENGTH)
         """Steady time of receipt [s], v, omega."""
@@ -182,7 +187,8 @@ class SimulateNode:
 
     def _on_command(self, message: Any) -> None:
         now = time.monotonic()
-        self.command_log.append((now, message.linear.x, message.angular.z))
+        planar = message.twist if self.options.command_type == "TwistStamped" else message
+        self.command_log.append((now, planar.linear.x, planar.angular.z))
         if self._asked is not None:
             self.delays.append((self._asked, now - self._asked))
             self._asked = None
@@ -331,6 +337,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--linger", type=float, default=1.0, help="listen for so long after the last episode [s]")
     parser.add_argument("--results", type=Path, help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
+    parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
     parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)

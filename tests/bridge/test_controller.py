@@ -41,9 +41,10 @@ class ScriptedPolicy:
 class World:
     """A camera, a steady clock and a wall clock."""
 
-    def __init__(self, **contract):
+    def __init__(self, options=None, hold_zeros=True, **contract):
         self.policy = ScriptedPolicy(FakeContract(**contract))
-        self.controller = Controller(self.policy, SafetyConfig((-0.5, -1.0), (1.0, 1.0)), clock=lambda: 0.0)
+        safety = SafetyConfig((-0.5, -1.0), (1.0, 1.0), hold_zeros=hold_zeros)
+        self.controller = Controller(self.policy, safety, clock=lambda: 0.0, **(options or {}))
         self.now, self.count = 10.0, 0
 
     def image(self, dt=0.1, **changes):
@@ -68,7 +69,7 @@ def test_each_frame_gives_one_command_and_a_new_episode_begins_with_a_fresh_stat
 
 
 @pytest.mark.parametrize("bad", [
-    {"encoding": "mono8"}, {"height": 9}, {"data": b"short"}, {"step": 23}, {"width": 0}, {"stamp_age": 5.0},
+    {"encoding": "16UC1"}, {"height": 9}, {"data": b"short"}, {"step": 23}, {"width": 0}, {"stamp_age": 5.0},
 ])
 def test_unusable_frame_reaches_neither_policy_nor_wheels_and_stops_the_vehicle_in_time(bad):
     world = World()
@@ -79,7 +80,7 @@ def test_unusable_frame_reaches_neither_policy_nor_wheels_and_stops_the_vehicle_
     stop = world.tick(0.011)
     assert (stop.v, stop.omega, stop.reason) == (0.0, 0.0, "frame age")
     if "stamp_age" not in bad:
-        assert world.controller.supervisor.counts["unusable"] == 5 and world.controller.last_error
+        assert world.controller.supervisor.counts["unusable"] == 5 and world.controller.unusable
 
 
 def test_silent_camera_stops_the_vehicle_within_260_ms_of_its_last_frame():
@@ -93,6 +94,34 @@ def test_silent_camera_stops_the_vehicle_within_260_ms_of_its_last_frame():
     assert world.policy.steps == 0  # nothing is fed while standing
     world.image()
     assert world.policy.steps == 1  # after a reset
+
+
+def test_base_that_stops_by_itself_gets_no_packet_before_the_first_drive_and_six_zeros_after_it():
+    world = World(hold_zeros=False)
+    assert [world.tick(0.01) for _ in range(100)] == [None] * 100
+    world.drive()
+    sent = [command for command in (world.tick(0.01) for _ in range(300)) if command is not None]
+    assert [command.v for command in sent] == [0.4] + [0.0] * 6
+
+
+def test_vehicle_that_was_moving_gets_a_farewell_and_a_released_one_does_not():
+    world = World(hold_zeros=False)
+    assert not world.controller.farewell()
+    world.drive()
+    assert world.controller.farewell()
+    world.controller.supervisor.foreign_command(world.now)
+    assert not world.controller.farewell()
+
+
+def test_policy_that_raises_an_error_is_zero_for_the_same_frame_and_named():
+    world = World()
+    world.drive()
+    world.policy.step = None  # not callable
+    command = world.image()
+    assert (command.v, command.reason) == (0.0, "non-finite action") and "not callable" in world.controller.unusable
+    for _ in range(10):
+        world.image()
+    assert world.controller.supervisor.latched == "repeated non-finite actions"
 
 
 def test_backstop_repeats_zero_at_about_the_control_rate_while_standing():
@@ -147,3 +176,49 @@ def test_dark_camera_is_counted_once_per_run_of_frames():
     for _ in range(8):
         world.image(data=bytes(192))
     assert world.controller.supervisor.counts["dark or saturated"] == 1
+
+
+@pytest.mark.parametrize("action, blind_speed", [("warn", 0.4), ("slow", 0.12), ("stop", 0.0)])
+def test_dark_camera_warns_slows_or_stops_as_asked_and_only_while_it_lasts(action, blind_speed):
+    world = World({"on_blind": action})
+    world.drive()
+    speeds = []
+    for i in range(8):  # the frames differ, or they would count as frozen
+        speeds.append(world.image(data=bytes([i % 2]) + bytes(191)).v)
+    assert speeds[3] == 0.4 and speeds[-1] == pytest.approx(blind_speed) and world.controller.is_blind
+    assert [world.image().v for _ in range(4)][-1] == 0.4
+
+
+@pytest.mark.parametrize("pace", [0.5, 2.0])
+def test_simulator_off_real_time_gets_one_step_per_frame_where_its_stamps_set_the_pace(pace):
+    world = World({"pace_by_stamp": True})
+    stamp = 100.0
+    for i in range(54):
+        stamp += 0.1
+        if i == 4:
+            steps = world.policy.steps
+        world.image(dt=0.1 / pace, stamp=stamp)
+    assert world.policy.steps - steps == 50
+
+
+def test_stamps_that_begin_again_do_not_stall_a_policy_paced_by_them():
+    world = World({"pace_by_stamp": True})
+    world.drive()
+    world.tick(0.3)
+    commands = [world.image(stamp=i / 10) for i in range(6)]
+    assert commands[-1] is not None and commands[-1].v == 0.4
+
+
+def test_compressed_image_is_decoded_and_a_damaged_one_named():
+    import io
+
+    image = pytest.importorskip("PIL.Image")
+    world = World()
+    for i in range(5):
+        buffer = io.BytesIO()
+        image.fromarray(np.full((8, 8, 3), 100 + i, np.uint8)).save(buffer, "PNG")
+        world.now += 0.1
+        command = world.controller.on_compressed(world.now, world.now, 0.0, buffer.getvalue())
+    assert command.v == 0.4
+    assert world.controller.on_compressed(world.now + 0.1, world.now + 0.1, 0.0, buffer.getvalue()[:-9]) is None
+    assert "its end is missing" in world.controller.unusable

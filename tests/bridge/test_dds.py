@@ -1,75 +1,13 @@
 """Whole drives of separate processes over real DDS, on a domain of their own."""
 
 import csv
-import importlib.util
-import itertools
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
-import tiny_policy
-
-ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed")
-counter = itertools.count()
-
-
-class Graph:
-    """Processes of one ROS domain that end with the test."""
-
-    def __init__(self, folder):
-        self.folder, self.processes = folder, {}
-        domain = 1 + (os.getpid() * 7 + next(counter)) % 100
-        python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
-        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log")}
-
-    def start(self, name, *arguments):
-        log = open(self.folder / f"{name}.log", "w")
-        command = [sys.executable, "-m", f"bridge.{name}", *map(str, arguments)]
-        self.processes[name] = subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=log, stderr=log)
-        log.close()
-
-    def log(self, name):
-        return (self.folder / f"{name}.log").read_text()
-
-    def end(self, name, number=signal.SIGTERM):
-        """Send a signal and return the exit code."""
-        self.processes[name].send_signal(number)
-        return self.wait(name)
-
-    def wait(self, name, seconds=60):
-        try:
-            return self.processes[name].wait(seconds)
-        except subprocess.TimeoutExpired:
-            pytest.fail(f"{name} did not end in {seconds} s: {self.log(name)}")
-
-    def wait_for(self, name, text, seconds=60):
-        """Wait until a process has said something."""
-        end = time.monotonic() + seconds
-        while text not in self.log(name):
-            assert time.monotonic() < end and self.processes[name].poll() is None, f"{name}: {self.log(name)}"
-            time.sleep(0.05)
-
-
-@pytest.fixture
-def graph(tmp_path):
-    graph = Graph(tmp_path)
-    yield graph
-    for process in graph.processes.values():
-        if process.poll() is None:
-            process.kill()
-            process.wait()
-
-
-@pytest.fixture
-def policy(tmp_path):
-    return tiny_policy.write(tmp_path / "tiny")
 
 
 def column(path, name):
@@ -81,7 +19,7 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
     results = tmp_path / "results.json"
     graph.start("record", tmp_path / "logs", "straight_1")
     graph.start("drive", policy)
-    graph.wait_for("drive", "standing: no frame yet")
+    graph.wait_for("drive", "standing")
     graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 2, "--linger", 1.5,
                 "--results", results)
     assert graph.wait("simulate") == 0, graph.log("simulate")
@@ -113,13 +51,9 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
 def test_vehicle_is_stopped_however_the_policy_node_ends(graph, policy, tmp_path, number, code):
     results = tmp_path / "results.json"
-    if number == signal.SIGKILL:
-        graph.start("guard")
     graph.start("simulate", "--simulator", "point_robot:EndlessRobot", "--results", results)
     graph.start("drive", policy)
     graph.wait_for("drive", "driving")
-    if number == signal.SIGKILL:
-        graph.wait_for("guard", "guarding")
     time.sleep(0.5)
     assert graph.end("drive", number) == code, graph.log("drive")
     time.sleep(1.0)
@@ -147,7 +81,7 @@ def test_missing_camera_is_named(graph, policy):
 
 def test_large_best_effort_images_arrive_with_the_shipped_profile(graph, policy, tmp_path):
     graph.start("drive", policy)
-    graph.wait_for("drive", "standing: no frame yet")
+    graph.wait_for("drive", "standing")
     graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 1, "--image-size", 720, 1280,
                 "--results", tmp_path / "results.json")
     assert graph.wait("simulate") == 0, graph.log("simulate")
@@ -167,8 +101,7 @@ def test_refused_policy_ends_the_node_with_an_error_before_it_joins_the_graph(gr
 def test_unarmed_bridge_stands_before_a_good_camera_until_it_is_armed(graph, policy, tmp_path):
     graph.start("simulate", "--simulator", "point_robot:EndlessRobot", "--results", tmp_path / "results.json")
     graph.start("drive", policy, "--require-arm", "--ros-args", "-p", "use_sim_time:=true")  # and nobody sends /clock
-    graph.wait_for("drive", "standing: not armed")
+    graph.wait_for("drive", "disarmed: not armed")
     time.sleep(1.0)
     assert graph.end("drive") == 0 and graph.end("simulate") == 0
-    commands = json.loads((tmp_path / "results.json").read_text())["commands"]
-    assert len(commands) >= 5 and all(v == 0 and omega == 0 for _, v, omega in commands)
+    assert json.loads((tmp_path / "results.json").read_text())["commands"] == []  # the rider keeps the joystick

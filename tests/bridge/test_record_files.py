@@ -3,12 +3,12 @@
 import argparse
 import csv
 import math
+import os
 import tomllib
 
 import pytest
 
-from bridge.guard import Watchdog
-from bridge.record import TrialWriter, parse_arguments, toml_text, write_dataset_file
+from bridge.record import TrialWriter, finish, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 
 pytestmark = pytest.mark.quick
@@ -97,22 +97,17 @@ def test_ros_arguments_are_passed_on():
     assert split_ros_arguments(["a"]) == (["a"], [])
 
 
-def test_guard_sends_zeros_only_after_a_motion_was_followed_by_silence():
-    guard = Watchdog()
-    assert not any(guard.tick(t / 100) for t in range(100))  # nothing was ever commanded
-    guard.command(1.0, True)
-    sent = [t for t in range(100, 200) if guard.tick(t / 100)]
-    assert sent[0] in (117, 118) and len(sent) == 10 and guard.stops == 1
-    guard.command(2.0, True)
-    guard.command(2.1, False)  # the policy node stopped by itself
-    assert not any(guard.tick(2.1 + t / 100) for t in range(100))
-
-
-def test_guard_stays_silent_while_commands_flow_and_yields_when_they_return():
-    guard = Watchdog()
-    for i in range(100):
-        guard.command(i * 0.125, True)
-        assert not any(guard.tick(i * 0.125 + t / 100) for t in range(12))
-    assert guard.tick(99 * 0.125 + 0.2)
-    guard.command(99 * 0.125 + 0.21, True)
-    assert not guard.tick(99 * 0.125 + 0.26)
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(tmp_path, capsys):
+    writer = TrialWriter(tmp_path, "full")
+    writer.odometry(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.flush()
+    writer._files["command"] = open("/dev/full", "w")  # each write to it fails for want of space
+    writer.command(0.1, 0.3, 0.0)
+    with pytest.raises(OSError, match="No space"):
+        writer.flush()
+    assert finish(writer) is None
+    said = capsys.readouterr().err
+    assert "No space left on device" in said and "Make room" in said
+    (partial,) = tmp_path.glob(".full.partial-*")
+    assert len((partial / "odometry.csv").read_text().splitlines()) == 2 and not (tmp_path / "trials" / "full").exists()

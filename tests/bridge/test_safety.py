@@ -1,9 +1,14 @@
-"""Every rule of the supervisor, with made-up times."""
+"""Every rule of the supervisor and every edge of its machine, with made-up times."""
+
+import dataclasses
+import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bridge.safety import SafetyConfig, Supervisor
+from bridge.safety import EDGES, Event, SafetyConfig, State, Supervisor
 
 CONFIG = SafetyConfig(low=(-0.5, -1.0), high=(1.0, 1.0))
 GO = np.array([0.4, 0.2])
@@ -55,10 +60,10 @@ def test_commands_are_clamped_to_the_vehicle_and_counted(action, expected):
 def test_no_output_of_any_policy_leaves_the_limits():
     rng = np.random.default_rng(0)
     drive = Drive()
-    for bits in rng.integers(0, 2**64, (2000, 2), np.uint64):
+    for bits in rng.integers(0, 2**64, (20_000, 2), np.uint64):
         command = drive.frame(bits.view(np.float64))
         assert -0.5 <= command.v <= 1.0 and -1.0 <= command.omega <= 1.0
-        drive.supervisor.rearm()
+        drive.supervisor.arm()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -79,7 +84,7 @@ def test_three_non_finite_actions_in_ten_seconds_latch_until_rearmed():
             drive.frame()
     assert drive.supervisor.latched == "repeated non-finite actions"
     assert all(speeds(drive.frame()) == (0, 0) for _ in range(20))
-    assert drive.supervisor.rearm()
+    assert drive.supervisor.arm()
     assert speeds(drive.frame()) == (0.4, 0.2)
 
 
@@ -188,10 +193,10 @@ def test_collision_stops_at_once_and_only_the_operator_releases_it():
     drive.supervisor.latch("collision")
     drive.supervisor.block("collision", True)
     assert speeds(drive.tick(0.0)) == (0, 0) and drive.supervisor.counts["collision"] == 1
-    assert not drive.supervisor.rearm()  # still touching
+    assert not drive.supervisor.arm()  # still touching
     drive.supervisor.block("collision", False)
     assert all(drive.frame().reason == "collision" for _ in range(10))
-    assert drive.supervisor.rearm() and speeds(drive.frame()) == (0.4, 0.2)
+    assert drive.supervisor.arm() and speeds(drive.frame()) == (0.4, 0.2)
 
 
 def test_condition_holds_the_vehicle_as_long_as_it_lasts():
@@ -214,3 +219,158 @@ def test_thousand_jittering_but_healthy_frames_never_stop():
 def test_limits_that_forbid_stopping_are_refused(low, high):
     with pytest.raises(ValueError, match="include 0"):
         SafetyConfig(low=low, high=high)
+
+
+RELEASE = dataclasses.replace(CONFIG, hold_zeros=False)
+
+
+def in_state(state, config=CONFIG):
+    """A drive that has come to a state."""
+    drive = Drive(config)
+    if state is State.STANDING:
+        drive.tick(0.3)
+    elif state is State.DISARMED:
+        drive.supervisor.latch("collision")
+    elif state is State.YIELDED:
+        drive.supervisor.foreign_command(drive.now)
+    assert drive.supervisor.state is state
+    return drive
+
+
+def cause(drive, event):
+    """Let an event happen in the world of a drive."""
+    supervisor = drive.supervisor
+    if event is Event.ARM:
+        supervisor.arm()
+    elif event is Event.FRAMES:
+        for _ in range(3):
+            drive.frame()
+    elif event is Event.FAULT:
+        supervisor.fault("policy too slow")
+    elif event is Event.LATCH:
+        supervisor.latch("emergency stop")
+    elif event is Event.FOREIGN:
+        supervisor.foreign_command(drive.now)
+    elif event is Event.QUIET:
+        drive.now += supervisor.config.quiet + 0.01
+        supervisor.tick(drive.now)
+
+
+@pytest.mark.parametrize("state, event", EDGES, ids=lambda x: x.value)
+def test_edge_leads_where_the_table_says_and_only_driving_moves_the_vehicle(state, event):
+    drive = in_state(state)
+    cause(drive, event)
+    assert drive.supervisor.state is EDGES[state, event]
+    assert (drive.supervisor.reason == "") == drive.supervisor.may_drive == (drive.supervisor.state is State.DRIVING)
+    if not drive.supervisor.may_drive:
+        assert speeds(drive.supervisor.tick(drive.now)) == (0, 0)
+
+
+STAYS = [pair for pair in itertools.product(State, Event) if pair not in EDGES and pair[1] is not Event.QUIET]
+
+
+@pytest.mark.parametrize("state, event", STAYS, ids=lambda x: x.value)
+def test_event_without_an_edge_leaves_the_state(state, event):
+    drive = in_state(state)
+    cause(drive, event)
+    assert drive.supervisor.state is state
+
+
+def test_no_state_reaches_driving_but_by_fresh_frames_while_standing():
+    assert [pair for pair, after in EDGES.items() if after is State.DRIVING] == [(State.STANDING, Event.FRAMES)]
+    assert {after for (_, event), after in EDGES.items() if event is Event.FOREIGN} == {State.YIELDED}
+
+
+def test_drawing_in_the_documentation_is_the_machine():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "bridge.md").read_text(encoding="utf-8")
+    drawn = re.findall(r"^ +([A-Z]+) --> ([A-Z]+): ([a-z ]+)$", text, re.MULTILINE)
+    assert {((State[a], Event(label)), State[b]) for a, b, label in drawn} == set(EDGES.items())
+
+
+def test_base_that_stops_by_itself_gets_a_few_zeros_and_then_silence():
+    drive = in_state(State.STANDING, RELEASE)
+    assert [drive.supervisor.take_turn() for _ in range(8)] == [True] * 6 + [False] * 2
+
+
+def test_base_without_a_time_out_of_its_own_gets_zeros_for_as_long_as_the_bridge_stands():
+    for state in (State.STANDING, State.DISARMED):
+        drive = in_state(state)
+        assert all(drive.supervisor.take_turn() for _ in range(100))
+
+
+@pytest.mark.parametrize("config", [CONFIG, RELEASE])
+def test_bridge_that_yielded_never_speaks(config):
+    drive = in_state(State.YIELDED, config)
+    assert not any(drive.supervisor.take_turn() for _ in range(10))
+    assert not drive.supervisor.arm() and drive.supervisor.state is State.YIELDED
+
+
+def test_abandoned_base_without_a_time_out_is_stopped_when_the_other_driver_falls_silent():
+    drive = in_state(State.YIELDED)
+    cause(drive, Event.QUIET)
+    assert drive.supervisor.take_turn() and speeds(drive.tick(0.0)) == (0, 0)
+
+
+def test_emergency_stop_while_another_node_drives_is_remembered():
+    drive = in_state(State.YIELDED)
+    drive.supervisor.latch("emergency stop")
+    assert drive.supervisor.state is State.YIELDED
+    cause(drive, Event.QUIET)
+    assert drive.supervisor.reason == "emergency stop"
+
+
+def test_arming_is_refused_while_a_condition_holds_the_vehicle():
+    drive = in_state(State.DISARMED)
+    drive.supervisor.block("no guard", True)
+    assert not drive.supervisor.arm() and drive.supervisor.state is State.DISARMED
+    drive.supervisor.block("no guard", False)
+    assert drive.supervisor.arm() and drive.supervisor.state is State.STANDING
+
+
+def test_bridge_that_must_be_armed_begins_disarmed():
+    drive = Drive(dataclasses.replace(CONFIG, require_arm=True))
+    assert drive.supervisor.state is State.DISARMED and drive.supervisor.reason == "not armed"
+    assert drive.supervisor.arm() and speeds(drive.frame()) == (0.4, 0.2)
+
+
+def test_without_automatic_resumption_every_stop_needs_an_operator():
+    drive = Drive(dataclasses.replace(CONFIG, auto_resume=False))
+    drive.tick(0.3)
+    assert all(drive.frame().reason == "frame age" for _ in range(10))
+    assert drive.supervisor.state is State.DISARMED
+    assert drive.supervisor.arm() and speeds(drive.frame()) == (0.4, 0.2)
+
+
+def test_latching_condition_latches_only_a_drive_that_it_ends():
+    drive = in_state(State.STANDING)
+    drive.supervisor.block("emergency stop unknown", True, latching=True)
+    assert drive.supervisor.state is State.STANDING
+    drive.supervisor.block("emergency stop unknown", False)
+    cause(drive, Event.FRAMES)
+    drive.supervisor.block("emergency stop unknown", True, latching=True)
+    assert drive.supervisor.state is State.DISARMED
+
+
+def test_slew_limits_bound_each_change_of_the_command_but_not_a_stop():
+    drive = Drive(dataclasses.replace(CONFIG, slew=(1.0, 0.5)))
+    before = (0.4, 0.2)
+    drive.frame()
+    for action in ([1.0, 1.0], [1.0, 1.0], [-0.5, -1.0], [0.0, 0.0]):
+        before = speeds(drive.supervisor.tick(drive.now))
+        command = drive.frame(action)
+        assert abs(command.v - before[0]) <= 0.1 + 1e-9 and abs(command.omega - before[1]) <= 0.05 + 1e-9
+    assert speeds(drive.tick(0.3)) == (0, 0)
+    assert [round(drive.frame([1.0, 1.0]).v, 6) for _ in range(4)] == [0, 0, 0, 0.1]  # from rest again
+
+
+def test_slow_driving_scales_the_command_while_it_is_asked_for():
+    drive = Drive()
+    drive.supervisor.slow.add("dark or saturated camera")
+    assert speeds(drive.frame()) == pytest.approx((0.12, 0.06))
+    drive.supervisor.slow.clear()
+    assert speeds(drive.frame()) == (0.4, 0.2)
+
+
+def test_slew_limits_that_forbid_moving_are_refused():
+    with pytest.raises(ValueError, match="never moves"):
+        SafetyConfig(low=(-1.0, -1.0), high=(1.0, 1.0), slew=(0.0, 1.0))

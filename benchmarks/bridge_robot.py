@@ -1,0 +1,182 @@
+"""A plain ROS node that plays a vehicle: camera, base, emergency stop, operator. For the bridge's tests and figures.
+
+It shares no code with the bridge but the quality of service of images, so what it hears is what a real base would hear.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import importlib
+import json
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+Heard = tuple[float, float, float]
+"""Steady time of receipt [s], v [m/s], omega [rad/s]."""
+
+
+def message_type(name: str) -> Any:
+    """Return the class of a message such as std_msgs/Bool."""
+    package, _, kind = name.partition("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+class Switch:
+    """A truth value that is published again and again."""
+
+    def __init__(self, value: bool) -> None:
+        self.value = value
+        self.timer: Any = None
+
+
+class Robot:
+    """Whatever parts of a vehicle are asked for, served by a thread."""
+
+    def __init__(self, domain: int, name: str = "robot") -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        before = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.context = rclpy.Context()
+        try:
+            rclpy.init(context=self.context, domain_id=domain)
+        finally:
+            del os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
+            if before is not None:
+                os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = before
+        self.node = rclpy.create_node(name, context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.commands: list[Heard] = []
+        self.statuses: list[dict[str, Any]] = []
+        self.frames = 0
+        self.clock_offset, self.encoding, self.frozen = 0.0, "rgb8", False  # of the camera
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        with contextlib.suppress(ExternalShutdownException):
+            self.executor.spin()
+
+    def close(self) -> None:
+        """Leave the graph in order, so that nobody lists this node any more."""
+        self.executor.shutdown(timeout_sec=5)
+        self._thread.join(5)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def publisher(self, kind: str, topic: str, profile: Any = 1) -> Any:
+        """Return a publisher of a message type such as std_msgs/Bool."""
+        return self.node.create_publisher(message_type(kind), topic, profile)
+
+    def repeat(self, publisher: Any, period: float, make: Callable[[], Any]) -> Any:
+        """Publish `make()` again and again, at once too; return the timer."""
+        publisher.publish(make())
+        return self.node.create_timer(period, lambda: publisher.publish(make()))
+
+    def base(self, topic: str = "whill/controller/cmd_vel", kind: str = "geometry_msgs/Twist") -> None:
+        """Listen to commands, which are collected in `commands`."""
+        def heard(message: Any) -> None:
+            planar = getattr(message, "twist", message)
+            self.commands.append((time.monotonic(), planar.linear.x, planar.angular.z))
+
+        self.node.create_subscription(message_type(kind), topic, heard, 10)
+
+    def watch(self, topic: str = "bridge/status") -> None:
+        """Collect the statuses of a bridge in `statuses`."""
+        self.node.create_subscription(message_type("std_msgs/String"), topic,
+                                      self._on_status, 10)
+
+    def _on_status(self, message: Any) -> None:
+        self.statuses.append(json.loads(message.data))
+
+    def e_stop(self, topic: str = "e_stop") -> Switch:
+        """Beat as an emergency stop, not pulled."""
+        switch = Switch(False)
+        boolean = message_type("std_msgs/Bool")
+        switch.timer = self.repeat(self.publisher("std_msgs/Bool", topic), 0.02, lambda: boolean(data=switch.value))
+        return switch
+
+    def camera(self, topic: str = "sensing/camera/front/image_raw", rate: float = 10,
+               size: tuple[int, int] = (64, 64)) -> Any:
+        """Publish white images, each different from the last unless `frozen`; return the timer."""
+        from bridge import ros
+
+        image = message_type("sensor_msgs/Image")
+        publisher = self.node.create_publisher(image, topic, ros.best_effort())
+        pixels = bytearray(b"\xff" * (size[0] * size[1] * 3))
+
+        def make() -> Any:
+            self.frames += 1
+            pixels[0] = 5 if self.frozen else self.frames % 250
+            message = image(height=size[0], width=size[1], encoding=self.encoding, step=3 * size[1])
+            message.data = array.array("B", pixels)
+            stamp = time.time() + self.clock_offset
+            message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
+            return message
+
+        return self.repeat(publisher, 1 / rate, make)
+
+    def whole(self) -> Switch:
+        """Be a whole vehicle with base, camera and status; return its emergency stop."""
+        self.base()
+        self.watch()
+        self.camera()
+        return self.e_stop()
+
+    def commander(self, v: float, topic: str = "whill/controller/cmd_vel", kind: str = "geometry_msgs/Twist"
+                  ) -> tuple[Any, Callable[[], Any]]:
+        """Return a publisher on the command topic and a maker of its commands: a joystick, a planner."""
+        def make() -> Any:
+            message = message_type(kind)()
+            getattr(message, "twist", message).linear.x = float(v)
+            return message
+
+        return self.publisher(kind, topic), make
+
+    def arm(self, topic: str = "bridge/rearm") -> None:
+        """Arm the bridge, as soon as it listens."""
+        publisher = self.publisher("std_msgs/Empty", topic)
+        self.wait_until(lambda _: publisher.get_subscription_count())
+        publisher.publish(message_type("std_msgs/Empty")())
+
+    def wait_until(self, condition: Callable[[Robot], Any], seconds: float = 60) -> Any:
+        """Wait for a condition of this robot and return its value.
+
+        Raises:
+            AssertionError: it did not come true in time; with the last commands and statuses.
+        """
+        end = time.monotonic() + seconds
+        while not (value := condition(self)):
+            if time.monotonic() > end:
+                raise AssertionError(f"commands {self.commands[-5:]}, statuses {self.statuses[-3:]}")
+            time.sleep(0.005)
+        return value
+
+    def wait_for_status(self, seconds: float = 60, **fields: Any) -> dict[str, Any]:
+        """Wait until the newest status has these values, of texts and lists a part is enough; return it."""
+        def fits(robot: Robot) -> dict[str, Any] | None:
+            status = robot.statuses[-1] if robot.statuses else {}
+            whole = all(want == status.get(name) if isinstance(want, bool) else want in str(status.get(name, ""))
+                        for name, want in fields.items())
+            return status if status and whole else None
+
+        return self.wait_until(fits, seconds)
+
+    def moving(self, since: float = 0.0) -> list[Heard]:
+        """Return the commands after a time that are not zero."""
+        return [command for command in self.commands if command[0] > since and (command[1] or command[2])]
+
+    def first_zero(self, since: float) -> float:
+        """Wait for the first zero after a time; return how long [s] after it the zero came."""
+        def found(robot: Robot) -> list[Heard]:
+            return [command for command in robot.commands if command[0] >= since and not (command[1] or command[2])]
+
+        return self.wait_until(found)[0][0] - since

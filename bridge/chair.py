@@ -1,0 +1,75 @@
+"""Live odometry of a WHILL Model CR2, whose own driver publishes none.
+
+    python -m bridge.chair
+
+Reads whill_msgs/ModelCr2State and publishes nav_msgs/Odometry on whill/odom, which `bridge.record` writes. The state
+has no stamp, so the time of receipt counts.
+"""
+
+import argparse
+import math
+import sys
+import time
+from typing import Any
+
+from bridge import ros
+from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
+
+SLOW = 0.15
+"""Interval of states [s] above which odometry is too coarse to identify a vehicle from."""
+
+
+class ChairNode:
+    """Turns the chair's states into odometry."""
+
+    def __init__(self, node: Any, options: argparse.Namespace) -> None:
+        from nav_msgs.msg import Odometry
+
+        self.node, self.odometry = node, WheelOdometry(options.wheel_radius, options.tread)
+        self._message = Odometry
+        self._last = math.nan
+        self._warned = False
+        self._publisher = node.create_publisher(Odometry, ros.ODOMETRY_TOPIC, ros.reliable())
+        node.create_subscription(ros.chair_state_type(), options.state_topic, self._on_state, ros.best_effort(10))
+
+    def _on_state(self, state: Any) -> None:
+        now = time.monotonic()
+        pose = self.odometry.update(now, ChairState.of(state))
+        if now - self._last > SLOW and not self._warned:
+            self._warned = True
+            self.node.get_logger().warning(f"a state each {now - self._last:.2f} s is too slow to identify a vehicle: "
+                                           "start the driver with publish_interval_ms:=20")
+        self._last = now
+        message = self._message()
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.pose.pose.position.x, message.pose.pose.position.y = pose.x, pose.y
+        message.pose.pose.orientation.z = math.sin(pose.yaw / 2)
+        message.pose.pose.orientation.w = math.cos(pose.yaw / 2)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = pose.v, pose.omega
+        self._publisher.publish(message)
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(prog="bridge.chair", description="Publish the odometry of a WHILL Model CR2.")
+    parser.add_argument("--state-topic", default=ros.CHAIR_STATE_TOPIC)
+    parser.add_argument("--wheel-radius", type=float, default=WHEEL_RADIUS, help="[m], loaded")
+    parser.add_argument("--tread", type=float, default=TREAD, help="[m], between the drive wheels")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Publish until SIGTERM or Ctrl-C."""
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parse_arguments(own)
+    with ros.node_session("bridge_chair", ros_arguments) as node:
+        chair = ChairNode(node, options)
+        ros.spin(node)
+        if chair.odometry.gaps:
+            print(f"bridge.chair: {chair.odometry.gaps} gaps above 2 s in which the pose stood still", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

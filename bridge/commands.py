@@ -1,0 +1,194 @@
+"""The command topic: who listens in which type, who else publishes, and whose each command is."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from bridge import ros
+
+TYPES = {"geometry_msgs/msg/Twist": "Twist", "geometry_msgs/msg/TwistStamped": "TwistStamped"}
+"""Message types of commands, and the words for them on the command line."""
+HEARD_DEPTH = 50
+"""Commands that may wait to be heard, so that none of another node is overwritten by ours."""
+GUARD_DELAY = 0.15
+"""A zero that the guard has not reported after this time [s] came from somebody else; it reports each 50 ms."""
+
+
+class Ear:
+    """Separates our own commands, the guard's zeros and the commands of other nodes; pure, with injected time.
+
+    ROS does not name the sender of a message. So we compare each command heard with those we sent, exactly; the guard
+    reports how many zeros it has sent.
+    """
+
+    def __init__(self) -> None:
+        self._own: deque[tuple[float, float]] = deque(maxlen=64)
+        self._unknown_zeros: deque[float] = deque()  # times of zeros that neither we nor the guard are known to send
+        self._guard_zeros: int | None = None
+        self._reported: deque[float] = deque()  # times at which the guard reported a zero that we have not heard yet
+
+    def sent(self, v: float, omega: float) -> None:
+        """Remember a command of ours."""
+        self._own.append((v, omega))
+
+    def heard(self, now: float, v: float, omega: float) -> bool:
+        """Take a command from the topic; return whether another node surely sent it."""
+        if (v, omega) in self._own:
+            while self._own.popleft() != (v, omega):
+                pass  # earlier ones were lost on the way
+            return False
+        if v != 0 or omega != 0:
+            return True
+        self._unknown_zeros.append(now)
+        return False
+
+    def guard_reports(self, now: float, zeros: int) -> None:
+        """Take the number of zeros that the guard has sent so far; a smaller number comes from a restarted guard."""
+        before = zeros if self._guard_zeros is None else self._guard_zeros
+        self._reported.extend([now] * (zeros - before if zeros >= before else zeros))
+        self._guard_zeros = zeros
+
+    def foreign_zero(self, now: float) -> bool:
+        """Return whether a zero was heard that neither we nor the guard can have sent."""
+        while self._reported and self._unknown_zeros:
+            self._reported.popleft()
+            self._unknown_zeros.popleft()
+        while self._reported and now - self._reported[0] > 1.0:
+            self._reported.popleft()  # this one was lost on its way to us
+        if not self._unknown_zeros or now - self._unknown_zeros[0] < GUARD_DELAY:
+            return False
+        self._unknown_zeros.clear()
+        return True
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or subscriber of a topic."""
+
+    node: str
+    """Full name of its node."""
+    type: str
+    """Message type, such as geometry_msgs/msg/Twist."""
+
+
+def endpoints(infos: list[Any]) -> list[Endpoint]:
+    """Return what the graph says of a topic's publishers or subscribers."""
+    return [Endpoint(f"{info.node_namespace.rstrip('/')}/{info.node_name}", info.topic_type) for info in infos]
+
+
+def without(found: list[Endpoint], *names: str) -> list[Endpoint]:
+    """Return the endpoints without one of each name: a second node of the same name is somebody else."""
+    rest, missing = [], list(names)
+    for endpoint in found:
+        if endpoint.node in missing:
+            missing.remove(endpoint.node)
+        else:
+            rest.append(endpoint)
+    return rest
+
+
+def choose_type(listeners: list[Endpoint]) -> str:
+    """Return the type in which a base listens, empty while nobody does. Twist wins where both are asked for."""
+    kinds = [TYPES[endpoint.type] for endpoint in listeners if endpoint.type in TYPES]
+    return min(kinds, default="", key=list(TYPES.values()).index)
+
+
+class CommandListener:
+    """Hears the commands on a topic, whatever their type and quality of service.
+
+    One participant can use a topic in one type only, so the topic is opened when its type is known.
+    """
+
+    def __init__(self, node: Any, topic: str, kind: str, on_command: Callable[[float, float], None]) -> None:
+        """Prepare the topic.
+
+        Args:
+            node: ROS node.
+            topic: its name, resolved by the node's namespace and remappings.
+            kind: Twist, TwistStamped, or auto: as the base listens.
+            on_command: called with v [m/s] and omega [rad/s] of every command on the topic, our own ones too.
+        """
+        self.node, self.name = node, node.resolve_topic_name(topic)
+        self.kind = ""
+        """Type of the commands; empty while it is unknown."""
+        self._on_command = on_command
+        self._own = ros.full_name(node)
+        namespace = self._own.rpartition("/")[0]
+        tools = [f"{namespace}/{name}" for name in (ros.DRIVE_NAME, ros.GUARD_NAME, ros.RECORD_NAME)]
+        self._known = [self._own, *(name for name in tools if name != self._own)]
+        self._guard = f"{namespace}/{ros.GUARD_NAME}"
+        if kind != "auto":
+            self._open(kind)
+
+    def listeners(self) -> list[Endpoint]:
+        """Return who listens to commands, without the bridge's own nodes."""
+        return without(endpoints(self.node.get_subscriptions_info_by_topic(self.name)), *self._known)
+
+    def commanders(self) -> list[str]:
+        """Return the names of all other nodes that publish commands; one guard beside us is not among them."""
+        found = endpoints(self.node.get_publishers_info_by_topic(self.name))
+        return sorted(endpoint.node for endpoint in without(found, self._own, self._guard))
+
+    def look(self) -> bool:
+        """Open the topic as soon as its type is known; return whether it is open."""
+        kind = self.kind or choose_type(self._witnesses())
+        if kind and not self.kind:
+            self._open(kind)
+        return bool(self.kind)
+
+    def _witnesses(self) -> list[Endpoint]:
+        """Return whose types decide."""
+        return self.listeners() or endpoints(self.node.get_publishers_info_by_topic(self.name))
+
+    def _open(self, kind: str) -> None:
+        from geometry_msgs import msg
+
+        self.kind, self._message = kind, getattr(msg, kind)
+
+        def heard(message: Any) -> None:
+            planar = message.twist if kind == "TwistStamped" else message
+            self._on_command(planar.linear.x, planar.angular.z)
+
+        self.node.create_subscription(self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
+
+
+class CommandTopic(CommandListener):
+    """Publishes commands in the type that the base listens to, and hears those of others."""
+
+    publisher: Any = None
+
+    def publish(self, v: float, omega: float) -> None:
+        """Send one command, where the topic is open."""
+        if self.publisher is None:
+            return
+        message = planar = self._message()
+        if self.kind == "TwistStamped":
+            message.header.stamp = self.node.get_clock().now().to_msg()
+            message.header.frame_id = "base_link"
+            planar = message.twist
+        planar.linear.x, planar.angular.z = float(v), float(omega)
+        self.publisher.publish(message)
+
+    def publish_stops(self, count: int = 5, interval: float = 0.02) -> None:
+        """Send zeros, spaced so that a depth-1 reader gets each, and wait for their delivery."""
+        from rclpy.duration import Duration
+
+        if self.publisher is None:
+            return
+        for _ in range(count):
+            self.publish(0.0, 0.0)
+            time.sleep(interval)
+        self.publisher.wait_for_all_acked(Duration(seconds=0.5))
+
+    def matched_listeners(self) -> int:
+        """Return how many readers of other nodes get our commands, as far as the transport has matched them."""
+        return self.publisher.get_subscription_count() - 1 if self.publisher is not None else 0
+
+    def _witnesses(self) -> list[Endpoint]:
+        return self.listeners()
+
+    def _open(self, kind: str) -> None:
+        super()._open(kind)
+        self.publisher = self.node.create_publisher(self._message, self.name, ros.reliable())

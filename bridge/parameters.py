@@ -1,0 +1,79 @@
+"""ROS parameters as options of the command line: `-p name:=value` and `--params-file FILE` after `--ros-args`.
+
+They are read before the node exists, so a bad one ends the program before it joins the graph. Options given on the
+command line itself win.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+OF_ROS = ("use_sim_time", "start_type_description_service")
+"""Parameters that every ROS node has; the node itself reads them."""
+
+
+def as_options(ros_arguments: list[str], node: str, positional: str = "") -> list[str]:
+    """Return the ROS parameters of a node as words of the command line.
+
+    Args:
+        ros_arguments: what follows and includes `--ros-args`.
+        node: name of the node, to find its section of a parameter file.
+        positional: the parameter that is no option but stands alone.
+
+    Raises:
+        ValueError: a parameter file cannot be read.
+    """
+    values: dict[str, Any] = {}
+    for flag, argument in zip(ros_arguments, ros_arguments[1:], strict=False):
+        if flag == "--params-file":
+            values.update(read_file(Path(argument), node))
+        elif flag in ("-p", "--param") and ":=" in argument:
+            name, _, text = argument.partition(":=")
+            values[name.rpartition(":")[2]] = _yaml(text)
+    words: list[str] = []
+    for name, value in values.items():
+        if name in OF_ROS or name.startswith("qos_overrides."):
+            continue
+        if name == positional:
+            words.insert(0, str(value))
+        else:
+            words.extend(_option(name, value))
+    return words
+
+
+def read_file(path: Path, node: str) -> dict[str, Any]:
+    """Return the parameters that a YAML file has for a node, or for all of them.
+
+    Raises:
+        ValueError: the file is missing or is no parameter file.
+    """
+    try:
+        sections = _yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}. Give an existing parameter file.") from error
+    if not isinstance(sections, dict):
+        raise ValueError(f"{path}: holds {type(sections).__name__}; a parameter file maps node names to "
+                         "`ros__parameters`. Correct it.")
+    values: dict[str, Any] = {}
+    for name, section in sections.items():
+        if str(name).rpartition("/")[2] in ("**", "*", node) and isinstance(section, dict):
+            values.update(section.get("ros__parameters") or {})
+    return values
+
+
+def _option(name: str, value: Any) -> Iterator[str]:
+    """Yield the words of one option; false and empty values leave the default."""
+    if value is False or value is None or value == "":
+        return
+    yield "--" + name.replace("_", "-")
+    if value is not True:
+        yield from (str(item) for item in (value if isinstance(value, list) else [value]))
+
+
+def _yaml(text: str) -> Any:
+    import yaml  # rclpy depends on it
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"ROS parameters: {error}. Correct the YAML.") from error

@@ -1,0 +1,85 @@
+"""Processes and plain ROS nodes on a domain of their own, for the tests of the nodes."""
+
+import contextlib
+import fcntl
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.bridge_robot import Robot
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@contextlib.contextmanager
+def free_domain():
+    """Hold a ROS domain that no other test of this machine uses now, and none used just before."""
+    first = random.randrange(100)
+    for domain in (1 + (first + i) % 100 for i in itertools.count()):
+        with open(Path(tempfile.gettempdir()) / f"ros-domain-{domain}.lock", "w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield domain
+            return
+
+
+class Graph:
+    """Processes of one ROS domain that end with the test."""
+
+    def __init__(self, folder, domain):
+        self.folder, self.domain, self.processes, self.peers = folder, domain, {}, []
+        python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log")}
+
+    def start(self, name, *arguments, key=None):
+        key = key or name
+        log = open(self.folder / f"{key}.log", "w")
+        command = [sys.executable, "-m", f"bridge.{name}", *map(str, arguments)]
+        self.processes[key] = subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=log, stderr=log)
+        log.close()
+
+    def peer(self, name="peer"):
+        """A plain ROS node within this process."""
+        peer = Robot(self.domain, name)
+        self.peers.append(peer)
+        return peer
+
+    def log(self, name):
+        return (self.folder / f"{name}.log").read_text()
+
+    def end(self, name, number=signal.SIGTERM):
+        """Send a signal and return the exit code."""
+        self.processes[name].send_signal(number)
+        return self.wait(name)
+
+    def wait(self, name, seconds=60):
+        try:
+            return self.processes[name].wait(seconds)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"{name} did not end in {seconds} s: {self.log(name)}")
+
+    def wait_for(self, name, text, seconds=60):
+        """Wait until a process has said something."""
+        end = time.monotonic() + seconds
+        while text not in self.log(name):
+            assert time.monotonic() < end and self.processes[name].poll() is None, f"{name}: {self.log(name)}"
+            time.sleep(0.05)
+
+    def close(self):
+        for peer in self.peers:
+            peer.close()
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.kill()
+                process.wait()

@@ -1,0 +1,119 @@
+"""The guard's decisions and both sides of the heartbeat, with made-up times."""
+
+import json
+
+import pytest
+
+from bridge.guard import GuardLink, Watchdog, read_beat
+
+pytestmark = pytest.mark.quick
+
+
+def beats(guard, start, stop, driving=True, session="a"):
+    """Heartbeats each 50 ms and a watch each 10 ms; the times [10 ms] at which a zero was sent."""
+    sent = []
+    for t in range(start, stop):
+        if t % 5 == 0:
+            guard.heartbeat(t / 100, session, driving)
+        if guard.tick(t / 100):
+            sent.append(t)
+    return sent
+
+
+def silence(guard, start, stop):
+    return [t for t in range(start, stop) if guard.tick(t / 100)]
+
+
+def test_guard_sends_zeros_only_after_a_driving_node_fell_silent():
+    guard = Watchdog()
+    assert not silence(guard, 0, 100) and not beats(guard, 100, 200)
+    guard.command(True)
+    sent = silence(guard, 200, 300)
+    assert sent[0] in (210, 211) and len(sent) == 10 and guard.stops == 1 and guard.zeros == 10
+
+
+def test_guard_stops_a_node_that_died_before_its_first_command_was_heard():
+    guard = Watchdog()
+    guard.command(False)  # of an earlier drive
+    guard.heartbeat(1.0, "a", True)
+    assert len(silence(guard, 100, 200)) == 10
+
+
+@pytest.mark.parametrize("driving, moves", [(False, True), (True, False)])
+def test_guard_leaves_a_node_alone_that_does_not_drive_or_has_stopped_the_vehicle(driving, moves):
+    guard = Watchdog()
+    beats(guard, 0, 100, driving)
+    guard.command(moves)
+    assert not silence(guard, 100, 300)
+
+
+def test_guard_yields_to_whoever_moves_the_vehicle():
+    guard = Watchdog()
+    beats(guard, 0, 100)
+    assert len(silence(guard, 100, 115)) == 1
+    guard.command(True)
+    assert not silence(guard, 115, 200)
+
+
+def test_guard_watches_each_of_two_nodes():
+    guard = Watchdog()
+    for t in range(0, 100, 5):
+        guard.heartbeat(t / 100, "a", True)
+        guard.heartbeat(t / 100, "b", True)
+    assert len(beats(guard, 100, 200, session="b")) == 10 and guard.stops == 1
+
+
+def test_guard_forgets_a_node_that_stays_silent():
+    guard = Watchdog()
+    guard.heartbeat(0.0, "a", False)
+    guard.tick(1.0)
+    assert "a" in guard.heard
+    guard.tick(3.0)
+    assert "a" not in guard.heard
+
+
+GOOD = {"topic": "/cmd_vel", "type": "Twist", "ready": True, "zeros": 0, "stops": 0, "hears": ["me"]}
+
+
+@pytest.mark.parametrize("change, problem", [
+    ({}, ""), ({"topic": "/other"}, "follows /other"), ({"hears": ["you"]}, "does not hear"),
+    ({"ready": False}, "would not reach"),
+])
+def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, problem):
+    link = GuardLink("me", "/cmd_vel", None)
+    assert link.problem(0.0) == "no guard is running"
+    link.heard(1.0, json.dumps({**GOOD, **change}))
+    assert problem in link.problem(1.1) and bool(problem) == bool(link.problem(1.1))
+    assert link.problem(2.0) == "no guard is running"
+
+
+class Process:
+    """A child process that has, or has not, ended."""
+
+    returncode = None
+
+    def poll(self):
+        return self.returncode
+
+
+def test_guard_that_ended_is_started_again_after_a_pause():
+    started = []
+
+    def start():
+        started.append(Process())
+        return started[-1]
+
+    link = GuardLink("me", "/cmd_vel", start)
+    link.keep(0.0), link.keep(1.0)
+    assert len(started) == 1
+    started[0].returncode = 1
+    assert link.problem(1.1) == "the guard ended with code 1"
+    link.keep(1.2)
+    assert len(started) == 1
+    link.keep(2.1)
+    assert len(started) == 2
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "[]", "{}", '{"session": 3, "driving": true}', '{"session": "a"}'])
+def test_damaged_heartbeat_is_no_heartbeat(text):
+    assert read_beat(text, session=str, driving=bool) == {}

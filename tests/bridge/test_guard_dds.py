@@ -1,0 +1,84 @@
+"""Nothing drives without a guard, and a guard stops what dies."""
+
+import os
+import signal
+import time
+
+
+def drive_alone(graph, policy, *options):
+    """A robot and a bridge that has just begun to drive it."""
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.start("drive", policy, *options)
+    robot.wait_until(lambda robot: robot.moving())
+    return robot
+
+
+def stopped(robot):
+    return robot.commands[-1][1:] == (0.0, 0.0)
+
+
+def test_bridge_killed_at_its_first_command_leaves_a_standing_vehicle(graph, policy):
+    robot = drive_alone(graph, policy)
+    graph.end("drive", signal.SIGKILL)
+    robot.wait_until(stopped)
+
+
+def test_bridge_killed_on_another_topic_leaves_a_standing_vehicle(graph, policy):
+    robot = graph.peer("robot")
+    robot.base("/base/velocity")
+    robot.camera()
+    robot.e_stop()
+    graph.start("drive", policy, "--command-topic", "/base/velocity")
+    robot.wait_until(lambda robot: robot.moving())
+    graph.end("drive", signal.SIGKILL)
+    robot.wait_until(stopped)
+    assert "vehicle stopped" in graph.log("drive")  # the guard says so in the log of its starter
+
+
+def test_frozen_bridge_is_stopped_by_the_guard_and_drives_on_after_fresh_frames(graph, policy):
+    robot = drive_alone(graph, policy, "--signal-age", 60)  # however long the pause on a busy machine
+    graph.processes["drive"].send_signal(signal.SIGSTOP)
+    robot.wait_until(stopped)
+    graph.processes["drive"].send_signal(signal.SIGCONT)
+    since = time.monotonic()
+    robot.wait_until(lambda robot: robot.moving(since))  # and its own guard is not taken for a stranger
+
+
+def test_bridge_that_waits_for_another_guard_stands_without_it(graph, policy):
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.start("drive", policy, "--guard", "other")
+    robot.wait_for_status(reason="no guard", causes="no guard is running")
+    time.sleep(0.5)
+    assert robot.commands == []
+    graph.start("guard", "--command-topic", "/elsewhere")
+    robot.wait_for_status(reason="no guard", causes="the guard follows /elsewhere")
+    graph.end("guard")
+    graph.start("guard")
+    robot.wait_for_status(driving=True)
+    graph.end("guard")
+    robot.wait_for_status(state="standing", reason="no guard")
+    robot.wait_until(stopped)
+
+
+def test_guard_that_was_killed_is_started_again_and_the_vehicle_stands_meanwhile(graph, policy):
+    robot = drive_alone(graph, policy)
+    os.kill(child_of(graph.processes["drive"].pid), signal.SIGKILL)
+    robot.wait_for_status(reason="no guard")
+    since = time.monotonic()
+    robot.wait_until(lambda robot: robot.moving(since))
+
+
+def test_bridge_leaves_no_guard_behind(graph, policy):
+    drive_alone(graph, policy)
+    guard = child_of(graph.processes["drive"].pid)
+    graph.end("drive")
+    assert not os.path.exists(f"/proc/{guard}")
+
+
+def child_of(pid):
+    """The one child process."""
+    with open(f"/proc/{pid}/task/{pid}/children") as file:
+        (child,) = file.read().split()
+    return int(child)

@@ -1,0 +1,131 @@
+"""The robot's side runs on Python 3.10 and on Humble's rclpy."""
+
+import ast
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.quick
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = sorted((ROOT / "bridge").rglob("*.py"))
+LATER = {"tomllib", "StrEnum", "UTC", "Self", "ExceptionGroup", "BaseExceptionGroup", "assert_never", "override",
+         "LiteralString", "reveal_type", "TaskGroup", "batched", "itertools.batched", "add_note"}
+"""Names of the standard library that came after Python 3.10."""
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.name)
+def test_module_is_python_3_10(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 10))
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {alias.name for alias in node.names} | {getattr(node, "module", None) or ""}
+    assert not names & LATER
+
+
+def test_modules_compile_under_python_3_10_where_there_is_one(tmp_path):
+    found = [shutil.which("python3.10"), *Path.home().glob(".pyenv/versions/3.10*/bin/python3.10")]
+    for python in filter(None, found):
+        ask = [python, "-c", "import sys; print(sys.version_info[:2])"]
+        if subprocess.run(ask, capture_output=True, text=True).stdout.strip() == "(3, 10)":
+            break
+    else:
+        pytest.skip("there is no Python 3.10")
+    code = "import sys, pathlib\nfor name in sys.argv[1:]:\n    compile(pathlib.Path(name).read_text(), name, 'exec')"
+    subprocess.run([python, "-c", code, *map(str, MODULES)], check=True, cwd=tmp_path)
+
+
+DRIVE = """
+import json, sys, time, types
+import humble_stub
+humble_stub.install()
+import numpy as np
+from bridge import drive, guard
+from bridge.controller import Controller
+from bridge.safety import SafetyConfig
+
+class Policy:
+    contract = types.SimpleNamespace(height=8, width=8, rate_hz=200.0, action_repeat=1)
+    reset = lambda self: None
+    step = lambda self, image: np.array([0.2, 0.1])
+
+options = drive.parse_arguments(["policy", "--guard", "other", *sys.argv[1:]])
+node = humble_stub.Node("bridge_drive")
+kind = "TwistStamped" if "stamped" in options.image_topic else "Twist"
+node.topics["/whill/controller/cmd_vel"] = f"geometry_msgs/msg/{kind}"
+bridge = drive.DriveNode(node, Controller(Policy(), SafetyConfig((-1.0, -1.0), (1.0, 1.0), hold_zeros=False)), options)
+beat = {"topic": "/whill/controller/cmd_vel", "type": kind, "ready": True, "zeros": 0, "stops": 0,
+        "hears": [bridge.guard.session]}
+for i in range(6):
+    node.clock.nanoseconds = (i + 1) * 10**8
+    node.deliver("/bridge/guard", humble_stub.String(data=json.dumps(beat)))
+    joystick = 80 if i == 5 else 0
+    node.deliver("/whill/states/model_cr2", humble_stub.ModelCr2State(power_on=1, battery_power=90, joy_side=joystick))
+    node.deliver("/e_stop", humble_stub.Bool(data=False))
+    image = humble_stub.Image(height=8, width=8, encoding="rgb8", step=24, data=bytes([i]) * 192)
+    image.header.stamp = humble_stub.Time(nanosec=(i + 1) * 10**8)
+    node.deliver("/" + options.image_topic, image)
+    node.fire()
+    time.sleep(0.01)
+watch = guard.GuardNode(humble_stub.Node("bridge_guard"), guard.parse_arguments([]))
+watch.node.fire()
+bridge.close()
+sent = [getattr(message, "twist", message) for message in node.publishers["/whill/controller/cmd_vel"].sent]
+print(json.dumps([[message.linear.x, message.angular.z] for message in sent]))
+"""
+
+
+CHAIR = """
+import sys
+import humble_stub
+humble_stub.install()
+from fake_chair import FakeChair
+from bridge import chair
+
+node = humble_stub.Node("bridge_chair")
+clock = [0.0]
+chair.time.monotonic = lambda: clock[0]
+bridge = chair.ChairNode(node, chair.parse_arguments([]))
+fake = FakeChair()
+for i in range(500):
+    fake.command(0.5, 0.3)
+    fake.advance(0.01)
+    if i % 50 == 0:
+        clock[0] = fake.now
+        node.deliver("/whill/states/model_cr2", humble_stub.ModelCr2State(battery_current=0.0, speed_mode_indicator=0,
+                                                                         **vars(fake.state())))
+last = node.publishers["/whill/odom"].sent[-1].pose.pose.position
+print(last.x - fake.x, last.y - fake.y, node.logged)
+"""
+
+
+def run(code, folder, *arguments):
+    """Run a script on the stub; return what it prints."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])}
+    result = subprocess.run([sys.executable, "-c", code, *arguments], env=environment, cwd=folder, capture_output=True,
+                            text=True)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_chair_node_publishes_odometry_and_names_a_slow_driver(tmp_path):
+    x, y, logged = run(CHAIR, tmp_path).split(maxsplit=2)
+    assert abs(float(x)) < 0.3 and abs(float(y)) < 0.3  # the chair has moved on for half a second
+    assert "publish_interval_ms:=20" in logged
+
+
+def test_chair_whose_rider_moves_the_joystick_is_left_to_its_rider(tmp_path):
+    commands = json.loads(run(DRIVE, tmp_path, "--image-topic", "camera", "--whill-state", "whill/states/model_cr2"))
+    assert [0.2, 0.1] in commands and [0.0, 0.0] not in commands  # the last state but one had the joystick moved
+
+
+@pytest.mark.parametrize("topic", ["camera", "camera_of_a_base_with_stamped_commands"])
+def test_nodes_drive_on_the_names_of_humble_alone(tmp_path, topic):
+    commands = json.loads(run(DRIVE, tmp_path, "--image-topic", topic))
+    assert [0.2, 0.1] in commands and commands[-5:] == [[0.0, 0.0]] * 5

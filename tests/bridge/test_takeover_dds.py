@@ -1,0 +1,93 @@
+"""Who drives: a person who takes over wins, a second commander is refused, namespaces keep bridges apart."""
+
+import time
+
+import pytest
+
+
+def test_person_who_takes_over_while_driving_is_never_fought_and_the_bridge_needs_arming_afterwards(graph, policy):
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.start("drive", policy, "--allow-other-commanders")
+    person = graph.peer("joystick")
+    publisher, make = person.commander(0.11)
+    robot.wait_for_status(driving=True)
+    robot.wait_until(lambda robot: robot.moving())
+    timer = person.repeat(publisher, 0.05, make)
+    robot.wait_for_status(state="yielded", reason="another node drives")
+    quiet_since = time.monotonic()
+    time.sleep(1.0)
+    assert {v for t, v, _ in robot.commands if t > quiet_since} == {0.11}  # nothing of the bridge among them
+    timer.cancel()
+    robot.wait_for_status(state="disarmed", reason="another node drove")
+    since = time.monotonic()
+    time.sleep(0.5)
+    assert not [command for command in robot.commands if command[0] > since]  # the WHILL is left to its rider
+    person.arm()
+    robot.wait_for_status(driving=True)
+
+
+def test_single_stray_command_of_another_node_ends_the_drive(graph, policy):
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.start("drive", policy, "--allow-other-commanders")
+    publisher, make = graph.peer("stray").commander(9.0)
+    robot.wait_for_status(driving=True)
+    publisher.publish(make())
+    robot.wait_for_status(state="disarmed", reason="another node drove")
+
+
+def test_base_that_keeps_its_last_command_is_stopped_when_the_other_driver_falls_silent(graph, policy):
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.start("drive", policy, "--allow-other-commanders", "--base", "generic")
+    publisher, make = graph.peer("joystick").commander(0.11)
+    robot.wait_for_status(driving=True)
+    publisher.publish(make())
+    robot.wait_for_status(state="disarmed")
+    robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", ["geometry_msgs/Twist", "geometry_msgs/TwistStamped"])
+def test_commands_come_in_the_type_that_the_base_listens_to(graph, policy, kind):
+    robot = graph.peer("robot")
+    robot.base(kind=kind), robot.camera(), robot.e_stop()
+    graph.start("drive", policy)
+    robot.wait_until(lambda robot: robot.moving())
+
+
+def test_second_commander_that_is_there_before_the_start_is_named_and_nothing_moves(graph, policy):
+    robot = graph.peer("robot")
+    robot.whole()
+    graph.peer("planner").commander(0.0)
+    graph.start("drive", policy)
+    robot.wait_for_status(state="standing", reason="another node publishes commands", causes="/planner")
+    time.sleep(0.5)
+    assert robot.commands == []
+
+
+def test_arming_one_of_two_bridges_in_namespaces_leaves_the_other_disarmed(graph, policy):
+    robot = graph.peer("robot")
+    for side in ("left", "right"):
+        robot.e_stop(f"/{side}/e_stop")
+        robot.base(f"/{side}/whill/controller/cmd_vel")
+        robot.camera(f"/{side}/sensing/camera/front/image_raw")
+        graph.start("drive", policy, "--require-arm", "--ros-args", "-r", f"__ns:=/{side}", key=side)
+    left, right = graph.peer("left_operator"), graph.peer("right_operator")
+    left.watch("/left/bridge/status"), right.watch("/right/bridge/status")
+    for operator in (left, right):
+        operator.wait_for_status(state="disarmed", holds="[]")
+    left.arm("/left/bridge/rearm")
+    left.wait_for_status(driving=True)
+    time.sleep(1.0)
+    assert right.wait_for_status(state="disarmed")["driving"] is False
+
+
+def test_remapped_command_topic_is_followed_by_bridge_and_guard(graph, policy):
+    robot = graph.peer("robot")
+    robot.base("/cmd_vel")
+    robot.camera()
+    robot.e_stop()
+    graph.start("drive", policy, "--ros-args", "-r", "whill/controller/cmd_vel:=/cmd_vel")
+    robot.wait_until(lambda robot: robot.moving())
+    graph.wait_for("drive", "guarding /cmd_vel")

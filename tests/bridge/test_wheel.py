@@ -1,0 +1,108 @@
+"""The robot's own wheel holds all that the robot needs and nothing of the training."""
+
+import configparser
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
+
+import pytest
+import tiny_policy
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built from a copy of the folder alone."""
+    pytest.importorskip("wheel")
+    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT / "bridge", folder / "bridge", ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-build-isolation", "--no-deps", "--no-index",
+                    "--wheel-dir", folder / "out", folder / "bridge"], check=True, cwd=folder)
+    (path,) = (folder / "out").glob("*.whl")
+    return path
+
+
+CLEAN = """
+import importlib, pkgutil, sys
+
+class Forbidden:
+    names = "jax jaxlib flax mujoco optax orbax scipy onnx whill_mjx dreamer sysid benchmarks cv2 matplotlib".split()
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in self.names:
+            raise ModuleNotFoundError(f"{name} is not on the robot")
+
+sys.meta_path.insert(0, Forbidden())
+wheel, policy = sys.argv[1:]
+sys.path.insert(0, wheel)
+import bridge
+assert bridge.__file__.startswith(wheel), bridge.__file__
+for module in pkgutil.iter_modules(bridge.__path__):
+    importlib.import_module(f"bridge.{module.name}")
+assert "rclpy" not in sys.modules
+from bridge.controller import Controller
+from bridge.drive import parse_arguments, safety_config
+from bridge.policy import Policy
+loaded = Policy.load(policy)
+controller = Controller(loaded, safety_config(loaded, parse_arguments([policy])))
+commands = [controller.on_image(i / 10, i / 10, 0.0, 64, 64, "rgb8", 192, bytes([200 + i]) * 12288) for i in range(5)]
+assert commands[-1].v > 0.1 and commands[-1].reason == "", commands
+"""
+
+
+def test_wheel_drives_where_nothing_of_the_training_can_be_imported(wheel, tmp_path):
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "installed")
+    policy = tiny_policy.write(tmp_path / "tiny")
+    result = subprocess.run([sys.executable, "-I", "-c", CLEAN, tmp_path / "installed", policy], cwd=tmp_path,
+                            capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+def test_wheel_is_pure_python_3_10_with_two_dependencies_and_carries_the_files_of_ros(wheel):
+    assert wheel.name.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        (metadata,) = [archive.read(name).decode() for name in names if name.endswith("/METADATA")]
+        (entries,) = [archive.read(name).decode() for name in names if name.endswith("/entry_points.txt")]
+    required = {line.split(": ")[1] for line in metadata.splitlines() if line.startswith("Requires-Dist")}
+    assert {name for name in required if "extra" not in name} == {"numpy", "onnxruntime"}
+    assert "Requires-Python: >=3.10" in metadata
+    assert {"bridge_drive", "bridge_guard", "bridge_record"} <= {line.split(" =")[0] for line in entries.splitlines()}
+    for end in ("bridge/fastdds.xml", "whill_bridge/package.xml", "drive.launch.py", "whill.yaml",
+                "whill-bridge.service", "resource_index/packages/whill_bridge"):
+        assert any(name.endswith(end) for name in names), end
+    assert "bridge/setup.py" not in names and "bridge/safety.py" in names
+
+
+def test_ament_package_and_wheel_agree_on_name_version_and_licence():
+    package = ElementTree.parse(ROOT / "bridge" / "package.xml").getroot()
+    config = configparser.ConfigParser()
+    config.read(ROOT / "bridge" / "setup.cfg")
+    text = {name: package.findtext(name) for name in ("name", "version", "license")}
+    assert text == {"name": config["metadata"]["name"].replace("-", "_"), "version": config["metadata"]["version"],
+                    "license": config["metadata"]["license"]}
+    assert package.findtext("export/build_type") == "ament_python"
+    assert config["install"]["install_scripts"] == f"$base/lib/{text['name']}"  # where `ros2 run` looks
+
+
+def test_parameter_file_of_the_package_holds_options_of_the_node_only():
+    pytest.importorskip("yaml")
+    from bridge.drive import parse_arguments
+    from bridge.parameters import as_options
+
+    file = ROOT / "bridge" / "config" / "whill.yaml"
+    options = parse_arguments(as_options(["--ros-args", "--params-file", str(file)], "bridge_drive", "policy"))
+    assert options.require_arm and options.resume == "arm" and options.e_stop == "require" and options.base == "whill"
+
+
+@pytest.mark.parametrize("name", ["drive", "twist_mux"])
+def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
+    from bridge import ros
+
+    text = (ROOT / "bridge" / "launch" / f"{name}.launch.py").read_text(encoding="utf-8")
+    compile(text, name, "exec")
+    assert 'package="whill_bridge", executable="bridge_drive"' in text and f'"{ros.COMMAND_TOPIC}"' in text
