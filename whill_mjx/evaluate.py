@@ -24,6 +24,7 @@ from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, 
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
 from whill_mjx.evaluation.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
+from whill_mjx.heartbeat import say
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 
@@ -121,14 +122,13 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
             "drivers": summaries,
             "sweeps": [result.plain() for result in results],
         }
-        pictures, videos = draw(options, task, course(), drivers[main_name], driven, main_name, results)
+        pictures, videos = draw(options, task, course(), driven, main_name, results)
     evaluation["seconds"] = time.perf_counter() - began
     write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
     if options.html:
         from whill_mjx.evaluation.pages import page
 
-        title = f"{options.policy} on {evaluation['task']['name']}"
-        page(title, evaluation, pictures, videos, options.out / "pages.html")
+        say(f"report: {page(evaluation, pictures, videos, options.out / 'report.html')}")
     say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
     return evaluation
 
@@ -227,7 +227,7 @@ def headline(name: str, summary: dict[str, Any]) -> str:
 
 
 def draw(
-    options: EvaluateOptions, task: Task, course: Course, driver: Driver, driven: dict[str, Episodes], main_name: str,
+    options: EvaluateOptions, task: Task, course: Course, driven: dict[str, Episodes], main_name: str,
     sweeps: list[Sweep],
 ) -> tuple[list[Path], list[Path]]:  # fmt: skip
     """Write pictures and videos; what cannot be written for want of a package is left out and said."""
@@ -251,8 +251,8 @@ def draw(
             jobs[f"paths_{label}.png"] = lambda path, sweep=sweep: pages.sweep_paths(sweep, path, radius)
     if len(failed) and options.videos:
         def failures(path: Path) -> None:
-            shown = np.asarray(failed[: options.videos])
-            pages.episode_video(*course.film(driver, episodes.keys[shown]), path, rate)
+            shown = episodes.some(failed[: options.videos])
+            pages.episode_video(shown, *course.film(shown), path, rate)
 
         jobs["failures.mp4"] = failures
     written = []
@@ -263,11 +263,6 @@ def draw(
         except ImportError as error:
             say(f"{name} is left out: {error}. Install the base package to draw it.")
     return [path for path in written if path.suffix == ".png"], [path for path in written if path.suffix == ".mp4"]
-
-
-def say(text: str) -> None:
-    """Tell the user how far the evaluation is."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
-from sysid.pages.html import Section
 from sysid.pages.series import TrialSeries
+from whill_mjx.html import Section
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -95,8 +95,8 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         sections: more sections, shown first.
     """
     from sysid.pages.fit_page import fit_sections
-    from sysid.pages.html import html_page
     from sysid.pages.series import FILE, load, replay
+    from whill_mjx.html import html_page
 
     run = Path(run)
     report = read_report(run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dreamer import checkpoint, parallel
+from whill_mjx.heartbeat import say
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import write_json
 
@@ -84,8 +84,3 @@ class Stopper:
             write_json(self._out / "stopped.json", {"env_steps": line["env_steps"], "success": self._success})
         say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
         return True
-
-
-def say(text: str) -> None:
-    """Tell the user how far the run is."""
-    print(text, file=sys.stderr, flush=True)

@@ -13,8 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from dreamer import checkpoint
+from dreamer.progress import Progress
 from whill_mjx.folders import write_whole
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
+
+SHOWN = ("success", "return")
+"""Figures of an evaluation in the progress bar."""
 
 
 def train_ppo(
@@ -29,6 +33,8 @@ def train_ppo(
     say: Callable[[str], None] = lambda text: None,
     eval_ahead: bool = False,
     checkpoint_every_s: float = 60.0,
+    announce: Callable[[str], None] = lambda text: None,
+    progress: bool = False,
 ) -> tuple[Any, int, int, float]:
     """Train until `total_steps` environment steps, summed over instances, are done, or until `stop` says so.
 
@@ -47,6 +53,8 @@ def train_ppo(
         eval_ahead: call `eval_fn` once in a thread at the start, so that it is compiled beside the run's own program.
             Not with several devices.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
+        announce: gets a line when something begins that takes long.
+        progress: show a bar on stderr.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
@@ -54,6 +62,7 @@ def train_ppo(
     out.mkdir(parents=True, exist_ok=True)
     each, updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
     iterations = -(-total_steps // each)
+    announce("compiling the training program, usually 1 to 2 minutes")
     state, wall_before = _first_state(env, config, out, iterations, seed)
     done, began = int(state.updates), time.monotonic()
     _keep_lines(out / "metrics.jsonl", done * each)
@@ -78,14 +87,19 @@ def train_ppo(
         say(f"{done * each} steps: " + ", ".join(f"{name} {line[name]:.3g}" for name in line if "eval/" in name))
         return line
 
-    stopped = False
+    stopped, running, bar = False, None, Progress(iterations * each, done * each, progress)
     try:
         while done < iterations and not stopped:
             state, metrics = run(state)
             done += 1
+            if progress:
+                jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
+                bar.show(done * each, {})
+            running = metrics
             if done == iterations or done * each // eval_every > evaluated_at:
                 evaluated_at = done * each // eval_every
                 line = evaluated(metrics)
+                bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
                 stopped = stop is not None and stop(line)
             if done == iterations or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
                 save()
@@ -93,6 +107,8 @@ def train_ppo(
     except KeyboardInterrupt:
         checkpoint.save_if_whole(save, state)
         raise
+    finally:
+        bar.close()
     return state.params, done * each, done * updates_each, wall_s()
 
 
