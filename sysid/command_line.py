@@ -27,10 +27,10 @@ def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Pro
     """A bar with rate and remaining time, and the function that closes it."""
     from tqdm import tqdm
 
-    bar: Any = tqdm(total=total, desc=what, unit=unit)
+    bar: Any = tqdm(total=total, desc=what, unit=unit, dynamic_ncols=True)
 
     def advance(count: int, remark: str) -> None:
-        bar.set_postfix_str(remark, refresh=False)
+        bar.set_postfix_str(remark, refresh=count == 0)
         bar.update(min(count, max(bar.total - bar.n, 0)))
 
     return advance, bar.close

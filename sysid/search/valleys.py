@@ -12,10 +12,11 @@ from functools import partial
 
 import numpy as np
 
+from sysid.errors.bin_objective import FeatureObjective
 from sysid.errors.pose_objective import Told
 from sysid.errors.space import Space
 from sysid.search import least_squares, slopes
-from sysid.search.result import FitResult, Progress
+from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
@@ -31,7 +32,7 @@ WORTH = 0.001  # share of the cost that another valley must save for the floor t
 
 def gradient_search(
     objective: Told, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
-    progress: Progress | None,
+    stages: Stages | None,
 ) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
@@ -44,6 +45,9 @@ def gradient_search(
     Nothing of this is done without `config.elsewhere`.
     """
 
+    binned = isinstance(objective, FeatureObjective)
+    progress = stages.begin("motion in bins" if binned else "whole poses to the end") if stages else None
+
     def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
         return from_all(objective, space, starts, iterations, config.robust, progress)
 
@@ -54,6 +58,7 @@ def gradient_search(
 
     result = search(objective, starts, iterations)
     objective, result = renew(objective, result, result.starts)
+    progress = stages.begin("checks from other starts") if stages else None
     follow = partial(search, objective)
     if config.elsewhere:
         result = _from_ends(follow, objective, result, iterations, config.robust)
