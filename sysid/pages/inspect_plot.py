@@ -34,6 +34,7 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     _intervals(left, log)
     _velocities(right, log)
     _liveliest(middle.subplots(), log)
+    lower.suptitle("Standard deviation between replicates: no model can predict better", fontsize=11)
     _spread(lower.subplots(1, len(UNITS), sharey=True), found)
     figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,17 +47,20 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
 
 def _intervals(axis: Any, log: Log) -> None:
     """Distribution of the intervals between samples."""
-    for name in COLOURS:
+    from matplotlib import ticker
+
+    for name, style in zip(COLOURS, ("-", "-", "--"), strict=True):
         streams = [getattr(trial, name) for trial in log.trials]
         steps = [np.diff(stream.t) for stream in streams if stream is not None and len(stream.t) > 1]
         if steps:
             ordered = np.sort(np.concatenate(steps)) * 1e3
-            axis.plot(ordered, np.linspace(0, 1, len(ordered)), color=COLOURS[name], label=LABELS[name])
+            axis.plot(ordered, np.linspace(0, 1, len(ordered)), style, color=COLOURS[name], label=LABELS[name])
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     axis.set_xlim(low / 3, high * 3)
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter("")
+    axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
+    axis.xaxis.set_minor_formatter("{x:g}")
     axis.set_xlabel("interval between samples [ms]")
     axis.set_ylabel("share of intervals below")
     axis.set_title("Sampling: an upright line is regular")
@@ -116,7 +120,7 @@ def _spread(panels: Sequence[Any], found: dict[str, Any]) -> None:
     labels = [group["trials"][0].rsplit("_", 1)[0] for group in groups]
     for axis, (unit, quantities) in zip(panels, UNITS.items(), strict=True):
         mine = [name for name in names if name.partition(".")[2] in quantities]
-        axis.set_title(f"Spread of replicates [{unit}]", fontsize=10)
+        axis.set_title(f"{' and '.join(quantities)} [{unit}]", fontsize=9)
         if not mine:
             axis.text(0.5, 0.5, "no replicates" if not groups else "not measured", ha="center", va="center",
                       transform=axis.transAxes)
@@ -127,10 +131,9 @@ def _spread(panels: Sequence[Any], found: dict[str, Any]) -> None:
             axis.plot([group["spread"].get(name, np.nan) for group in groups], range(len(groups)), mark,
                       markersize=5, color=COLOURS.get(channel, "black"), alpha=0.8,
                       label=f"{name.partition('.')[2]}, {LABELS.get(channel, channel)}")
-        axis.set_xlim(left=0.0)
+        axis.set_xlim(0.0, 1.1 * axis.get_xlim()[1])
         axis.set_ylim(len(groups) - 0.5, -0.5)
         axis.set_yticks(range(len(groups)), labels, fontsize=8)
-        axis.set_xlabel(f"standard deviation [{unit}]", fontsize=8)
         axis.tick_params(axis="x", labelsize=7)
-        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.32), ncols=2, frameon=False)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.2), ncols=2, frameon=False)
         axis.grid(alpha=0.3)
