@@ -5,7 +5,7 @@ RUN ?= runs/train
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick lint clean
+.PHONY: train test test-quick test-long lint clean
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -32,6 +32,10 @@ test: $(VENV)/.installed-dev
 
 test-quick: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick
+
+# Damage, kills and full disks in numbers: an hour or more.
+test-long: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -q -m long
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .

@@ -29,7 +29,6 @@ from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
-from whill_mjx.evaluation.policy_file import RUN_FILE
 from whill_mjx.learning.checks import mean_figures
 from whill_mjx.learning.setup import (
     TRUTH,
@@ -43,9 +42,9 @@ from whill_mjx.learning.setup import (
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.train import (
     TrainOptions,
+    begin,
     choose_preset,
     main,
-    prepare_vehicle,
     preset_name,
     train_baseline,
     train_policy,
@@ -89,10 +88,9 @@ def run(options: argparse.Namespace) -> None:
 def train_alone(asked: TrainOptions) -> dict[str, Any]:
     """The training without what the main command does after it: its last evaluation stands for the final one."""
     preset = choose_preset(asked)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    write_json(asked.out / RUN_FILE, {"command": plain(asked), "preset": plain(preset)})
     train_it = train_policy if asked.learner == "dreamer" else train_baseline
-    train_it(asked, preset, prepare_vehicle(asked))
+    with begin(asked, preset) as vehicle:
+        train_it(asked, preset, vehicle)
     lines = [json.loads(line) for line in (asked.out / "metrics.jsonl").read_text().splitlines()]
     return {"learner": asked.learner, "seed": asked.seed, **last_evaluation(asked.out, plain(preset), lines)}
 

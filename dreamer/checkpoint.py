@@ -12,7 +12,6 @@ import os
 import shutil
 import warnings
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -87,10 +86,9 @@ def save(
     return target
 
 
-def save_if_whole(save: Callable[[], Any], state: Any) -> None:
-    """Save an interrupted run, unless the interrupt came while its arrays were being replaced by the next ones."""
-    if not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in jax.tree.leaves(state)):
-        save()
+def is_whole(state: Any) -> bool:
+    """Whether all arrays of an interrupted run are there: an interrupt may come while the next ones replace them."""
+    return not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in jax.tree.leaves(state))
 
 
 def _remove_unfinished(folder: Path) -> None:

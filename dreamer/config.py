@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -171,6 +172,18 @@ class DreamerConfig:
     """Steps of the recurrences unrolled into one loop body: more is faster on a GPU, 1 is best on a CPU."""
 
     def __post_init__(self) -> None:
+        numbers = {field.name: value for field in dataclasses.fields(self)
+                   if isinstance(value := getattr(self, field.name), (int, float))}  # fmt: skip
+        sizes = ("deter", "hidden", "units", "stoch", "blocks", "depth", "patch", "patch_units", "bins", "batch_size",
+                 "replay_capacity", "imag_horizon", "scan_unroll")  # fmt: skip
+        general = [
+            *((math.isfinite(value) and value >= 0, name, "must be finite and not negative")
+              for name, value in numbers.items()),
+            *((numbers[name] >= 1, name, "must be at least 1") for name in sizes),
+            *((numbers[name] > 0, name, "must be positive") for name in ("lr", "horizon", "min_std", "max_std")),
+        ]  # fmt: skip
+        for ok, field, rule in general:
+            self._require(ok, field, rule)
         rules = (
             (self.deter % self.blocks == 0, "deter", f"must be divisible by blocks ({self.blocks})"),
             (self.bins % 2 == 1, "bins", "must be odd: the middle bin is zero"),
@@ -205,8 +218,11 @@ class DreamerConfig:
             (self.kernel == 5, "kernel", "must be 5: the 2x2-block form of the convolutions is written for it"),
         )
         for ok, field, rule in rules:
-            if not ok:
-                raise ValueError(f"DreamerConfig.{field} = {getattr(self, field)!r}: it {rule}. Change {field}.")
+            self._require(ok, field, rule)
+
+    def _require(self, ok: bool, field: str, rule: str) -> None:
+        if not ok:
+            raise ValueError(f"DreamerConfig.{field} = {getattr(self, field)!r}: it {rule}. Change {field}.")
 
     @property
     def dtype(self) -> DTypeLike:

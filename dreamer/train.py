@@ -237,15 +237,18 @@ def train(
                 figures = eval_fn(params, line["env_steps"])
                 line |= {f"eval/{name}": float(value) for name, value in figures.items()}
                 bar.note(_evaluated(figures))
-            waiting.pop(0)
             log.write(line)
+            waiting.pop(0)  # interrupted just before, the line is written twice and read once
             stops = stops or (params is not None and stop is not None and stop(line))
         return stops
 
     waiting: list[tuple[dict[str, Any], Params | None]] = []
     logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
     stopped, iterations = False, 0
+    missing = env_steps // eval_every > log.evaluated_at // eval_every or env_steps >= total_steps > log.evaluated_at
     try:
+        if eval_fn is not None and counted and env_steps and parallel.agree(missing):
+            stopped = write_log(state, True, at_once=True)  # it was interrupted between a step and its evaluation
         while (env_steps < total_steps or not counted) and not stopped:
             state, metrics = iterate(state)
             begins = False
@@ -276,11 +279,11 @@ def train(
                 counted = True
                 iterate = iterate if finished or stopped else compiled(train_iteration)
     except KeyboardInterrupt:
-        if jax.process_count() == 1:  # the other processes may not be there to take part
+        if jax.process_count() == 1 and checkpoint.is_whole(state):  # other processes may not be there to take part
             try:
                 write_waiting(at_once=True)
             finally:  # interrupted again, say
-                checkpoint.save_if_whole(lambda: save_state(out, state, config, wall_s()), state)
+                save_state(out, state, config, wall_s())
         raise
     finally:
         bar.close()
@@ -409,6 +412,8 @@ class _Log:
         self._path, self._on_metrics, self._config = path, on_metrics, config
         self._board = Board(path.parent, place) if tensorboard and parallel.is_first_process() else None
         self.last: dict[str, float] = {}
+        self.evaluated_at = 0
+        """Steps at the last evaluation so far."""
         kept: list[str] = []
         if not parallel.is_first_process():
             return
@@ -417,9 +422,11 @@ class _Log:
                 line = json.loads(text)
             except ValueError:
                 continue  # cut off by the kill
-            if pretrain.position(config, line) <= place:
+            if pretrain.position(config, line) <= place and text not in kept[-1:]:
                 kept.append(text)
                 self.last = line
+                if any(name.startswith("eval/") for name in line):
+                    self.evaluated_at = line["env_steps"]
         _write_atomically(path, "".join(text + "\n" for text in kept))
 
     def write(self, line: dict[str, float]) -> None:

@@ -67,8 +67,8 @@ class Range:
         return low and (value < self.high if self.below else value <= self.high)
 
     def __str__(self) -> str:
-        low = f"{'above' if self.above else 'at least'} {self.low:g}" if math.isfinite(self.low) else ""
-        high = f"{'below' if self.below else 'at most'} {self.high:g}" if math.isfinite(self.high) else ""
+        low = f"{'above' if self.above else 'at least'} {self.low}" if math.isfinite(self.low) else ""
+        high = f"{'below' if self.below else 'at most'} {self.high}" if math.isfinite(self.high) else ""
         return " and ".join(part for part in (low, high) if part) or "a finite number"
 
 
@@ -143,7 +143,7 @@ def run(
     _State.working, _State.stopped = True, stopped
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
     try:
-        chosen: Any = tyro.cli(options, description=description, config=config, args=args)
+        chosen: Any = tyro.cli(options, prog=program(), description=description, config=config, args=args)
         check_options(chosen)
         main(chosen)
         sys.stdout.flush()
@@ -163,6 +163,12 @@ def run(
     finally:
         _State.working = False
         _stop_listening()
+
+
+def program() -> str:
+    """This command as it is typed: `python -m MODULE`, or the name of the console script."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return f"python -m {spec.name.removesuffix('.__main__')}" if spec else os.path.basename(sys.argv[0])
 
 
 def one_line(error: BaseException) -> str:

@@ -13,18 +13,22 @@ the planted truth.
 from __future__ import annotations
 
 import math
-import os
-import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
+
+from whill_mjx.command_line import SEED, OptionError, Range, listen, refusing, run
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.folders import check_place, new_folder
 from whill_mjx.logs.dataset import (
     COMMAND_HEADER,
     write_csv,
@@ -60,7 +64,7 @@ class DriveOptions:
     """Built-in vehicle, or a vehicle file."""
     effects: tuple[str, ...] = ()
     """Effects to add to the vehicle, or to change: NAME or NAME:PARAMETER=VALUE,..."""
-    replicates: int = 1
+    replicates: Annotated[int, Range(1, 10_000)] = 1
     """Drives of each manoeuvre: the same commands from another pose, with other noise."""
     noise: bool = False
     """Add white noise to the measurements."""
@@ -70,7 +74,7 @@ class DriveOptions:
     """Rates and latencies of the measurements."""
     held_out: tuple[str, ...] = ()
     """Manoeuvres that the dataset declares as never to be fitted."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of start poses and noise."""
     scenario: Scenario = field(default_factory=Scenario)
     """How hard the manoeuvres are driven."""
@@ -83,10 +87,11 @@ def main(options: DriveOptions) -> Path:
         ValueError, FileNotFoundError: naming the option, its value, the rule and the remedy.
     """
     names = tuple(MANOEUVRES) if options.manoeuvre == ("all",) else options.manoeuvre
-    commands = [command_table(name, options.scenario) for name in names]
-    _check(options, names)
-    spec, params = find_vehicle(options.vehicle)
-    params = with_effects(params, options.effects)
+    with refusing():
+        commands = [command_table(name, options.scenario) for name in names]
+        _check(options, names)
+        spec, params = find_vehicle(options.vehicle)
+        params = with_effects(params, options.effects)
     random = np.random.default_rng(options.seed)
     trials = [
         (f"{name}_{replicate}", command, (*random.uniform(-1.0, 1.0, 2), random.uniform(-np.pi, np.pi)))
@@ -100,8 +105,7 @@ def main(options: DriveOptions) -> Path:
             f"vehicle {options.vehicle!r} with effects {' '.join(options.effects) or 'none'}: the motion became "
             f"non-finite in {lost}. Bring the effects' values closer to those in docs/effects.md."
         )
-    partial = options.out.with_name(f".{options.out.name}.partial-{os.getpid()}")
-    try:
+    with new_folder(options.out) as partial:
         noise = options.noise_levels if options.noise else None
         for index, (name, command, _) in enumerate(trials):
             motion = {sensor: motions[sensor][index] for sensor in motions}
@@ -109,9 +113,6 @@ def main(options: DriveOptions) -> Path:
         write_fields(partial, spec, [name for name, _, _ in trials if name.rsplit("_", 1)[0] in options.held_out])
         truth = {"vehicle": options.vehicle, "effects": " ".join(options.effects), "seed": options.seed}
         save_vehicle(partial / "vehicle.toml", spec, params, provenance=truth)
-        os.replace(partial, options.out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return options.out
 
 
@@ -255,20 +256,20 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     if absent:
         raise ValueError(f"--held-out {absent[0]}: not among the manoeuvres driven ({', '.join(names)}). Add it there.")
     if options.out.exists():
-        raise ValueError(f"--out {options.out}: exists already; a drive never replaces another. Choose another folder.")
+        raise OptionError(f"--out {options.out}: exists already; a drive replaces nothing. Choose another folder.")
+    check_place("--out", options.out)
+
+
+def drive(options: DriveOptions) -> None:
+    """Drive, and say what to do with the dataset."""
+    folder = main(options)
+    count = len(list((folder / "trials").iterdir()))
+    print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
 
 
 def cli() -> None:
     """Command line."""
-    import tyro
-
-    chosen = tyro.cli(DriveOptions)
-    try:
-        folder = main(chosen)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"whill_mjx.drive: {error}")
-    count = len(list((folder / "trials").iterdir()))
-    print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
+    run(DriveOptions, drive, __doc__, positional=False)
 
 
 if __name__ == "__main__":

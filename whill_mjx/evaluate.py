@@ -8,12 +8,17 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
-import json
-import sys
+import math
 import time
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
+
+from whill_mjx.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 import numpy as np
@@ -23,12 +28,16 @@ from whill_mjx.env import make_env
 from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
-from whill_mjx.evaluation.sweeps import STANDARD, Sweep, parse_sweep, run_sweep
-from whill_mjx.heartbeat import say
+from whill_mjx.evaluation.policy_world import find_policy, trained_fields
+from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
+from whill_mjx.folders import claim_folder
+from whill_mjx.heartbeat import Heartbeat, say
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 
 SCRIPTED = ("planner", "random")
+KIND = "whill_mjx.evaluate"
+OUTPUTS = ("report.html", "paths.png", "failures.png", "failures.mp4")
 
 
 @dataclass(frozen=True)
@@ -36,22 +45,22 @@ class EvaluateOptions:
     """Options of the command."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Folder of an exported policy, or "planner" or "random"."""
+    """Folder of an exported policy or of its training, or "planner" or "random"."""
     task: str | None = None
     """obstacle_course or corridor; none takes the one that the policy was trained for."""
-    episodes: int = 200
+    episodes: Annotated[int, Range(1, 1_000_000)] = 200
     """Episodes of each driver."""
     out: Path = Path("runs/evaluation")
     """Folder for everything that is written."""
     vehicle: str | None = None
     """Vehicle file or preset; none takes the one inside the policy file, else the built-in chair."""
-    layout: Literal["randomised", "fixed"] = "randomised"
-    """A new world in each episode, or always the same one."""
+    layout: Literal["randomised", "fixed"] | None = None
+    """A new world in each episode, or always the same one; none takes that of the training, else randomised."""
     set: tuple[str, ...] = ()
     """Fields of the task, such as gates=1; those that the policy was trained with are found beside it."""
     looks: Literal["task", "on", "off"] = "task"
     """Random colours, light and photometric changes; task leaves it to the task."""
-    spread: float = 0.0
+    spread: Annotated[float, Range(0, 1, below=True)] = 0.0
     """Relative spread of the vehicle's parameters from episode to episode."""
     baselines: tuple[str, ...] = ()
     """Also drive the same episodes with planner, random, or another policy as NAME=FOLDER."""
@@ -59,60 +68,97 @@ class EvaluateOptions:
     """Proofs of sight: black images, the first image frozen, actions of another episode replayed."""
     sweep: tuple[str, ...] = ()
     """Grids such as "obstacle_x=2,3 obstacle_y=-0.4:0.4:5"; "standard" stands for those of the task."""
-    sweep_episodes: int = 50
+    sweep_episodes: Annotated[int, Range(1, 1_000_000)] = 50
     """Episodes in each cell of a grid."""
-    videos: int = 4
+    videos: Annotated[int, NOT_NEGATIVE] = 4
     """Failures shown as video, at most."""
     html: bool = False
     """Also write one page with everything."""
-    near: float = NEAR_M
+    near: Annotated[float, NOT_NEGATIVE] = NEAR_M
     """Distance below which there is a near miss [m]."""
-    seed: int = 2_000_003
+    seed: Annotated[int, SEED] = 2_000_003
     """Of the episodes; training and its own evaluations use others."""
-    batch: int = 1000
+    batch: Annotated[int, Range(1, 1_000_000)] = 1000
     """Episodes at a time."""
     runtime: Literal["jax", "onnxruntime"] = "jax"
     """Who computes the policy: compiled with the simulator, or the vehicle's runtime, slowly."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What an evaluation drives, read and checked."""
+
+    options: EvaluateOptions
+    task: Task
+    policy: PolicyFile | None
+    sweeps: list[tuple[Axis, ...]]
+    courses: dict[str | None, Course] = field(default_factory=dict)
+    drivers: dict[str, Driver] = field(default_factory=dict)
+
+    @property
+    def main_name(self) -> str:
+        """Name of the driver that is evaluated; the others are its baselines."""
+        return self.options.policy if self.policy is None else "policy"
+
+    def course(self, vehicle: str | None = None) -> Course:
+        """The course with a vehicle, made once; None is the evaluation's own."""
+        if vehicle not in self.courses:
+            self.courses[vehicle] = make_course(self.options, self.task, self.policy, vehicle)
+        return self.courses[vehicle]
+
+    def driver(self, course: Course) -> Driver:
+        """The evaluated driver on a course."""
+        return make_driver(self.options.policy, self.policy, course, self.options)
+
+
 def main(options: EvaluateOptions) -> dict[str, Any]:
     """Evaluate and return what is written to evaluation.json."""
     began = time.perf_counter()
+    with refusing():
+        plan = make_plan(options)
+    with claim_folder(options.out, KIND, OUTPUTS) as claim:
+        claim.settle({})  # an evaluation replaces an earlier one as a whole
+        with Heartbeat() as heartbeat:
+            return evaluate(plan, began, heartbeat.stage)
+
+
+def make_plan(options: EvaluateOptions) -> Plan:
+    """Read and check everything that an evaluation needs before it drives or writes."""
     if options.episodes < 1 or options.sweep_episodes < 1 or options.batch < 1:
         raise ValueError("episodes, sweep_episodes and batch must each be at least 1.")
-    policy = None if options.policy in SCRIPTED else load_policy(options.policy, options.runtime)
+    policy = None if options.policy in SCRIPTED else load_policy(find_policy(options.policy), options.runtime)
     task = choose_task(options, policy)
-    sweeps = [parse_sweep(text) for text in chosen_sweeps(options, task)]
+    plan = Plan(options, task, policy, [parse_sweep(text) for text in chosen_sweeps(options, task)])
     others = dict(_named(text) for text in options.baselines)
-    courses: dict[str | None, Course] = {}
-
-    def course(vehicle: str | None = None) -> Course:
-        if vehicle not in courses:
-            courses[vehicle] = make_course(options, task, policy, vehicle)
-        return courses[vehicle]
-
-    main_name = options.policy if policy is None else "policy"
-
-    def drives(here: Course) -> Driver:
-        return make_driver(options.policy, policy, here, options)
-
-    drivers = {main_name: drives(course())}
+    plan.drivers[plan.main_name] = plan.driver(plan.course())
     for name, source in others.items():
-        drivers[name] = make_driver(source, None, course(), options)
-    options.out.mkdir(parents=True, exist_ok=True)
+        plan.drivers[name] = make_driver(source, None, plan.course(), options)
+    for axis in (axis for axes in plan.sweeps for axis in axes if axis.name == "vehicle"):
+        for vehicle in axis.values:
+            plan.course(vehicle)
+    return plan
+
+
+def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> dict[str, Any]:
+    """Drive everything and write the results to the claimed folder; `stage` gets a line when a part begins."""
+    options, task, policy, main_name, course = plan.options, plan.task, plan.policy, plan.main_name, plan.course
     keys = episode_keys(options.seed, options.episodes)
     with jax.default_matmul_precision("highest"):  # float32, as on the vehicle; a GPU would round to fewer bits
-        driven = {name: _drive(course(), driver, keys) for name, driver in drivers.items()}
+        driven = {}
+        for name, driver in plan.drivers.items():
+            stage(f"{name}: driving {len(keys)} episodes")
+            driven[name] = _drive(course(), driver, keys)
         for blind in dict.fromkeys(options.blind):
-            driven[f"{main_name} {blind}"] = course().blinded(drivers[main_name], keys, blind, driven[main_name])
+            stage(f"{main_name} without sight ({blind}): driving {len(keys)} episodes")
+            driven[f"{main_name} {blind}"] = course().blinded(plan.drivers[main_name], keys, blind, driven[main_name])
         summaries = {name: summarise(episodes, options.near) for name, episodes in driven.items()}
         for name, summary in summaries.items():
             say(headline(name, summary))
         results: list[Sweep] = []
-        for axes in sweeps:
-            say(f"sweep over {' and '.join(axis.name for axis in axes)}")
+        for axes in plan.sweeps:
+            stage(f"sweep over {' and '.join(axis.name for axis in axes)}")
             cell_keys = episode_keys(options.seed, options.sweep_episodes)
-            results.append(run_sweep(axes, cell_keys, course, drives))
+            results.append(run_sweep(axes, cell_keys, course, plan.driver))
         evaluation = {
             "policy": options.policy,
             "sha256": policy.sha256 if policy else None,
@@ -122,6 +168,8 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
             "drivers": summaries,
             "sweeps": [result.plain() for result in results],
         }
+        write_json(options.out / "evaluation.json", evaluation, allow_nan=False)  # kept, whatever becomes of pictures
+        stage("drawing pictures and videos")
         pictures, videos = draw(options, task, course(), driven, main_name, results)
     evaluation["seconds"] = time.perf_counter() - began
     write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
@@ -140,15 +188,13 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     there is one for the same task.
     """
     name = options.task or (policy.task if policy else "obstacle_course")
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r} (known: {', '.join(TASKS)}). Give one with --task.")
+    check_known("--task", name, TASKS)
     known: dict[str, Any] = {field.name: field.default for field in fields(TASKS[name])}
     changes: dict[str, Any] = {}
-    run = policy.path.parent / RUN_FILE if policy else None
-    if policy and run and run.is_file() and policy.task == name:
-        saved = json.loads(run.read_text())["preset"]["task"]
-        changes = {field: tuple(v) if isinstance(v, list) else v for field, v in saved.items() if field in known}
-        say(f"task: fields from {run}")
+    if policy and policy.task == name:
+        changes = trained_fields(policy.path, name)
+        if changes:
+            say(f"task: {name}, as in the training ({policy.path.parent / RUN_FILE})")
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}
@@ -157,17 +203,23 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
         if field not in known:
             raise ValueError(f"--set {text}: task {name!r} has no field {field!r} (known: {', '.join(sorted(known))}).")
         changes[field] = _parse(value, known[field], text)
-    return make_task(name, **{**changes, "layout": options.layout})
+    if options.layout is not None:
+        changes["layout"] = options.layout
+    return make_task(name, **changes)
 
 
 def _parse(text: str, like: Any, whole: str) -> Any:
     """A field's value from text, of the same type as its default."""
     try:
-        if isinstance(like, tuple):
-            return tuple(float(part) for part in text.split(","))
-        return type(like)(text)
+        parts = tuple(float(part) for part in text.split(",")) if isinstance(like, tuple) else ()
+        value = parts or type(like)(text)
     except ValueError as error:
-        raise ValueError(f"--set {whole}: {text!r} is no {type(like).__name__}. Correct it.") from error
+        raise OptionError(f"--set {whole}: {text!r} is no {type(like).__name__}. Correct it.") from error
+    if parts and len(parts) != len(like):
+        raise OptionError(f"--set {whole}: {len(parts)} numbers where {len(like)} are needed. Correct it.")
+    if not all(math.isfinite(one) for one in parts or (value,) if isinstance(one, float)):
+        raise OptionError(f"--set {whole}: must be finite. Correct it.")
+    return value
 
 
 def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:
@@ -197,7 +249,7 @@ def make_driver(source: str, policy: PolicyFile | None, course: Course, options:
         return planner_driver(course.env)
     if source == "random":
         return random_driver(course.env.task.action_repeat)
-    policy = policy or load_policy(source, options.runtime)
+    policy = policy or load_policy(find_policy(source), options.runtime)
     task, size = course.env.task, (course.env.height, course.env.width)
     if (policy.height, policy.width) != size:
         raise ValueError(f"{policy.path}: takes images of {policy.height} x {policy.width}, not {size[0]} x {size[1]}.")
@@ -277,10 +329,7 @@ def _named(text: str) -> tuple[str, str]:
 
 def cli() -> None:
     """Command line."""
-    try:
-        main(tyro.cli(EvaluateOptions, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    run(EvaluateOptions, main, __doc__, positional=False)
 
 
 if __name__ == "__main__":

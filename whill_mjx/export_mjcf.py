@@ -24,12 +24,14 @@ by about half a step's change of speed. The file's integrator and timestep are p
 from __future__ import annotations
 
 import math
-import os
-import shutil
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from whill_mjx.command_line import Range, listen, refusing, run
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +39,7 @@ import mujoco
 import numpy as np
 
 from whill_mjx.effects.base import apply_chain
+from whill_mjx.folders import new_folder
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import advance_odometry, forces, mass_distribution, nominal_world, place, substep
 from whill_mjx.vehicle.kinematics import reference_pose
@@ -182,17 +185,10 @@ def vehicle_mjcf(spec: VehicleSpec, params: VehicleParams, physics_dt: float = 0
 
 def export(spec: VehicleSpec, params: VehicleParams, out: Path, physics_dt: float = 0.005) -> Path:
     """Write the folder `out`, whole or not at all; it must not exist."""
-    if out.exists():
-        raise ValueError(f"--out {out}: exists already. Choose another folder.")
-    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
-    try:
-        partial.mkdir(parents=True)
+    with new_folder(out) as partial:
         (partial / "vehicle.xml").write_text(vehicle_mjcf(spec, params, physics_dt))
         save_vehicle(partial / "vehicle.toml", spec, params, provenance={"made_by": "whill_mjx.export_mjcf"})
         (partial / "drive.py").write_text(EXAMPLE)
-        os.replace(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return out
 
 
@@ -292,7 +288,7 @@ class Options:
     """Vehicle file, or a built-in vehicle."""
     out: Path = Path("runs/mujoco")
     """Folder to write; it must not exist."""
-    physics_dt: float = 0.005
+    physics_dt: Annotated[float, Range(1e-4, 0.05)] = 0.005
     """Physics step [s]; part of the vehicle, since its controller counts steps."""
     check: bool = True
     """Then drive a figure-eight in C MuJoCo and in the simulator and print how far apart they are."""
@@ -303,8 +299,9 @@ def main(options: Options) -> None:
     from whill_mjx.logs.manoeuvres import Scenario, command_table
     from whill_mjx.vehicle.presets import preset
 
-    named = options.vehicle.endswith(".toml")
-    spec, params = load_vehicle(options.vehicle)[:2] if named else preset(options.vehicle)
+    with refusing():
+        named = options.vehicle.endswith(".toml")
+        spec, params = load_vehicle(options.vehicle)[:2] if named else preset(options.vehicle)
     folder = export(spec, params, options.out, options.physics_dt)
     print(f"wrote {', '.join(str(folder / name) for name in FILES)}")
     if options.check:
@@ -315,13 +312,7 @@ def main(options: Options) -> None:
 
 def cli() -> None:
     """Command line."""
-    import tyro
-
-    chosen = tyro.cli(Options, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
-    try:
-        main(chosen)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    run(Options, main, __doc__)
 
 
 if __name__ == "__main__":

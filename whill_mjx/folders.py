@@ -24,6 +24,8 @@ from whill_mjx.command_line import WRITING, OptionError
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
 LOCK_FILE = ".lock"
+SHOWN = 6
+"""Differences between two runs that an error names."""
 LEAST_FREE = 4_000_000
 """Bytes that must be free where results are written."""
 RESULTS = ("report.html", "report.json", "vehicle.toml", "dataset.toml", "policy.json", "policy", "evaluation.json",
@@ -110,8 +112,9 @@ class Claim:
             differs = [f"{name} is {_short(there[name])} there and {_short(value)} here"
                        for name, value in identity.items() if name in there and there[name] != value]
             if differs:
-                raise FolderRefused(f"--out {self.out}: holds another run: {'; '.join(differs)}. Choose another --out, "
-                                    "or give the old values to go on.")
+                more_of_them = f"; and {len(differs) - SHOWN} more" if len(differs) > SHOWN else ""
+                raise FolderRefused(f"--out {self.out}: holds another run: {'; '.join(differs[:SHOWN])}{more_of_them}. "
+                                    "Choose another --out, or give the old values to go on.")
             return
         self._found = {"kind": self._kind, "identity": identity}
         write_whole(self.out / RUN_FILE, json.dumps({**self._found, **more}, indent=1) + "\n")

@@ -12,6 +12,12 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+from whill_mjx.command_line import SEED, OptionError, Range, check_known, listen, run
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +25,8 @@ import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
-from whill_mjx.folders import whole_file, write_whole
-from whill_mjx.tasks.tasks import TASKS
+from whill_mjx.folders import check_place, whole_file, write_whole
+from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.video import write_h264
@@ -45,13 +51,13 @@ class Look:
     """randomised or fixed."""
     looks: bool = False
     """Also draw colours, light and textures at random, and change the images photometrically."""
-    worlds: int = 6
+    worlds: Annotated[int, Range(1, 100)] = 6
     """Columns of the sheet."""
-    steps: int = 18
+    steps: Annotated[int, Range(1, 10_000)] = 18
     """Control steps that the planner drives before the second picture."""
-    scale: int = 3
+    scale: Annotated[int, Range(1, 50)] = 3
     """Enlargement of the pictures."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """First random key."""
 
 
@@ -193,9 +199,13 @@ def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
     if options.scene not in (*known, "all"):
-        raise ValueError(f"unknown scene {options.scene!r} (known: {', '.join(known)}, all).")
+        raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")
+    check_known("--layout", options.layout, LAYOUTS)
     if options.out.suffix not in (".png", *VIDEOS):
-        raise ValueError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
+        raise OptionError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
+    if options.out.is_dir():
+        raise OptionError(f"--out {options.out}: is a folder. Give the name of a file.")
+    check_place("--out", options.out)
     if options.scene == "all":
         for name in known:
             out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
@@ -216,10 +226,8 @@ def main(options: Look) -> None:
 
 def cli() -> None:
     """Command line."""
-    import tyro
-
     # `--task` is the option's former name.
-    main(tyro.cli(Look, args=["--scene" if word == "--task" else word for word in sys.argv[1:]]))
+    run(Look, main, __doc__, args=["--scene" if word == "--task" else word for word in sys.argv[1:]])
 
 
 if __name__ == "__main__":

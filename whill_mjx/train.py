@@ -168,8 +168,8 @@ def main(options: TrainOptions) -> dict[str, Any]:
     with refusing():
         preset = choose_preset(options)
         check(options, preset, processes)
-    say(f"devices: {', '.join(str(device) for device in jax.devices())}")
     with Heartbeat() as heartbeat, begin(options, preset, heartbeat.stage) as vehicle:
+        say(f"preset {preset_name(options.preset)}; devices: {', '.join(str(device) for device in jax.devices())}")
         return finish(options, preset, vehicle, started, heartbeat.stage)
 
 
@@ -212,7 +212,8 @@ def begin(options: TrainOptions, preset: Preset, stage: Stage = say) -> Iterator
             parallel.agree(True)
             yield options.out / "vehicle.toml"
         except OSError as error:
-            error.add_note(f"What was trained is in {options.out / 'checkpoints'}; the same command goes on there.")
+            if checkpoint.complete(options.out / "checkpoints"):
+                error.add_note(f"What was trained is in {options.out / 'checkpoints'}; the same command goes on there.")
             raise
 
 
@@ -268,7 +269,6 @@ def choose_preset(options: TrainOptions) -> Preset:
     preset = with_layout(find_preset(name, options.task), options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
-    say(f"preset {name}")
     learner, baseline = preset.learner, preset.ppo
     if options.lr is not None:
         learner = dataclasses.replace(learner, lr=options.lr)
@@ -427,10 +427,12 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         episodes = jax.device_get(ends(params))
         return mean_figures({**episodes, "return": episodes["episode_return"]})
 
+    stopper = Stopper(options.out, preset.stop_success)
     return Trained(*train_ppo(
         functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
-        preset.eval_every, Stopper(options.out, preset.stop_success), say, eval_ahead=not devices,
-        checkpoint_every_s=options.checkpoint_every_s, announce=stage, progress=True,
+        preset.eval_every, stopper, say, eval_ahead=not devices,
+        checkpoint_every_s=options.checkpoint_every_s, last_step=stopper.total_steps(preset.total_steps),
+        announce=stage, progress=True,
     ))  # fmt: skip
 
 
@@ -452,7 +454,11 @@ def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Train
     if best is None or best["env_steps"] == result.env_steps:
         return None
     path = options.out / "best" / f"{int(best['env_steps']):012d}"
-    state, _ = checkpoint.load(path, {"params": result.params}, preset.learner)
+    try:
+        state, _ = checkpoint.load(path, {"params": result.params}, preset.learner)
+    except checkpoint.CheckpointError as error:
+        say(f"the best parameters are lost, so the last ones become the policy: {error}")
+        return None
     return Trained(state["params"], int(best["env_steps"]), result.updates, result.wall_s)
 
 

@@ -29,7 +29,8 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
 
     rows = max(len(found["replicates"]), 3)
     figure = pyplot.figure(figsize=(12.0, 8.5 + 0.25 * rows), layout="constrained")
-    upper, middle, lower = figure.subfigures(3, 1, height_ratios=(4.2, 3.3, 1.0 + 0.25 * rows))
+    parts: Any = figure.subfigures(3, 1, height_ratios=(4.2, 3.3, 1.0 + 0.25 * rows))
+    upper, middle, lower = parts
     left, right = upper.subplots(1, 2)
     _intervals(left, log)
     _velocities(right, log)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
+from half_lit import TINY, half_lit_env
 
 from whill_mjx.learning.ppo import (
     Network,
@@ -25,48 +25,6 @@ from whill_mjx.learning.ppo import (
     track,
 )
 from whill_mjx.learning.ppo_training import train_ppo
-
-TINY = PpoConfig(stack=2, width=32, channels=(8, 8, 8), rollout=16, epochs=4, minibatches=4, lr=3e-3)
-
-
-@struct.dataclass
-class Step:
-    obs: jax.Array
-    reward: jax.Array
-    is_first: jax.Array
-    is_last: jax.Array
-    is_terminal: jax.Array
-    metrics: dict
-
-
-def half_lit_env(count, length=4):
-    """One half of the image is lit; the first action component should point there: reward 1 - |a - side| / 2.
-
-    Episodes last `length` steps, and the step after the end resets and ignores its action.
-    """
-
-    def emit(key, age, reward, first):
-        side = jnp.where(jax.vmap(jax.random.bernoulli)(jax.vmap(jax.random.fold_in)(key, age)), 1.0, -1.0)
-        columns = jnp.arange(8) >= 4
-        lit = jnp.where((side > 0)[:, None], columns, ~columns)
-        obs = jnp.broadcast_to((255 * lit)[:, None, :, None], (count, 8, 8, 3)).astype(jnp.uint8)
-        last = age >= length
-        return side, Step(obs, reward, first, last, last, {"success": reward})
-
-    def reset(key):
-        keys, age = jax.random.split(key, count), jnp.zeros(count, jnp.int32)
-        side, step = emit(keys, age, jnp.zeros(count), jnp.ones(count, bool))
-        return (keys, age, side, step.is_last), step
-
-    def step(state, action):
-        keys, age, side, ended = state
-        keys = jnp.where(ended, jax.vmap(lambda key: jax.random.fold_in(key, 99))(keys), keys)
-        age = jnp.where(ended, 0, age + 1)
-        reward = jnp.where(ended, 0.0, 1.0 - jnp.abs(action[:, 0] - side) / 2)
-        side, step = emit(keys, age, reward, ended)
-        return (keys, age, side, step.is_last), step
-
-    return SimpleNamespace(num_envs=count, obs_shape=(8, 8, 3), action_dim=2, reset=reset, step=step)
 
 
 def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
@@ -180,3 +138,49 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
     assert len(traced) == 1 and asked == [0, each, 2 * each]
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)
+
+
+def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp_path):
+    env, each = half_lit_env(4), 4 * TINY.rollout
+
+    def trained(out, stop=None):
+        def figures(params, env_steps):
+            return {"norm": float(jnp.linalg.norm(jax.tree.leaves(params)[-1]))}
+
+        return train_ppo(env, TINY, tmp_path / out, 6 * each, 0, figures, each, stop)
+
+    def lines(out):
+        text = (tmp_path / out / "metrics.jsonl").read_text()
+        return [{**json.loads(line), "wall_s": 0.0} for line in text.splitlines()]
+
+    def interrupt(line):
+        if line["env_steps"] == 3 * each:
+            raise KeyboardInterrupt
+
+    straight = trained("straight")
+    with pytest.raises(KeyboardInterrupt):
+        trained("broken", interrupt)
+    with (tmp_path / "broken" / "metrics.jsonl").open("a") as file:
+        file.write('{"env_steps": ')  # cut off by a kill
+    resumed = trained("broken")
+    jax.tree.map(np.testing.assert_array_equal, resumed[:3], straight[:3])
+    assert lines("broken") == lines("straight") and len(lines("broken")) == 6
+    again = trained("broken")
+    jax.tree.map(np.testing.assert_array_equal, again[:3], straight[:3])
+    assert lines("broken") == lines("straight")
+
+
+def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
+    from dreamer.checkpoint import CheckpointError
+
+    env, each = half_lit_env(4), 4 * TINY.rollout
+    train_ppo(env, TINY, tmp_path, each, 0)
+    with pytest.raises(CheckpointError, match="lr: saved 0.003, now 0.1"):
+        train_ppo(env, dataclasses.replace(TINY, lr=0.1), tmp_path, 2 * each, 0)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("wrong", [{"lr": float("nan")}, {"lr": 0.0}, {"discount": 1.5}, {"entropy_scale": -1.0}])
+def test_settings_that_cannot_be_meant_are_refused(wrong):
+    with pytest.raises(ValueError, match=f"PpoConfig.{next(iter(wrong))} = .* must"):
+        PpoConfig(**wrong)

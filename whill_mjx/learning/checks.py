@@ -52,16 +52,25 @@ def _rank(figures: dict[str, float]) -> tuple[float, float]:
 
 
 def read_best(out: Path) -> dict[str, float] | None:
-    """RUN/best.json, if there is one."""
+    """RUN/best.json, if there is one that can be read."""
     path = out / "best.json"
-    return json.loads(path.read_text()) if path.is_file() else None
+    if not path.is_file():
+        return None
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return {**told, **{name: float(told[name]) for name in ("success", "return")},
+                "env_steps": int(told["env_steps"])}  # fmt: skip
+    except (ValueError, KeyError, TypeError):
+        say(f"{path}: is damaged and left aside; the best evaluation before it is not known.")
+        return None
 
 
 class Stopper:
     """Ends a run after two good evaluations in a row, or when there is a file RUN/stop."""
 
     def __init__(self, out: Path, success: float | None):
-        self._out, self._success, self._good = out, success, 0
+        self._out, self._success = out, success
+        self._good: int | None = None  # good evaluations in a row; None: those of an earlier start are not counted yet
 
     def total_steps(self, planned: int) -> int:
         """Steps to train: those at which an earlier start has ended for its success, if it asked the same."""
@@ -76,6 +85,8 @@ class Stopper:
         if parallel.agree((self._out / "stop").exists()):
             say(f"stopped, since {self._out / 'stop'} exists; remove it to go on.")
             return True
+        if self._good is None:
+            self._good = self._good_before(line["env_steps"])
         reached = self._success is not None and line.get("eval/success", 0.0) >= self._success
         self._good = self._good + 1 if reached else 0
         if self._good < 2:
@@ -84,3 +95,12 @@ class Stopper:
             write_json(self._out / "stopped.json", {"env_steps": line["env_steps"], "success": self._success})
         say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
         return True
+
+    def _good_before(self, env_steps: float) -> int:
+        """Good evaluations in a row at the end of what an earlier start has logged: a resumed run ends alike."""
+        path, good = self._out / "metrics.jsonl", 0
+        for text in path.read_text().splitlines() if path.is_file() and self._success is not None else []:
+            line = json.loads(text)
+            if "eval/success" in line and line["env_steps"] < env_steps:
+                good = good + 1 if line["eval/success"] >= self._success else 0
+        return good

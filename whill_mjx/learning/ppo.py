@@ -8,6 +8,7 @@ step is left out of the loss, and a truncated episode bootstraps from its own la
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +56,15 @@ class PpoConfig:
         for name in ("stack", "width", "rollout", "epochs", "minibatches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must be at least 1. Change {name}.")
+        for name in ("lr", "clip", "max_grad_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must be positive. Change {name}.")
+        for name in ("discount", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must lie in 0..1. Change {name}.")
+        for name in ("value_scale", "entropy_scale"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must not be negative. Change {name}.")
 
 
 class Network(nn.Module):

@@ -33,6 +33,7 @@ def train_ppo(
     say: Callable[[str], None] = lambda text: None,
     eval_ahead: bool = False,
     checkpoint_every_s: float = 60.0,
+    last_step: int | None = None,
     announce: Callable[[str], None] = lambda text: None,
     progress: bool = False,
 ) -> tuple[Any, int, int, float]:
@@ -53,6 +54,7 @@ def train_ppo(
         eval_ahead: call `eval_fn` once in a thread at the start, so that it is compiled beside the run's own program.
             Not with several devices.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
+        last_step: environment step at which an earlier start of this run was stopped; none trains them all.
         announce: gets a line when something begins that takes long.
         progress: show a bar on stderr.
 
@@ -62,19 +64,24 @@ def train_ppo(
     out.mkdir(parents=True, exist_ok=True)
     each, updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
     iterations = -(-total_steps // each)
+    last = iterations if last_step is None else min(iterations, -(-last_step // each))
     announce("compiling the training program, usually 1 to 2 minutes")
     state, wall_before = _first_state(env, config, out, iterations, seed)
     done, began = int(state.updates), time.monotonic()
+    logged = done * each // eval_every
     _keep_lines(out / "metrics.jsonl", done * each)
-    ready = _ahead(eval_fn, state.params) if eval_ahead and eval_fn is not None and done < iterations else []
+    ready = _ahead(eval_fn, state.params) if eval_ahead and eval_fn is not None and done < last else []
     run = jax.jit(lambda state: iterate(env, config, iterations, state), donate_argnums=0)
-    saved_at, evaluated_at = time.monotonic(), done * each // eval_every
+    saved_at = time.monotonic()
 
     def wall_s() -> float:
         return wall_before + time.monotonic() - began
 
     def save() -> None:
-        checkpoint.save(out / "checkpoints", state, config, done * each, wall_s())
+        checkpoint.save(out / "checkpoints", state, config, int(state.updates) * each, wall_s())
+
+    def due(done: int) -> bool:
+        return done == last or done * each // eval_every > logged
 
     def evaluated(metrics: dict[str, Any]) -> dict[str, float]:
         line = _line(jax.device_get(metrics), done * each, done * updates_each)
@@ -89,23 +96,24 @@ def train_ppo(
 
     stopped, running, bar = False, None, Progress(iterations * each, done * each, progress)
     try:
-        while done < iterations and not stopped:
+        while done < last and not stopped:
             state, metrics = run(state)
             done += 1
             if progress:
                 jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
                 bar.show(done * each, {})
             running = metrics
-            if done == iterations or done * each // eval_every > evaluated_at:
-                evaluated_at = done * each // eval_every
+            if due(done):
                 line = evaluated(metrics)
                 bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
+                logged = done * each // eval_every
                 stopped = stop is not None and stop(line)
-            if done == iterations or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
+            if done == last or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
                 save()
                 saved_at = time.monotonic()
     except KeyboardInterrupt:
-        checkpoint.save_if_whole(save, state)
+        if checkpoint.is_whole(state) and not due(int(state.updates)):
+            save()  # an evaluation that is due would be missing from the run that goes on from here
         raise
     finally:
         bar.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,7 +161,21 @@ def with_settings(learner: Any, settings: Sequence[str]) -> Any:
         except json.JSONDecodeError as error:
             raise ValueError(f"{text!r}: give NAME=VALUE, the value as in JSON: 0.1, true or [1, 2].") from error
         changes[name] = tuple(found) if isinstance(found, list) else found
+        if not _alike(changes[name], getattr(learner, name)):
+            raise ValueError(f"{text!r}: {name} is {getattr(learner, name)!r} by default; give a finite value like it.")
     return dataclasses.replace(learner, **changes)
+
+
+def _alike(value: Any, default: Any) -> bool:
+    """Whether a setting has the type of its default; numbers must be finite."""
+    if isinstance(default, tuple):
+        same = isinstance(value, tuple) and all(isinstance(one, (int, float, str)) for one in value)
+        return same and (not default or all(_alike(one, default[0]) for one in value))
+    if isinstance(default, (bool, str)):
+        return isinstance(value, type(default))
+    if isinstance(default, int):
+        return isinstance(value, int)
+    return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def to_transition(step: TimeStep) -> Transition:

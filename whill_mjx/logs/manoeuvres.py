@@ -9,8 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+
+from whill_mjx.command_line import OptionError, Range, check_options
 
 STANDSTILL = 1.0  # s before and after the drive
 Pieces = list[tuple[float, float, float]]
@@ -21,14 +24,17 @@ Pieces = list[tuple[float, float, float]]
 class Scenario:
     """How hard the manoeuvres are driven."""
 
-    v: float = 0.6
+    v: Annotated[float, Range(-10, 10)] = 0.6
     """Forward speed [m/s]."""
-    omega: float = 0.6
+    omega: Annotated[float, Range(-10, 10)] = 0.6
     """Yaw rate in turns [rad/s]."""
-    length: float = 8.0
+    length: Annotated[float, Range(0, 3600, above=True)] = 8.0
     """Time in motion [s]."""
-    dt: float = 0.1
+    dt: Annotated[float, Range(0.001, 1)] = 0.1
     """Command period [s]."""
+
+    def __post_init__(self) -> None:
+        check_options(self, "scenario.")
 
 
 def straight(scenario: Scenario) -> Pieces:
@@ -55,6 +61,8 @@ def s_curve(scenario: Scenario) -> Pieces:
 
 def figure_eight(scenario: Scenario) -> Pieces:
     """A full circle to the left, then one to the right."""
+    if scenario.omega < 0.01:
+        raise OptionError(f"--scenario.omega {scenario.omega}: a figure-eight needs at least 0.01 rad/s. Correct it.")
     lap = 2 * math.pi / scenario.omega
     return [(lap, scenario.v, scenario.omega), (lap, scenario.v, -scenario.omega)]
 

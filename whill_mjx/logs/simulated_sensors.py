@@ -7,10 +7,14 @@ with the time of the report, as a driver without hardware stamps does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from whill_mjx.command_line import Range, check_options
+
 ENCODER_STEP = 0.001  # rad, of the chair's state message
+LENGTH, ANGLE, SPEED = Range(0, 10), Range(0, 4), Range(0, 10)  # m, rad, m/s or rad/s
 COUNTER_WRAP = 201  # ms: the chair's counter runs from 0 to 200
 
 
@@ -50,18 +54,21 @@ class Sensors:
 class SensorNoise:
     """Standard deviations of white noise on every sample."""
 
-    position: float = 0.003
+    position: Annotated[float, LENGTH] = 0.003
     """Outside pose [m]."""
-    yaw: float = 0.003
+    yaw: Annotated[float, ANGLE] = 0.003
     """Outside pose [rad]."""
-    odometry_position: float = 0.001
-    odometry_yaw: float = 0.001
-    v: float = 0.005
-    omega: float = 0.01
-    gyro: float = 0.002
+    odometry_position: Annotated[float, LENGTH] = 0.001
+    odometry_yaw: Annotated[float, ANGLE] = 0.001
+    v: Annotated[float, SPEED] = 0.005
+    omega: Annotated[float, SPEED] = 0.01
+    gyro: Annotated[float, SPEED] = 0.002
     """Rate of the gyro [rad/s]."""
-    encoder: float = 0.0
+    encoder: Annotated[float, ANGLE] = 0.0
     """Wheel angles [rad], before they are rounded to their step."""
+
+    def __post_init__(self) -> None:
+        check_options(self, "noise-levels.")
 
 
 def times(duration: float, rate: float) -> np.ndarray:

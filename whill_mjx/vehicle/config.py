@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -18,7 +19,8 @@ class VehicleConfig:
     so that it compiles into few kernels; "mjx" calls `mjx.step`. Both give the same motion to rounding."""
 
     def __post_init__(self) -> None:
-        if self.physics_dt <= 0 or abs(self.substeps * self.physics_dt - self.control_dt) > 1e-9:
+        known = 0 < self.physics_dt < math.inf and 0 < self.control_dt < math.inf
+        if not known or abs(self.substeps * self.physics_dt - self.control_dt) > 1e-9:
             raise ValueError(
                 f"physics_dt {self.physics_dt} does not divide control_dt {self.control_dt}; choose e.g. 0.005 and 0.1."
             )

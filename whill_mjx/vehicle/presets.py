@@ -33,7 +33,7 @@ from whill_mjx.effects import (
     state_rate,
 )
 from whill_mjx.vehicle.model import box_inertia
-from whill_mjx.vehicle.specs import VehicleSpec, find_spec
+from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 from whill_mjx.vehicle.types import Body, VehicleParams
 
 
@@ -53,8 +53,10 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     if name in whill:
         spec = find_spec("whill_cr")
         return spec, whill[name](spec)
-    spec = find_spec(name)
-    return spec, preset_params(spec, "paper")
+    if name not in SPECS:
+        known = ", ".join(sorted({*SPECS, *whill}))
+        raise ValueError(f"unknown vehicle {name!r} (known: {known}). Use one of them or a vehicle file.")
+    return SPECS[name], preset_params(SPECS[name], "paper")
 
 
 def preset_params(spec: VehicleSpec, kind: str = "paper") -> VehicleParams:
