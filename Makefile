@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
 BIN := $(VENV)/bin
+COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: train test test-quick test-long lint clean
@@ -14,14 +15,23 @@ $(BIN)/python:
 		{ echo "$(PYTHON) cannot make virtual environments; on Debian or Ubuntu run: apt-get install -y python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
+# $(call install,ARGUMENTS): pip with its own output, and a line every 10 s where pip says nothing.
+define install
+	@( seconds=0; while sleep 10; do seconds=$$((seconds + 10)); echo "  installing for $$seconds s"; done ) & beat=$$!; \
+		trap "kill $$beat 2>/dev/null" EXIT INT TERM; $(PIP) install -c constraints.txt $(1)
+endef
+
 # jax[cuda13] is added where nvidia-smi answers.
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	@if nvidia-smi -L >/dev/null 2>&1; then extra=cuda; else extra=; fi; \
-		$(PIP) install --quiet -c constraints.txt -e ".$${extra:+[$$extra]}"
+	@if nvidia-smi -L >/dev/null 2>&1; then \
+		echo "Installing whill-mjx with JAX for NVIDIA GPUs into $(VENV): once, several minutes and GB."; \
+		else echo "Installing whill-mjx with JAX, MuJoCo and ONNX into $(VENV): once, 1 to 5 minutes, 1.5 GB."; fi
+	$(call install,-e "$$(nvidia-smi -L >/dev/null 2>&1 && echo '.[cuda]' || echo .)")
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) install --quiet -c constraints.txt -e ".[dev,ros]"
+	@echo "Installing what the tests need (pytest, ruff, mypy, ROS 2 messages) into $(VENV): once, about a minute."
+	$(call install,-e ".[dev$(COMMA)ros]")
 	@touch $@
 
 train: $(VENV)/.installed

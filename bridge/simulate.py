@@ -78,7 +78,8 @@ class ChairSimulator:
     """
 
     def __init__(
-        self, task: str = "corridor", vehicle: str | Path | None = None, size: tuple[int, int] = (64, 64), **changes: Any
+        self, task: str = "corridor", vehicle: str | Path | None = None, size: tuple[int, int] = (64, 64),
+        **changes: Any,
     ) -> None:
         """Compile the environment of a task with some of its fields changed, and of a vehicle file or preset.
 
@@ -341,7 +342,8 @@ def field(text: str) -> tuple[str, Any]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="python -m bridge.simulate", description="Serve the simulator on the vehicle's topics.")
+    parser = argparse.ArgumentParser(prog="python -m bridge.simulate",
+                                     description="Serve the simulator on the vehicle's topics.")
     parser.add_argument("policy", nargs="?", type=Path, help="folder of a policy or of its training: task, gates, "
                         "vehicle and camera are those that it was trained with")
     parser.add_argument("--task", help="default: that of the policy, or corridor")

@@ -46,8 +46,8 @@ def read_world(path: str | Path) -> PolicyWorld:
     folder = find_policy(path)
     file = folder / "policy.json"
     if not file.is_file():
-        raise OptionError(f"{path}: holds neither policy.json nor policy/policy.json. Give the folder of a policy or of "
-                          "a training; unpack a zip first.")
+        raise OptionError(f"{path}: holds neither policy.json nor policy/policy.json. Give the folder of a policy or "
+                          "of a training; unpack a zip first.")
     try:
         table = json.loads(file.read_text(encoding="utf-8"))
         task, (height, width) = str(table["task"]), (int(table["image"][name]) for name in ("height", "width"))
