@@ -225,7 +225,7 @@ def measure(seconds: float, resets: int, kills: int, policy_path: Path | None) -
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the bridge.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge", description="Measure the bridge.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each steady run")
     parser.add_argument("--resets", type=int, default=20)
     parser.add_argument("--kills", type=int, default=5)

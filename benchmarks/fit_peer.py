@@ -309,4 +309,4 @@ def main(settings: Peer) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Peer, description=__doc__))
+    main(tyro.cli(Peer, prog="python -m benchmarks.fit_peer", description=__doc__))

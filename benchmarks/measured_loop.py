@@ -288,4 +288,4 @@ def main(settings: Benchmark) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Benchmark, description=__doc__))
+    main(tyro.cli(Benchmark, prog="python -m benchmarks.measured_loop", description=__doc__))

@@ -210,4 +210,4 @@ def write_json(path: Path, content: Any) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Benchmark, description=__doc__))
+    main(tyro.cli(Benchmark, prog="python -m benchmarks.undeclared", description=__doc__))

@@ -36,7 +36,8 @@ def cli() -> None:
     """Command line: `python -m sysid.report RUN`."""
     import argparse
 
-    parser = argparse.ArgumentParser(prog="sysid.report", description="Write RUN/report.html of an earlier fit.")
+    parser = argparse.ArgumentParser(prog="python -m sysid.report",
+                                     description="Write RUN/report.html of an earlier fit.")
     parser.add_argument("run", type=Path, help="folder that sysid.fit wrote")
     run = parser.parse_args().run
     try:

@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> Path:
     """Parse the command line and write the dataset; returns its folder."""
     table = "\n".join(f"  {name} [{entry.unit}], base {entry.base:g}: {entry.form}" for name, entry in EFFECTS.items())
     parser = argparse.ArgumentParser(
-        prog="benchmarks.plant", description=__doc__, epilog=f"effects:\n{table}",
+        prog="python -m benchmarks.plant", description=__doc__, epilog=f"effects:\n{table}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, help="dataset folder to write; it must not exist")
