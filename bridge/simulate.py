@@ -1,4 +1,4 @@
-"""The simulator behind the vehicle's topics, so that the policy node cannot tell it from the chair.
+"""The simulator behind the vehicle's topics, so that the policy node sees no difference from the chair.
 
     python -m bridge.simulate RUN/policy --episodes 10
 

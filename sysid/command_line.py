@@ -37,7 +37,7 @@ def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Pro
 
 
 def keep_compiled() -> None:
-    """Keep what XLA compiles for later runs, in the user's cache folder, unless JAX was told another folder
+    """Keep what XLA compiles for later runs, in the user's cache folder, unless JAX was given another folder
     (JAX_COMPILATION_CACHE_DIR) or none (JAX_ENABLE_COMPILATION_CACHE=false), or where that cannot be written.
 
     Each kind of processor has a folder of its own: a home may be shared by several.

@@ -127,7 +127,7 @@ class TrainOptions:
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
-    """Let the world model also tell goal, speeds and free distances, which the simulator knows
+    """Let the world model also predict goal, speeds and free distances, which the simulator knows
     (`whill_mjx.learning.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: Annotated[float | None, SHARE] = None

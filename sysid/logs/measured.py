@@ -26,7 +26,7 @@ from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
 DRIVE_ROWS = 40  # samples of one window (2 s)
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
-MOVING = 0.05  # m of track or wheel travel below which a window tells nothing
+MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
 # The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
 GYRO_SIGN = {"warthog_gravel": -1.0}
 MRCLAM_WINDOW = 15.0  # s
@@ -102,7 +102,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
 
 
 def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
-    """Load MRCLAM robots as consecutive windows in which the robot was told to move."""
+    """Load MRCLAM robots as consecutive windows in which the robot was commanded to move."""
     folder = Path(folder)
     trials: list[Trial] = []
     notes = []

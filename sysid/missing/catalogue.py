@@ -19,7 +19,7 @@ from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
-ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not tell
+ROUND = 200.0  # s of the session that a round of manoeuvres counts as, with its pauses: logs do not say
 
 GRAVITY = 9.81  # m/s^2
 LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -40,7 +40,7 @@ class Axis:
     limit: float = 12.0
     """Largest |q| that a refit may reach."""
     open: tuple[float, float] = (1.0, 1.0)
-    """Factors on the size, least and largest, that drives cannot tell from what the effect leaves open."""
+    """Factors on the size, least and largest, that drives cannot separate from what the effect leaves open."""
     dependent: bool = False
     """Whether it does nothing by itself, but changes what the other axes do."""
 

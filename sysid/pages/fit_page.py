@@ -125,7 +125,7 @@ def _summary_table(part: dict[str, Any]) -> str:
 
 
 def parameters(report: dict[str, Any]) -> str:
-    """Initial and fitted values with intervals; what was not fitted; what the log does not tell."""
+    """Initial and fitted values with intervals; what was not fitted; what the log does not determine."""
     rows: list[list[Any]] = []
     for one in report["parameters"]:
         low, high = one["interval"]
@@ -142,7 +142,7 @@ def parameters(report: dict[str, Any]) -> str:
              paragraph("Bar: interval (blue) and fitted value (dot) within the bounds of the search; the orange tick "
                        "is the initial value.", "dim")]
     if report["weak_combinations"]:
-        parts += [heading("Combinations that this log does not tell"), bullets(report["weak_combinations"])]
+        parts += [heading("Combinations that this log does not determine"), bullets(report["weak_combinations"])]
     if report.get("spectrum"):
         parts += [heading("Fisher information"),
                   table(["combination", "information", "standard error"], [

@@ -120,21 +120,21 @@ def fit_log(
         points = coarse.u[None]
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
-    told: Told = choose(objective, points[0], log.spec.track, config, stages)
+    chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, told, profiles = gradient_search(told, space, points, iterations, config, stages)
+        search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
-        residuals = told.residuals(space.to_unit(space.initial)[None])
-        initial_cost = float(robust_cost(residuals, config.robust)[0]) / told.counted
-    known = uncertainty.estimate(told, u, robust=config.robust and config.method not in GLOBAL)
-    traced = profile(told, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+        residuals = chosen.residuals(space.to_unit(space.initial)[None])
+        initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
+    known = uncertainty.estimate(chosen, u, robust=config.robust and config.method not in GLOBAL)
+    traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
-    earlier = told.prior if config.vehicle is not None else None
+    earlier = chosen.prior if config.vehicle is not None else None
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
                profiles, time.perf_counter() - began, plant, earlier, model, tuple(traced), given.frame)
 
@@ -158,13 +158,13 @@ def choose(
     near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
                         progress=progress)
     share = uncertainty.inflation(objective, near.u)
-    told: Objective | FeatureObjective = objective
+    chosen: Objective | FeatureObjective = objective
     if config.method == "features" and share >= TOGETHER:
         binned = make_features_objective(objective, track)
         if binned.enough:
-            told = binned.renewed(u)
-            share = uncertainty.inflation(told, u)
-    return told if told.prior is None else replace(told, prior=replace(told.prior, share=share))
+            chosen = binned.renewed(u)
+            share = uncertainty.inflation(chosen, u)
+    return chosen if chosen.prior is None else replace(chosen, prior=replace(chosen.prior, share=share))
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
 
     Of a grid over the range of each parameter the best point below and the best above, the others following by one
     damped Gauss-Newton step. Points that cost what u does are left out: a search from there comes back to where it was.
-    What lies behind such level ground comes first, since no derivative tells of it: a limit that was never met, say.
+    What lies behind such level ground comes first, since no derivative shows it: a limit that was never met, say.
     The rest is in the order of its costs.
     """
     linear = _linearised(objective, u)
@@ -241,7 +241,7 @@ def profile_delays(
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
     A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
-    by one damped Gauss-Newton step, which tells whether another valley is as deep.
+    by one damped Gauss-Newton step, which shows whether another valley is as deep.
 
     Args:
         points: of an even grid over the whole range.

@@ -1,7 +1,7 @@
 """The gradient search on poses, and where else it looks: costs of drives have many valleys.
 
 A search ends in the valley that it starts in. Others are looked for at the ends of ranges, far along them, and at other
-delays; what a drive hardly tells, or tells only beyond a limit, is found so.
+delays; so parameters are found that a drive hardly determines, or only beyond a limit.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def gradient_search(
 ) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
-    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    What drives hardly determine, such as how far a suspension sags, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
     right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
     on a grid, and LM tries another valley that is about as deep. The floors of valleys are jagged: at the end slopes

@@ -17,7 +17,7 @@ TINY = 1e-12  # keeps the edge defined at a dead zone of 0
 class CommandDeadZone(Effect):
     """u -> 0 where |u| < d, and u beyond, of v and omega each for itself, and then of each wheel's speed.
 
-    The edge is a smooth step from 0.8 d to 1.2 d. Larger commands pass unchanged, so only slow motion tells d. Once
+    The edge is a smooth step from 0.8 d to 1.2 d. Larger commands pass unchanged, so only slow motion shows d. Once
     awake, a command passes down to `release` d (a switch with hysteresis), and asleep again it needs d.
     """
 

@@ -51,7 +51,7 @@ class CommandDelay(Effect):
     def ahead(self, commands: jax.Array, dt: float) -> jax.Array:
         """What acts in each of S physics steps of `dt` [s], of the commands (S, 2) sent in them and none before.
 
-        As `command` tells it step by step, however many changes are under way, for commands that are all known.
+        The result of `command` step by step, however many changes are under way, for commands that are all known.
         """
         steps = self.delay / dt
         whole = jnp.floor(steps)

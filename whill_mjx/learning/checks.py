@@ -57,9 +57,9 @@ def read_best(out: Path) -> dict[str, float] | None:
     if not path.is_file():
         return None
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        return {**told, **{name: float(told[name]) for name in ("success", "return")},
-                "env_steps": int(told["env_steps"])}  # fmt: skip
+        saved = json.loads(path.read_text(encoding="utf-8"))
+        return {**saved, **{name: float(saved[name]) for name in ("success", "return")},
+                "env_steps": int(saved["env_steps"])}  # fmt: skip
     except (ValueError, KeyError, TypeError):
         say(f"{path}: is damaged and left aside; the best evaluation before it is not known.")
         return None
@@ -77,8 +77,8 @@ class Stopper:
         path = self._out / "stopped.json"
         if self._success is None or not path.is_file():
             return planned
-        told = json.loads(path.read_text())
-        return min(planned, int(told["env_steps"])) if told["success"] == self._success else planned
+        saved = json.loads(path.read_text())
+        return min(planned, int(saved["env_steps"])) if saved["success"] == self._success else planned
 
     def __call__(self, line: dict[str, float]) -> bool:
         """Whether the run ends after this line."""
