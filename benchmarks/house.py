@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
 import json
 import os
 import re
@@ -26,14 +25,12 @@ from pathlib import Path
 
 from benchmarks.harness import figure, record
 from benchmarks.import_graph import circles, floors, import_graph
+from benchmarks.prose import sentences
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
 CLAIM = "a stranger finds the room in a minute"
 LONG, MANY = 60, 6  # lines of a function, and arguments, beyond which it counts
-ROOM_TABLES = "catalogue|falsifiers|next_manoeuvre|alone"
-PROGRAMS = ("physics", "environment", "learner", "replay")
-"""Compiled programs that are compared, see `benchmarks.house_programs`."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +55,6 @@ def functions(root: Path = ROOT) -> Iterator[Function]:
                     extra = (given.vararg is not None) + (given.kwarg is not None)
                     lines = (node.end_lineno or node.lineno) - node.lineno + 1
                     yield Function(path.relative_to(root), node.name, lines, len(named) + extra)
-
-
-def words_of(text: str) -> Iterator[str]:
-    """Sentences of a page: ended by . ! ? : or ;, without tables, code, headings and pictures."""
-    text = re.sub(r"```.*?```", "", text, flags=re.S)
-    kept = [line for line in text.splitlines() if not line.lstrip().startswith(("|", "#", "<", "!["))]
-    for paragraph in re.split(r"\n\s*\n|\n\s*[-*] |\n\s*\d+\. ", "\n".join(kept)):
-        yield from (one for one in re.split(r"(?<=[.!?:;])\s+", " ".join(paragraph.split())) if one)
 
 
 def pages(root: Path = ROOT) -> list[Path]:
@@ -99,7 +88,7 @@ def from_sources(root: Path = ROOT) -> dict[str, dict]:
     every = list(functions(root))
     long = [one for one in every if one.lines > LONG]
     many = [one for one in every if one.arguments > MANY]
-    sentences = [one for page in pages(root) for one in words_of(page.read_text())]
+    spoken = [one for page in pages(root) for one in sentences(page.read_text())]
     lines = sum(len(path.read_text().splitlines()) for path in (root / "sysid").rglob("*.py"))
     top = {package: len(list((root / package).glob("*.py"))) for package in PACKAGES}
     simple = ("supply_sag", "backlash", "wind", "jerk_limit", "gyro_bias")
@@ -110,7 +99,7 @@ def from_sources(root: Path = ROOT) -> dict[str, dict]:
         "files_per_new_effect": (max(files_naming(name, root) for name in simple), "count"),
         "functions_over_60": (len(long), "count"), "functions_over_6_arguments": (len(many), "count"),
         "lines_sysid": (lines, "count"), "names_sysid": (public_names(root / "sysid"), "count"),
-        "sentences_over_35_words": (sum(len(one.split()) > 35 for one in sentences), "count"),
+        "sentences_over_35_words": (sum(len(one.split()) > 35 for one in spoken), "count"),
         "tell_and_told": (dialect(root), "count"),
         "readme_lines": (len((root / "README.md").read_text().splitlines()), "count"),
         "benchmarks_page_kb": ((root / "benchmarks/README.md").stat().st_size / 1e3, "kB"),
@@ -167,11 +156,6 @@ def compare_times(other: Path, repeats: int) -> dict[str, dict]:
         print(f"pair {number + 1} of {repeats}, {time.perf_counter() - began:.0f} s: "
               + ", ".join(f"{name} {each[-1]:.3f}" for name, each in ratios.items()), flush=True)
     return {f"time_ratio_{name}": figure(each, "ratio") for name, each in ratios.items()}
-
-
-def digest(text: str) -> str:
-    """SHA-256 of a program's text without its places in the sources."""
-    return hashlib.sha256(re.sub(r"loc\(.*?\)|#loc.*", "", text).encode()).hexdigest()
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 The folder is described in docs/policy_file.md. The vehicle reads `policy.onnx`, the archive is `weights.npz`; both are
 plain data, nothing in the file can execute code. The writer checks its own work: it replays the ONNX network beside
-the JAX one and records the largest difference of their actions in `policy.json`. `export_agent` writes agents that see
+the JAX one, records the largest difference of their actions in `policy.json`, and has the finished folder read by
+`bridge.policy`, the reader of the vehicle. `export_agent` writes agents that see
 and do something else than a vehicle in the same way.
 """
 
@@ -23,16 +24,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bridge.policy import AGENT_KIND, KIND, SCHEMA, AgentContract, PolicyFileError, read_policy
 from dreamer import agent, sensors, spaces, world_model
 from dreamer.config import DreamerConfig
 from dreamer.network import OPSET, Carry, Network, Shapes, parity, to_onnx
 from dreamer.spaces import ActionSpec, Discrete, ObsShape
 from dreamer.types import Params
 
-SCHEMA = 1
-KIND = "micromobility-policy"
-AGENT_KIND = "dreamer-onnx-policy"
-SINGLE = "observation"
+SINGLE = AgentContract.SINGLE
 """Name of an observation that the environment does not name."""
 
 Step = Callable[[Carry, jax.Array], tuple[Carry, jax.Array]]
@@ -59,7 +58,7 @@ class PolicyContract:
     action_repeat: int = 1
     """The policy is evaluated on every k-th tick; its command is held in between."""
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Camera of the training, as plain JSON: pose, field of view, latency."""
+    """Camera of the training, as plain JSON: pose and field of view, and the frame in which the pose is given."""
 
     def __post_init__(self) -> None:
         for name in ("action_low", "action_high"):
@@ -100,7 +99,8 @@ def export_policy(
         check_steps: recurrent steps on random images over which ONNX and JAX are compared.
 
     Raises:
-        ValueError: the ONNX network needs operators outside the standard set or acts differently; nothing is written.
+        ValueError: the ONNX network needs operators outside the standard set or acts differently, or a reader would
+            refuse the file; nothing is written.
     """
     path = Path(path)
     shapes = {name: jax.ShapeDtypeStruct(np.shape(value), value.dtype) for name, value in carry.items()}
@@ -221,6 +221,10 @@ def _finish(folder: Path, path: Path, table: dict[str, Any], network: Network, c
     }
     (folder / "policy.json").write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
     folder.chmod(0o755)
+    try:
+        read_policy(folder, (table["kind"],))
+    except PolicyFileError as error:
+        raise PolicyFileError(str(error).replace(str(folder), str(path))) from error
     replace_folder(folder, path)
 
 

@@ -3,32 +3,51 @@
     policy, carry = Policy.load("runs/mine/policy"), None
     action, carry = policy.step(obs, carry)      # carry None begins an episode
 
-A folder holds `policy.json` (sizes, observations, actions) and `weights.npz` (plain arrays); nothing in it can execute
-code. What `dreamer.export` wrote, agents and the policy files of vehicles (docs/policy_file.md), is read as well and
-runs in onnxruntime.
+A folder, or a zip of it, holds `policy.json` (sizes, observations, actions) and `weights.npz` (plain arrays); nothing
+in it can execute code. What `dreamer.export` wrote, agents and the policy files of vehicles (docs/policy_file.md), is
+read as well and runs in onnxruntime. All kinds are read and checked by `bridge.policy`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bridge.policy import (
+    EXPORT_AGAIN,
+    SCHEMA,
+    AgentContract,
+    CheckedPolicy,
+    Contract,
+    Fields,
+    Parts,
+    PolicyFileError,
+    check_kind,
+    make_session,
+    parse_hashes,
+    parse_observation,
+    read_arrays,
+    read_policy,
+)
 from dreamer import agent, export, sensors, spaces
 from dreamer.config import DreamerConfig
 from dreamer.spaces import ActionSpec, Box, Discrete, ObsShape
 from dreamer.types import Params
 
 KIND = "dreamer-policy"
-SCHEMA = 1
+"""A policy as its parameters, which JAX runs."""
+WIDTHS = ("deter", "hidden", "units", "stoch", "classes", "blocks", "depth", "kernel", "patch", "patch_units", "bins")
+"""Settings that are sizes of arrays, so at least 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,26 +63,19 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
-        """The policy in a folder that `save`, `export_agent` or `export_policy` wrote.
+        """The policy in a folder, or a zip of it, that `save`, `export_agent` or `export_policy` wrote.
 
         Raises:
-            ValueError: no policy, or one of another version; names the file, the rule and the remedy.
+            PolicyFileError: no policy, a damaged one or one of another version; names the file, the field, the value,
+                the rule and the remedy.
         """
-        path = Path(path)
-        table = _read_table(path)
-        if table["kind"] == export.KIND:
-            return _load_exported(path, table)
-        shape = table["observation"]
-        obs_shape = {k: tuple(v) for k, v in shape.items()} if isinstance(shape, dict) else tuple(shape)
-        if table["kind"] == export.AGENT_KIND:
-            return _load_agent(path, table, obs_shape)
-        numbers: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table["config"].items()}
-        config = DreamerConfig(**numbers)
-        with np.load(path / "weights.npz", allow_pickle=False) as arrays:
-            params = _nest({name: jnp.asarray(arrays[name]) for name in arrays.files})
-        kinds: dict[str, type[Box] | type[Discrete]] = {"box": Box, "discrete": Discrete}
-        action = kinds[table["action"]["kind"]](table["action"]["size"])
-        return of_agent(config, params, obs_shape, action)
+        with Parts(path) as parts:
+            name = parts.name("policy.json")
+            table = parts.table()
+            if check_kind(name, table, (KIND, export.KIND, export.AGENT_KIND)) == KIND:
+                return _load_parameters(parts, name, table)
+        checked = read_policy(path, (export.KIND, export.AGENT_KIND))
+        return _of_agent_file(checked) if isinstance(checked.contract, AgentContract) else _of_vehicle_file(checked)
 
     def step(self, obs: Any, carry: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """The most probable action for an observation, and the state to hand in with the next one.
@@ -125,8 +137,9 @@ def save(
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        (folder / "policy.json").write_text(json.dumps(table, indent=2) + "\n")
         export.save_arrays(folder / "weights.npz", export.flatten_weights(params))
+        table["files"] = {"weights.npz": export.sha256((folder / "weights.npz").read_bytes())}
+        (folder / "policy.json").write_text(json.dumps(table, indent=2) + "\n")
         folder.chmod(0o755)
         export.replace_folder(folder, path)
     finally:
@@ -134,71 +147,118 @@ def save(
     return path
 
 
-def _read_table(path: Path) -> dict[str, Any]:
-    name = path / "policy.json"
+def _load_parameters(parts: Parts, name: str, table: dict[str, Any]) -> Policy:
+    """A policy that `save` wrote. Files of earlier versions list no hash."""
+    fields = Fields(name, table)
+    config, obs_shape = _parse_config(fields.child("config")), parse_observation(fields)
+    action = fields.child("action")
+    kind = action.rule("kind", lambda value: value in ("box", "discrete"), "must be 'box' or 'discrete'")
+    size = action.rule("size", lambda value: _is_whole(value) and 1 <= value <= 65536, "must be from 1 to 65536")
+    spec = Discrete(size) if kind == "discrete" else Box(size)
+    weights = parts.name("weights.npz")
+    if "files" in table:
+        data = parts.checked("weights.npz", parse_hashes(name, table, "weights.npz")["weights.npz"], keep=True)
+    else:
+        _, data = parts.take("weights.npz", keep=True)
+    params = _nest(read_arrays(weights, data), weights)
+    try:  # a step on shapes alone: nothing of a size that the weights do not have is ever allocated
+        shapes = jax.tree.map(lambda array: jax.ShapeDtypeStruct(array.shape, jnp.float32), params)
+        actions = spaces.actions(spec)
+        obs = jax.eval_shape(lambda: sensors.visible(config, spaces.zeros(obs_shape)))
+        carry = jax.eval_shape(lambda: agent.policy_carry(config, actions))
+        after, _ = jax.eval_shape(lambda *values: agent.policy_step(config, *values), shapes, carry, obs)
+        fits = jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, carry)
+        problem = "" if fits else "its state changes its shape"
+    except Exception as error:  # whatever JAX says of arrays that do not fit, or a parameter that is missing
+        problem = f"{type(error).__name__}: {str(error)[:200]}"
+    if problem:
+        raise PolicyFileError(f"{weights}: its arrays are not those of the config in policy.json ({problem}). Both "
+                              f"must agree. {EXPORT_AGAIN}.")
+    return of_agent(config, params, obs_shape, spec)
+
+
+def _parse_config(fields: Fields) -> DreamerConfig:
+    """Settings of an agent; those that a file of an earlier version lacks have their defaults."""
+    known = {field.name: field.default for field in dataclasses.fields(DreamerConfig)}
+    types = get_type_hints(DreamerConfig)
+    numbers: dict[str, Any] = {}
+    for key in fields.table:
+        if key not in known:
+            raise PolicyFileError(f"{fields.name}: {key!r} is no setting of this version. The settings are those of "
+                                  "dreamer.config.DreamerConfig. Use a newer version of this program, or remove it.")
+        default, choices = known[key], get_args(types[key]) if get_origin(types[key]) is Literal else ()
+        value = fields.rule(key, functools.partial(_is_like, default), f"must be of the kind of {default!r}")
+        if choices and value not in choices:
+            fields.rule(key, lambda value: False, f"must be one of {list(choices)}")
+        if key in WIDTHS or key == "mults":
+            fields.rule(key, lambda value: min(np.ravel(value), default=0) >= 1, "must be at least 1")
+        numbers[key] = tuple(value) if isinstance(value, list) else value
     try:
-        table = json.loads(name.read_text())
-        known = ((KIND, SCHEMA), (export.KIND, export.SCHEMA), (export.AGENT_KIND, export.SCHEMA))
-        if (table["kind"], table["schema"]) in known:
-            return table
-        problem = f"kind {table['kind']!r}, schema {table['schema']} is not known here"
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        problem = f"not readable as a policy's description ({error!r})"
-    raise ValueError(f"{name}: {problem}. Give the folder that dreamer.policy.save, export_agent or export_policy "
-                     "wrote.")
+        return DreamerConfig(**numbers)
+    except ValueError as error:
+        raise PolicyFileError(f"{fields.name}: {error} {EXPORT_AGAIN}.") from error
 
 
-def _nest(flat: dict[str, Any]) -> Params:
+def _is_like(default: Any, value: Any) -> bool:
+    """Whether a value of JSON may take the place of a setting's default."""
+    if isinstance(default, tuple):
+        like = default[0] if default else ""
+        return isinstance(value, list) and len(value) <= 64 and all(_is_like(like, item) for item in value)
+    if isinstance(default, int) and not isinstance(default, bool):
+        return _is_whole(value) and 0 <= value <= 1e12
+    if isinstance(default, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, type(default))
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _nest(flat: dict[str, np.ndarray], name: str) -> Params:
     """{"a/b": x} -> {"a": {"b": x}}."""
     tree: Params = {}
-    for name, value in flat.items():
-        *parents, last = name.split("/")
+    for key, value in flat.items():
+        *parents, last = key.split("/")
         branch = tree
         for parent in parents:
             branch = branch.setdefault(parent, {})
+            if not isinstance(branch, dict):
+                raise PolicyFileError(f"{name}: {key!r} lies in {parent!r}, which is an array itself. {EXPORT_AGAIN}.")
         branch[last] = value
     return tree
 
 
-def _load_agent(path: Path, table: dict[str, Any], obs_shape: ObsShape) -> Policy:
-    """What `export_agent` wrote, after a check of its files."""
-    import onnxruntime
-
-    for name, wanted in table["files"].items():
-        if not (path / name).is_file() or export.sha256((path / name).read_bytes()) != wanted:
-            raise ValueError(f"{path / name}: missing, or its SHA-256 is not the one in policy.json ({wanted}). Copy "
-                             "or export the policy again.")
-    session = onnxruntime.InferenceSession(str(path / "policy.onnx"), providers=["CPUExecutionProvider"])
-    state = [entry["name"] for entry in table["carry"]]
-    inputs, outputs = table["onnx"]["inputs"], table["onnx"]["outputs"]
-    after = len(outputs) - len(state)
+def _of_agent_file(checked: CheckedPolicy) -> Policy:
+    """What `export_agent` wrote."""
+    contract, session = checked.contract, make_session(checked)
+    assert isinstance(contract, AgentContract)
+    state = [entry.name for entry in contract.carry]
+    after = len(contract.outputs) - len(state)
 
     def call(carry: dict[str, Any], obs: Any) -> tuple[dict[str, Any], Any]:
         named = obs if isinstance(obs, dict) else {export.SINGLE: obs}
         arrays = {**named, **{f"carry_{name}": carry[name] for name in state}}
-        results = session.run(outputs, {name: np.asarray(arrays[name]) for name in inputs})
+        results = session.run(list(contract.outputs), {name: np.asarray(arrays[name]) for name in contract.inputs})
         return dict(zip(state, results[after:], strict=True)), results[0]
 
-    return Policy(obs_shape, _zero_carry(table), call)
+    return Policy(contract.observation, _zero_carry(contract), call)
 
 
-def _zero_carry(table: dict[str, Any]) -> dict[str, np.ndarray]:
-    return {entry["name"]: np.zeros(entry["shape"], entry["dtype"]) for entry in table["carry"]}
-
-
-def _load_exported(path: Path, table: dict[str, Any]) -> Policy:
-    """A vehicle's policy file. Its hashes are checked by the bridge, not here."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(str(path / "policy.onnx"), providers=["CPUExecutionProvider"])
-    names = [entry["name"] for entry in table["carry"]]
-    inputs, outputs = table["onnx"]["inputs"], table["onnx"]["outputs"]
-    low, high = (np.asarray(table["action"][name]) for name in ("low", "high"))
+def _of_vehicle_file(checked: CheckedPolicy) -> Policy:
+    """A vehicle's policy file."""
+    contract, session = checked.contract, make_session(checked)
+    assert isinstance(contract, Contract)
+    names = [entry.name for entry in contract.carry]
+    low, high = np.asarray(contract.low), np.asarray(contract.high)
 
     def call(carry: dict[str, Any], obs: Any) -> tuple[dict[str, Any], Any]:
-        feed = dict(zip(inputs, [np.asarray(obs), *(np.asarray(carry[name]) for name in names)], strict=True))
-        action, *values = session.run(outputs, feed)
+        feed = dict(zip(contract.inputs, [np.asarray(obs), *(np.asarray(carry[name]) for name in names)], strict=True))
+        action, *values = session.run(list(contract.outputs), feed)
         return dict(zip(names, values, strict=True)), low + (high - low) * (np.asarray(action, np.float64) + 1) / 2
 
-    image = table["image"]
-    return Policy((image["height"], image["width"], image["channels"]), _zero_carry(table), call)
+    return Policy((contract.height, contract.width, 3), _zero_carry(contract), call)
+
+
+def _zero_carry(contract: Contract | AgentContract) -> dict[str, np.ndarray]:
+    return {entry.name: np.zeros(entry.shape, entry.dtype) for entry in contract.carry}

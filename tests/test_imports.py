@@ -1,11 +1,17 @@
-"""Imports point one way: sysid -> whill_mjx; dreamer and bridge stand alone; two doors and one room look upwards."""
+"""Imports point one way, without circles; packages meet at their doors, and all may import `bridge.policy`."""
 
 from __future__ import annotations
 
 import ast
+import importlib
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from benchmarks.import_graph import circles, floors, import_graph
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
@@ -15,6 +21,9 @@ DOORS = {
     "bridge/simulate.py": {"whill_mjx"},  # the simulator behind the topics
 }
 ROOMS = {"whill_mjx/learning": {"dreamer"}}  # belongs to the first
+
+READER = "bridge.policy"
+"""The one reader of policy files, which all packages may import."""
 
 pytestmark = pytest.mark.quick
 
@@ -38,11 +47,85 @@ def test_imports_point_one_way(path):
     own = relative.parts[0]
     looking_up = DOORS.get(relative.as_posix(), set()) | ROOMS.get(relative.parent.as_posix(), set())
     allowed = {own} | ALLOWED[own] | looking_up
-    outside = {name.split(".")[0] for name in imported(path)} & {*PACKAGES, "benchmarks", "tests"}
+    names = {name for name in imported(path) if name != READER}
+    outside = {name.split(".")[0] for name in names} & {*PACKAGES, "benchmarks", "tests"}
     assert outside <= allowed
+
+
+def test_the_reader_of_policy_files_needs_only_numpy_and_onnxruntime():
+    own = sorted((ROOT / "bridge" / "policy").glob("*.py"))
+    names = {name for path in own for name in imported(path) if name != READER and not name.startswith(f"{READER}.")}
+    assert {name.split(".")[0] for name in names} - sys.stdlib_module_names == {"numpy", "onnxruntime"}
+
+
+def test_only_the_face_of_the_reader_is_imported_by_others():
+    outside = {name for path in modules() if path.parent.name != "policy" for name in imported(path)}
+    assert not [name for name in outside if name.startswith(f"{READER}.")]
 
 
 def test_nothing_imports_the_doors():
     doors = {door.removesuffix(".py").replace("/", ".") for door in DOORS}
     importers = {path.name for path in modules() if doors & set(imported(path))}
     assert not importers
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    assert circles(import_graph(ROOT, (*PACKAGES, "benchmarks"))) == []
+
+
+def test_sysid_has_nine_floors_at_most():
+    """The longest chain of imports from a command down to what imports nothing of the package."""
+    assert floors(import_graph(ROOT, ("sysid",)), "sysid") <= 9
+
+
+def test_circles_and_floors_are_counted_in_functions_and_for_type_checking_too(tmp_path):
+    package = tmp_path / "house"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "roof.py").write_text("from house import wall\n")
+    (package / "wall.py").write_text("def build():\n    from house.floor import lay\n    return lay\n")
+    (package / "floor.py").write_text("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from . import wall\n")
+    graph = import_graph(tmp_path, ("house",))
+    assert circles(graph) == [["house.floor", "house.wall"]] and floors(graph, "house") == 2
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_of_one_another_what_the_page_of_public_names_lists(package):
+    page = (ROOT / "docs/api.md").read_text().partition("## Between the packages")[2]
+    listed: set[str] = set()
+    for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE):
+        names = re.findall(r"`([\w.]+)`", row)
+        whole = [name for name in names if not name.startswith(".")]
+        stem = whole[0].split(".")[0] if len(whole[0].split(".")) < 3 else whole[0].rpartition(".")[0]
+        listed |= {*whole, *(stem + name for name in names if name.startswith("."))}
+    used = {name for path in modules() if path.relative_to(ROOT).parts[0] == package for name in modules_used(path)}
+    others = {name for name in used if name.split(".")[0] in PACKAGES and name.split(".")[0] != package}
+    assert others <= listed
+
+
+def modules_used(path):
+    """As `imported`, with the module itself where a package's module is imported by name."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                yield inside if (ROOT / inside.replace(".", "/")).with_suffix(".py").exists() else node.module
+
+
+@pytest.mark.parametrize("package", ["whill_mjx", "sysid", "dreamer"])
+def test_public_names_can_be_imported_and_others_are_refused_by_name(package):
+    door = importlib.import_module(package)
+    assert 10 <= len(door.__all__) <= 20
+    assert all(getattr(door, name) is not None and name in dir(door) for name in door.__all__)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = door.no_such_name
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_python_m_package_lists_its_commands(package):
+    said = subprocess.run([sys.executable, "-m", package], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    listed = re.findall(rf"python -m ({package}\.\w+) +(\S.*)", said)
+    assert all((ROOT / name.replace(".", "/")).with_suffix(".py").exists() for name, _ in listed)
+    assert listed or package == "dreamer"

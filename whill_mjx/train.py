@@ -42,6 +42,7 @@ from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
+from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.folders import Claim, claim_folder, write_whole
 from whill_mjx.heartbeat import Heartbeat, say
@@ -359,11 +360,10 @@ def _has_lines(path: Path) -> bool:
 
 def _fitted(log: Path, out: Path, stage: Stage) -> Path:
     """Vehicle file fitted to a driving log; its result is said in a few lines."""
-    from sysid import fit_dataset
+    from sysid import FitConfig, fit_dataset
     from sysid.command_line import progress_bar
     from sysid.pages.fit_page import in_words
     from sysid.search.fitting import expected_steps
-    from sysid.search.settings import FitConfig
 
     stage(f"vehicle: fitting to the driving log {log.name}, usually 1 to 3 minutes")
     config = FitConfig(quick=True)
@@ -511,16 +511,16 @@ def evaluate_policy(
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:
     """Write a policy file."""
     task = preset.task
-    spec, _, _ = load_vehicle(vehicle)
+    course = make_course(preset, vehicle)
     contract = PolicyContract(
         action_low=(task.v_min, -task.omega_max),
         action_high=(task.v_max, task.omega_max),
         task=options.task,
         rate_hz=10.0,
         action_repeat=task.action_repeat,
-        camera=dataclasses.asdict(spec.camera),
+        camera=camera_contract(course.env.model, course.params),
     )
-    step, carry = policy_of(options, preset, result, make_course(preset, vehicle))
+    step, carry = policy_of(options, preset, result, course)
     try:
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:

@@ -118,10 +118,18 @@ def test_changed_byte_is_refused_with_both_hashes(folder):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("name", ["policy.json", "policy.onnx", "weights.npz"])
+@pytest.mark.parametrize("name", ["policy.json", "policy.onnx"])
 def test_missing_file_is_refused_by_name(folder, name):
     (folder / name).unlink()
     assert f"{name}: is missing" in refusal(folder)
+
+
+@pytest.mark.quick
+def test_a_vehicle_needs_no_archive_of_the_weights_but_does_not_take_a_damaged_one(folder):
+    (folder / "weights.npz").write_bytes(b"PK damaged")
+    assert "weights.npz: SHA-256" in refusal(folder)
+    (folder / "weights.npz").unlink()
+    np.testing.assert_allclose(Policy.load(folder).step(colour(255, 255, 255)), [0.3, 0.0], atol=1e-6)
 
 
 @pytest.mark.quick

@@ -205,7 +205,7 @@ def whill(tmp_path_factory):
     config = DesignConfig("whill_cr", folder / "next.csv", space=(5.0, 5.0), v_max=0.6, omega_max=0.8, seconds=3.0,
                           parameters=("pid_drive.kp", "forward_slip.eta"), count=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(design_module, "vehicle_plant", stand_in)
+        patch.setattr("sysid.intervals.design.vehicle_plant", stand_in)
         return folder, config, main(config)
 
 
@@ -231,8 +231,8 @@ def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
 
 @quick
 def test_a_room_that_every_drive_leaves_is_refused(monkeypatch):
-    monkeypatch.setattr(design_module, "driven_paths", lambda objective: [np.array([[0, 0], [99, 99.0]])] * 2)
-    monkeypatch.setattr(design_module, "make_space", lambda *a: UNICYCLE_SPACE)
-    monkeypatch.setattr(design_module, "set_values", lambda params, names, values: values)
+    monkeypatch.setattr("sysid.intervals.design.driven_paths", lambda objective: [np.array([[0, 0], [99, 99.0]])] * 2)
+    monkeypatch.setattr("sysid.intervals.design.make_space", lambda *a: UNICYCLE_SPACE)
+    monkeypatch.setattr("sysid.intervals.design.set_values", lambda params, names, values: values)
     with pytest.raises(ValueError, match="leaves 8 x 8 m in every manoeuvre"):
         propose(WHILL_CR, None, candidates=candidates("straight", "turn", seconds=2.0), plant=unicycle_plant())

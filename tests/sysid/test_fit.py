@@ -106,7 +106,7 @@ def test_held_out_trials_never_reach_the_fit(planted, monkeypatch):
     def capture(plant, params, space, trials, noise):
         raise Reached(trials, noise)
 
-    monkeypatch.setattr(fit_module, "make_objective", capture)
+    monkeypatch.setattr("sysid.search.fitting.make_objective", capture)
     seen = []
     for spoil in (False, True):
         trials = tuple(

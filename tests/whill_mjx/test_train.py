@@ -78,6 +78,7 @@ def test_the_exported_policy_runs_on_the_bridge_and_gives_commands_within_the_li
 
     options, _ = run
     policy = Policy.load(options.out / "policy")
+    assert policy.contract.camera["frame"] == "base_footprint"
     policy.reset()
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     for frame in frames:

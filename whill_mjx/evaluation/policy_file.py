@@ -1,9 +1,12 @@
-"""Reads an exported policy file (docs/policy_file.md) as a JAX function of one instance, for evaluation in batches."""
+"""A policy file (docs/policy_file.md) as a JAX function of one instance, and the camera that a policy file describes.
+
+The file itself is read and checked by `bridge.policy`.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import json
+import dataclasses
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-SCHEMA, KIND = 1, "micromobility-policy"
+from bridge.policy import EXPORT_AGAIN, CheckedPolicy, Contract, PolicyFileError, make_session, read_policy
+from whill_mjx.effects.base import apply_chain
+from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.vehicle.dynamics import nominal_world, place
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.vehicle.model import VehicleModel
+from whill_mjx.vehicle.types import VehicleParams
+
 RUNTIMES = ("jax", "onnxruntime")
 RUN_FILE = "run.json"
 """In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
-EXPORT_AGAIN = "Export the policy again"
+OTHER_RUNTIME = "Evaluate with the runtime 'onnxruntime' instead."
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +50,8 @@ class PolicyFile:
     carry: dict[str, jax.ShapeDtypeStruct]
     step: Callable[[dict[str, jax.Array], jax.Array], tuple[dict[str, jax.Array], jax.Array]]
     """(carry, image (H, W, 3) uint8) -> carry, action (2,); traceable, and so is its vmap."""
+    unpacked: tempfile.TemporaryDirectory | None = None
+    """Folder of the vehicle file of a zip; it lives as long as this record."""
 
     def start(self) -> dict[str, jax.Array]:
         """Recurrent state at the start of an episode: all zeros."""
@@ -47,85 +59,104 @@ class PolicyFile:
 
 
 def load_policy(path: str | Path, runtime: str = "jax") -> PolicyFile:
-    """Policy of a folder.
+    """Policy of a folder, or of a zip of it.
 
     Args:
-        path: folder that holds policy.json and policy.onnx.
+        path: folder or zip that holds policy.json and policy.onnx.
         runtime: "jax" compiles the network with everything else; "onnxruntime" calls it on the host for one instance
             after the other: slow, but it is what runs on the vehicle.
 
     Raises:
-        ValueError: a part is missing, damaged or of another version; names file, value, rule and remedy.
+        PolicyFileError: a part is missing, damaged or of another version; names file, field, value, rule and remedy.
+        ValueError: unknown runtime.
     """
     path = Path(path)
     if runtime not in RUNTIMES:
         raise ValueError(f"unknown runtime {runtime!r}; use one of {RUNTIMES}.")
-    table = _read_table(path)
-    names = [entry["name"] for entry in table["carry"]]
-    carry = {
-        entry["name"]: jax.ShapeDtypeStruct(tuple(entry["shape"]), np.dtype(entry["dtype"])) for entry in table["carry"]
-    }
-    data = (path / "policy.onnx").read_bytes()
-    make = _jax_network if runtime == "jax" else _host_network
-    run = make(data, table["onnx"], carry, str(path / "policy.onnx"))
+    checked = read_policy(path)
+    contract = checked.contract
+    assert isinstance(contract, Contract)
+    carry = {entry.name: jax.ShapeDtypeStruct(entry.shape, np.dtype(entry.dtype)) for entry in contract.carry}
+    session = make_session(checked)
+    run = _jax_network(checked) if runtime == "jax" else _host_network(session, contract, carry)
 
     def step(state: dict[str, jax.Array], image: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        action, *values = run(image, *(state[name] for name in names))
-        after = {name: value.astype(carry[name].dtype) for name, value in zip(names, values, strict=True)}
+        action, *values = run(image, *(state[name] for name in carry))
+        after = {name: value.astype(carry[name].dtype) for name, value in zip(carry, values, strict=True)}
         return after, action
 
-    image, action = table["image"], table["action"]
-    vehicle = path / "vehicle.toml"
+    vehicle, unpacked = vehicle_file(path, checked)
     return PolicyFile(
-        path=path, task=table["task"], low=tuple(action["low"]), high=tuple(action["high"]), height=image["height"],
-        width=image["width"], rate_hz=float(table["rate_hz"]), action_repeat=int(table["action_repeat"]),
-        sha256=table["files"]["policy.onnx"], vehicle=vehicle if vehicle.is_file() else None, carry=carry, step=step,
+        path=path, task=contract.task, low=contract.low, high=contract.high, height=contract.height,
+        width=contract.width, rate_hz=contract.rate_hz, action_repeat=contract.action_repeat,
+        sha256=checked.files["policy.onnx"], vehicle=vehicle, carry=carry, step=step, unpacked=unpacked,
     )  # fmt: skip
 
 
-def _read_table(path: Path) -> dict[str, Any]:
-    """policy.json, checked against the files beside it."""
-    file = path / "policy.json"
-    if not file.is_file():
-        raise ValueError(f"{file}: does not exist. A policy is a folder that holds policy.json; unpack a zip first.")
+def camera_contract(model: VehicleModel, params: VehicleParams) -> dict[str, Any]:
+    """Camera of a policy file: its pose over level ground while the vehicle stands, and its field of view.
+
+    The vehicle file gives the camera in the chassis frame, but the chassis sinks and tilts on its suspension. What
+    somebody measures on the standing vehicle, and what the policy saw, is the pose in `base_footprint`: origin on the
+    ground below the reference point (middle of the driven axle), x forward, y left, z up.
+    """
+    level = dataclasses.replace(params, effects=tuple(e for e in params.effects if not _is_ground(model, e)))
+    position, rotation = camera_pose(model, place(model, level, 0.0, 0.0, 0.0).qpos)
+    right, _, forward = np.asarray(rotation, np.float64).T
+    pitch = np.arcsin(-forward[2])
+    angles = {"roll": np.arcsin(-right[2] / np.cos(pitch)), "pitch": pitch, "yaw": np.arctan2(forward[1], forward[0])}
+    lengths = dict(zip("xyz", np.asarray(position, np.float64), strict=True))
+    return {
+        "frame": "base_footprint",
+        **{name: round(float(value), 6) + 0.0 for name, value in {**lengths, **angles}.items()},
+        "fov_y": model.spec.camera.fov_y,
+    }
+
+
+def _is_ground(model: VehicleModel, effect: Any) -> bool:
+    """Whether an effect is a surface on the ground, such as a ramp."""
+    _, world = apply_chain((effect,), (effect.init(),), "world", nominal_world(model))
+    return bool(world.ground)
+
+
+def vehicle_file(path: Path, checked: CheckedPolicy) -> tuple[Path | None, tempfile.TemporaryDirectory | None]:
+    """The vehicle file beside the policy; that of a zip is unpacked."""
+    if checked.vehicle is None:
+        return None, None
+    if path.is_dir():
+        return path / "vehicle.toml", None
+    unpacked = tempfile.TemporaryDirectory()
+    file = Path(unpacked.name) / "vehicle.toml"
+    file.write_bytes(checked.vehicle)
+    return file, unpacked
+
+
+def _jax_network(checked: CheckedPolicy) -> Callable:
+    """The network as a JAX function, after a step on shapes alone."""
+    file, contract = f"{checked.path}/policy.onnx", checked.contract
+    names = list(contract.inputs), list(contract.outputs)
+    inputs, outputs = contract.tensors()
     try:
-        table = json.loads(file.read_text())
-        version = (table.get("schema"), table.get("kind"))
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"{file}: is not a JSON table ({error}). {EXPORT_AGAIN}.") from error
-    if version != (SCHEMA, KIND):
-        raise ValueError(f"{file}: schema and kind are {version}; this version reads {(SCHEMA, KIND)}. {EXPORT_AGAIN}.")
-    missing = {"image", "action", "rate_hz", "action_repeat", "carry", "onnx", "task", "files"} - set(table)
-    if missing:
-        raise ValueError(f"{file}: no field {sorted(missing)[0]!r}; the contract needs it. {EXPORT_AGAIN}.")
-    for name, wanted in table["files"].items():
-        if Path(name).name != name or not (path / name).is_file():
-            raise ValueError(f"{path / name}: is missing, but policy.json lists it. Copy the whole folder again.")
-        found = hashlib.sha256((path / name).read_bytes()).hexdigest()
-        if found != wanted:
-            raise ValueError(f"{path / name}: SHA-256 is {found}, but policy.json says {wanted}: the file was damaged "
-                             "or changed. Copy the whole folder again.")
-    return table
-
-
-def _jax_network(data: bytes, names: dict[str, Any], carry: dict[str, Any], file: str) -> Callable:
-    from whill_mjx.evaluation.onnx_network import Network
-
-    network = Network(data, file)
-    if (network.inputs, network.outputs) != (list(names["inputs"]), list(names["outputs"])):
-        raise ValueError(f"{file}: tensors {network.inputs} -> {network.outputs}, but policy.json says {names}. "
-                         f"{EXPORT_AGAIN}.")
+        network = Network(checked.network, file)
+        shapes = [jax.ShapeDtypeStruct(tensor.shape, np.dtype(tensor.dtype)) for tensor in inputs]
+        results = jax.eval_shape(network, *shapes) if (network.inputs, network.outputs) == names else ()
+    except Exception as error:  # an operator that is not known, or a model that only onnxruntime accepts
+        cause = str(error)[:300].removeprefix(f"{file}: ").removesuffix(f" {OTHER_RUNTIME}")
+        raise PolicyFileError(f"{file}: {cause} {OTHER_RUNTIME}") from error
+    found, wanted = [result.shape for result in results], [tensor.shape for tensor in outputs]
+    if found != wanted:
+        raise PolicyFileError(f"{file}: tensors {network.inputs} -> {network.outputs} of shapes {found}, but "
+                              f"policy.json says {names[0]} -> {names[1]} of {wanted}. Order and shapes must agree. "
+                              f"{EXPORT_AGAIN}.")
     return network
 
 
-def _host_network(data: bytes, names: dict[str, Any], carry: dict[str, Any], file: str) -> Callable:
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+def _host_network(session: Any, contract: Contract, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
+    """The network in onnxruntime, called from JAX."""
     shapes = (jax.ShapeDtypeStruct((2,), jnp.float32), *carry.values())
 
     def on_host(*values: Any) -> tuple[np.ndarray, ...]:
-        feed = {name: np.asarray(value) for name, value in zip(names["inputs"], values, strict=True)}
-        return tuple(session.run(list(names["outputs"]), feed))
+        feed = {name: np.asarray(value) for name, value in zip(contract.inputs, values, strict=True)}
+        return tuple(session.run(list(contract.outputs), feed))
 
     return lambda *values: jax.pure_callback(on_host, shapes, *values, vmap_method="sequential")

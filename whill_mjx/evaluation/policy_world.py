@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bridge.policy import Contract, read_policy
 from whill_mjx.command_line import OptionError
+from whill_mjx.evaluation.policy_file import vehicle_file
 from whill_mjx.folders import RUN_FILE
 from whill_mjx.tasks.tasks import TASKS
 
@@ -28,6 +31,8 @@ class PolicyWorld:
     height: int
     """Of the camera image [pixels]."""
     width: int
+    unpacked: tempfile.TemporaryDirectory | None = None
+    """Folder of the vehicle file of a zip; it lives as long as this record."""
 
 
 def find_policy(path: str | Path) -> Path:
@@ -41,26 +46,20 @@ def read_world(path: str | Path) -> PolicyWorld:
     """The world of a policy, or of the policy of a training.
 
     Raises:
-        OptionError: there is no policy, it is damaged, or its task is unknown.
+        PolicyFileError: there is no policy, or it is damaged.
+        OptionError: its task is unknown, or the run.json beside it is damaged.
     """
     folder = find_policy(path)
-    file = folder / "policy.json"
-    if not file.is_file():
-        raise OptionError(f"{path}: holds neither policy.json nor policy/policy.json. Give the folder of a policy or "
-                          "of a training; unpack a zip first.")
-    try:
-        table = json.loads(file.read_text(encoding="utf-8"))
-        task, (height, width) = str(table["task"]), (int(table["image"][name]) for name in ("height", "width"))
-        low, high = ([float(x) for x in table["action"][name]] for name in ("low", "high"))
-        limits = {"v_min": low[0], "v_max": high[0], "omega_max": high[1], "action_repeat": int(table["action_repeat"])}
-    except (ValueError, KeyError, TypeError, IndexError):
-        raise OptionError(f"{file}: task, image, action and action_repeat cannot be read. Export the policy again."
-                          ) from None  # fmt: skip
-    if task not in TASKS:
-        raise OptionError(f"{file}: unknown task {task!r} (known: {', '.join(TASKS)}). Export the policy again.")
-    vehicle = folder / "vehicle.toml"
-    fields = {**trained_fields(folder, task), **limits}
-    return PolicyWorld(task, fields, vehicle if vehicle.is_file() else None, height, width)
+    checked = read_policy(folder)
+    contract = checked.contract
+    assert isinstance(contract, Contract)
+    if contract.task not in TASKS:
+        raise OptionError(f"{folder}: unknown task {contract.task!r} (known: {', '.join(TASKS)}). Give --task.")
+    limits = {"v_min": contract.low[0], "v_max": contract.high[0], "omega_max": contract.high[1],
+              "action_repeat": contract.action_repeat}  # fmt: skip
+    vehicle, unpacked = vehicle_file(folder, checked)
+    fields = {**trained_fields(folder, contract.task), **limits}
+    return PolicyWorld(contract.task, fields, vehicle, contract.height, contract.width, unpacked)
 
 
 def trained_fields(policy: Path, task: str) -> dict[str, Any]:

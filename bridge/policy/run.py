@@ -1,0 +1,149 @@
+"""Reads a checked policy file and runs it on a vehicle, one image after the other."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.policy.contract import (
+    AGENT_KIND,
+    KIND,
+    AgentContract,
+    Contract,
+    check_kind,
+    parse_agent,
+    parse_contract,
+    parse_hashes,
+)
+from bridge.policy.parts import COPY_AGAIN, EXPORT_AGAIN, TABLE, Parts, PolicyFileError
+from bridge.policy.trial import Trial
+
+ZIP_STARTS = (b"PK\x03\x04", b"PK\x05\x06")
+"""First bytes of a zip, with members and without, by which numpy recognises an archive."""
+OPTIONAL = ("weights.npz",)
+"""Listed files that may be missing: no vehicle needs the archive of the weights, the largest part."""
+
+
+@dataclass(frozen=True)
+class CheckedPolicy:
+    """An exported policy of which every part was checked."""
+
+    path: str
+    contract: Contract | AgentContract
+    files: Mapping[str, str]
+    """SHA-256 of each listed file."""
+    network: bytes
+    """Serialised ONNX model."""
+    vehicle: bytes | None
+    """Vehicle file it was trained with, if it is inside."""
+
+
+def read_policy(path: str | Path, kinds: tuple[str, ...] = (KIND,)) -> CheckedPolicy:
+    """Read a policy of a folder or zip, after checking contract, hashes, network and one trial step.
+
+    Args:
+        path: folder or zip.
+        kinds: kinds that are accepted, of `KIND` and `AGENT_KIND`.
+
+    Raises:
+        PolicyFileError: with the file, the field, the value, the rule and the remedy.
+    """
+    with Parts(path) as parts:
+        name = parts.name(TABLE)
+        table = parts.table()
+        kind = check_kind(name, table, kinds)
+        contract = parse_agent(name, table) if kind == AGENT_KIND else parse_contract(name, table)
+        hashes = parse_hashes(name, table)
+        if isinstance(contract, Contract):
+            _check_vehicle(parts, hashes, contract)
+        kept = {part: parts.checked(part, want, keep=part in ("policy.onnx", "vehicle.toml"))
+                for part, want in hashes.items() if part not in OPTIONAL}
+        with Trial() as trial:  # its process starts while the large archive is read
+            _check_archive(parts, hashes)
+            import onnxruntime  # noqa: F401  (meanwhile: `make_session` needs it)
+
+            trial.run(parts.name("policy.onnx"), kept["policy.onnx"], *contract.tensors())
+    return CheckedPolicy(str(path), contract, hashes, kept["policy.onnx"], kept.get("vehicle.toml"))
+
+
+def make_session(policy: CheckedPolicy) -> Any:
+    """Build the onnxruntime session of a checked policy; the trial has already built it once."""
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(3)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # one thread has the lower tail latency on a vehicle's shared cores
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(policy.network, options, providers=["CPUExecutionProvider"])
+
+
+class Policy:
+    """A recurrent policy. `step` maps one image to one command and advances the state."""
+
+    def __init__(self, contract: Contract, session: Any, name: str = "policy") -> None:
+        self.contract = contract
+        self.name = name
+        self._session = session
+        self._low = np.array(contract.low)
+        self._span = np.array(contract.high) - self._low
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Policy":
+        """Return the policy of a folder or zip, after checking hashes, version, shapes and one trial step.
+
+        Raises:
+            PolicyFileError: with the file, the field, the value, the rule and the remedy.
+        """
+        checked = read_policy(path)
+        contract = checked.contract
+        assert isinstance(contract, Contract)
+        policy = cls(contract, make_session(checked), str(path))
+        policy.step(np.zeros((contract.height, contract.width, 3), np.uint8))  # the first step takes longest
+        policy.reset()
+        return policy
+
+    def reset(self) -> None:
+        """Forget everything seen: the zero state is the start of an episode."""
+        self._carry = [np.zeros(spec.shape, spec.dtype) for spec in self.contract.carry]
+
+    def step(self, image: np.ndarray) -> np.ndarray:
+        """Return the command (2,): v [m/s], omega [rad/s], for an image (H, W, 3) uint8 rgb8.
+
+        The command is not limited here (bridge/safety.py does), and it is NaN where the action or the new state is
+        not finite: a spoilt state must never hide behind a finite action.
+
+        Raises:
+            ValueError: the image has another shape or dtype than the policy was trained with.
+        """
+        want = (self.contract.height, self.contract.width, 3)
+        if image.shape != want or image.dtype != np.uint8:
+            raise ValueError(f"{self.name}: image {image.shape} {image.dtype}; the policy needs {want} uint8 rgb8. "
+                             "Convert it with bridge.image.to_rgb8.")
+        feed = dict(zip(self.contract.inputs, [image, *self._carry], strict=True))
+        action, *self._carry = self._session.run(list(self.contract.outputs), feed)
+        if not all(np.isfinite(value).all() for value in self._carry if value.dtype.kind == "f"):
+            return np.full(2, np.nan)
+        return self._low + self._span * (np.asarray(action, np.float64) + 1) / 2
+
+
+def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:
+    """Raise where the archive of the weights is there, and is another than the exported one or no archive at all."""
+    for part in OPTIONAL:
+        if part in hashes and parts.has(part):
+            start = parts.checked(part, hashes[part])
+            if start not in ZIP_STARTS:
+                raise PolicyFileError(f"{parts.name(part)}: is not a numpy archive (begins with {start!r}). It must "
+                                      f"hold plain arrays. {EXPORT_AGAIN}.")
+
+
+def _check_vehicle(parts: Parts, hashes: Mapping[str, str], contract: Contract) -> None:
+    """Raise where the vehicle file beside the policy is not that of its training."""
+    digest = hashes.get("vehicle.toml", contract.vehicle_sha256)
+    if digest != contract.vehicle_sha256:
+        raise PolicyFileError(f"{parts.name('vehicle.toml')}: SHA-256 {digest}, but the policy was trained with the "
+                              f"vehicle of vehicle_sha256 {contract.vehicle_sha256!r}. Both must agree. "
+                              f"{COPY_AGAIN}.")
