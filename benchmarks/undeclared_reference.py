@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks import kept
 from benchmarks.plant.make import make_log
 from sysid.logs.log import Log, load_log
 from sysid.missing.days import Reference
@@ -91,11 +91,15 @@ def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Pre
     """A set ready for `find_missing`; its days are driven, and fitted, where that was not done before."""
     days = reference_days(work, driven, number)
     path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
+    reference = None
     if path.exists():
-        reference = pickle.loads(path.read_bytes())
-    else:
+        try:
+            reference = kept.loads(path.read_bytes())
+        except kept.KeptError as error:
+            print(f"{path}: {error}; the set is fitted again", flush=True)
+    if reference is None:
         reference = reference_of(days, config)
-        _write(path, pickle.dumps(reference))
+        _write(path, kept.dumps(reference))
     return prepare(reference, days[0].spec, config)
 
 

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
+import re
 import shutil
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +69,7 @@ def save(
     temporary = folder / f"{UNFINISHED}{target.name}"
     temporary.mkdir()  # with the user's own rights: colleagues resume and evaluate too
     try:
-        with _checkpointer(ocp) as writer:
+        with _os_errors(target), _checkpointer(ocp) as writer:
             writer.save((temporary / "state").resolve(), {k: v for k, v in arrays.items() if v.size})
         meta = {
             "schema": SCHEMA,
@@ -84,6 +88,22 @@ def save(
     for old in complete(folder)[:-KEEP]:
         shutil.rmtree(old, ignore_errors=True)
     return target
+
+
+@contextmanager
+def _os_errors(target: Path) -> Iterator[None]:
+    """Turn the errors by which tensorstore reports a full disk, say, into an OSError that names the checkpoint."""
+    logger = logging.getLogger("absl")  # orbax logs the tracebacks of its threads besides
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    except ValueError as error:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(target)) from None
+    finally:
+        logger.disabled = before
 
 
 def is_whole(state: Any) -> bool:
@@ -173,6 +193,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
         if meta["schema"] == SCHEMA and {"config", "files", "env_steps", "wall_s"} <= set(meta):
             return meta
         problem = f"schema {meta['schema']} is not {SCHEMA}, or an entry is missing"
+    except FileNotFoundError:
+        raise Damaged(f"{path}: there is no such checkpoint. Resume from an older one or start anew.") from None
     except (ValueError, KeyError, TypeError) as error:
         problem = f"not readable as JSON with the expected entries ({error})"
     raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")

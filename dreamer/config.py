@@ -173,7 +173,8 @@ class DreamerConfig:
 
     def __post_init__(self) -> None:
         numbers = {field.name: value for field in dataclasses.fields(self)
-                   if isinstance(value := getattr(self, field.name), (int, float))}  # fmt: skip
+                   if isinstance(value := getattr(self, field.name), (int, float))
+                   and not field.name.startswith("pretrain")}  # fmt: skip
         sizes = ("deter", "hidden", "units", "stoch", "blocks", "depth", "patch", "patch_units", "bins", "batch_size",
                  "replay_capacity", "imag_horizon", "scan_unroll")  # fmt: skip
         general = [

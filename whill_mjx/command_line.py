@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import io
 import math
 import os
 import select
@@ -16,7 +17,7 @@ import sys
 import threading
 import typing
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
@@ -26,6 +27,8 @@ GRACE_S = 1.2
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 STOPPED = "stopped; every file is whole or absent. Give the same command again."
 DONE, FAILED, REFUSED, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+FRAME = " \t-─━│┃╭╮╰╯"
+"""Of the boxes that tyro draws."""
 REMEDIES = {
     errno.ENOSPC: "Free some space or choose another place.",
     errno.EDQUOT: "Free some space or choose another place.",
@@ -137,13 +140,10 @@ def run(
         positional: options without a default are given without their names.
         args: words instead of those of the command line.
     """
-    import tyro
-
     listen()
     _State.working, _State.stopped = True, stopped
-    config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
     try:
-        chosen: Any = tyro.cli(options, prog=program(), description=description, config=config, args=args)
+        chosen = _parsed(options, description, positional, args)
         check_options(chosen)
         main(chosen)
         sys.stdout.flush()
@@ -169,6 +169,22 @@ def program() -> str:
     """This command as it is typed: `python -m MODULE`, or the name of the console script."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     return f"python -m {spec.name.removesuffix('.__main__')}" if spec else os.path.basename(sys.argv[0])
+
+
+def _parsed(options: type, description: str | None, positional: bool, args: list[str] | None) -> Any:
+    """The options of the command line; what tyro finds wrong in them becomes one line."""
+    import tyro
+
+    config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
+    with redirect_stderr(io.StringIO()) as complaint:
+        try:
+            return tyro.cli(options, prog=program(), description=description, config=config, args=args)
+        except SystemExit as ended:
+            if ended.code in (0, None):
+                raise
+    lines = [line.strip(FRAME) for line in complaint.getvalue().splitlines()]
+    text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
+    raise OptionError(f"{text.rstrip('.')}. See --help.")
 
 
 def one_line(error: BaseException) -> str:
@@ -254,7 +270,7 @@ def leave(line: str, flush: bool = True) -> None:
         for child in sys.modules["multiprocessing"].active_children():
             child.kill()
     try:
-        os.write(2, f"\n{line}\n".encode())
+        os.write(2, f"{'' if flush else chr(10)}{line}\n".encode())  # a bar may stand on the line of the cursor
     finally:
         os._exit(INTERRUPTED)
 

@@ -248,6 +248,8 @@ def record_motion(
 
 
 def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
+    if not names:
+        raise OptionError("--manoeuvre: none is given. Name one, or leave the option out for figure_eight.")
     if len(set(names)) != len(names):
         raise ValueError(f"--manoeuvre {' '.join(names)}: one is given twice. Repeat a drive with --replicates.")
     if options.replicates < 1:
@@ -256,7 +258,7 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     if absent:
         raise ValueError(f"--held-out {absent[0]}: not among the manoeuvres driven ({', '.join(names)}). Add it there.")
     if options.out.exists():
-        raise OptionError(f"--out {options.out}: exists already; a drive replaces nothing. Choose another folder.")
+        raise OptionError(f"--out {options.out}: exists already; a drive never replaces another. Choose a new folder.")
     check_place("--out", options.out)
 
 

@@ -118,8 +118,12 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
         plan = make_plan(options)
     with claim_folder(options.out, KIND, OUTPUTS) as claim:
         claim.settle({})  # an evaluation replaces an earlier one as a whole
-        with Heartbeat() as heartbeat:
-            return evaluate(plan, began, heartbeat.stage)
+        try:
+            with Heartbeat() as heartbeat:
+                return evaluate(plan, began, heartbeat.stage)
+        except OSError as error:
+            error.add_note("The figures so far are in the lines above; the same command begins anew.")
+            raise
 
 
 def make_plan(options: EvaluateOptions) -> Plan:

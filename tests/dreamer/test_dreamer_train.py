@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import multiprocessing
+import os
+import resource
 import signal
 import time
 from random import Random
@@ -9,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 from dreamer_toys import corridor_env, counting_env, tiny_config, train_without_end
+from filelock import FileLock
 
 from dreamer import checkpoint, iteration
 from dreamer.train import evaluate, train
@@ -205,6 +208,53 @@ def test_an_unfinished_checkpoint_is_not_seen(saved):
     (folder / ".unfinished-x").mkdir()
     (folder / "000000000900").mkdir()  # without meta.json, which is written last
     assert read()[1]["env_steps"] == 300
+
+
+def test_a_full_disk_is_an_os_error_that_names_the_checkpoint_and_the_older_ones_stay(saved, capfd):
+    folder, read = saved
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large.*000000000400"):
+            checkpoint.save(folder, {"a": np.random.default_rng(0).normal(size=5000)}, CONFIG, 400)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(path.name for path in folder.iterdir()) == ["000000000200", "000000000300"]
+    assert read()[1]["env_steps"] == 300 and "Traceback" not in capfd.readouterr().err
+
+
+def test_what_a_killed_process_left_of_a_checkpoint_is_removed_by_the_next(saved):
+    folder, _ = saved
+    (folder / ".unfinished-000000000400" / "state").mkdir(parents=True)
+    checkpoint.save(folder, {"a": np.zeros(3)}, CONFIG, 500)
+    assert sorted(path.name for path in folder.iterdir()) == ["000000000300", "000000000500"]
+
+
+def test_a_checkpoint_has_the_rights_that_the_users_umask_lets_it_have(saved):
+    folder, _ = saved
+    umask = os.umask(0)
+    os.umask(umask)
+    folders = [path for path in folder.rglob("*") if path.is_dir()]
+    assert folders and {path.stat().st_mode & 0o777 for path in folders} == {0o777 & ~umask}
+
+
+@pytest.mark.quick
+def test_another_seed_or_a_second_process_in_the_folder_of_a_run_is_refused(tmp_path):
+    checkpoint.save(tmp_path / "checkpoints", {"a": np.zeros(3)}, CONFIG, 100)
+    (tmp_path / "config.json").write_text(json.dumps({"seed": 0}))
+    with pytest.raises(ValueError, match="begun with seed 0, not 1. Give that seed, or another folder"):
+        train(ENV, CONFIG, tmp_path, 400, 1, **QUIET)
+    with FileLock(tmp_path / ".training.lock"):
+        with pytest.raises(ValueError, match="another process trains there"):
+            train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("wrong", [{"lr": float("nan")}, {"lr": 0.0}, {"batch_size": 0}, {"horizon": float("inf")},
+                                   {"entropy_scale": -1.0}, {"blocks": 0}])  # fmt: skip
+def test_settings_that_cannot_be_meant_are_refused_by_name(wrong):
+    with pytest.raises(ValueError, match=f"DreamerConfig.{next(iter(wrong))} = .*: it must"):
+        dataclasses.replace(CONFIG, **wrong)
 
 
 def test_another_configuration_or_environment_is_refused_by_name(saved):

@@ -47,6 +47,25 @@ def test_a_number_out_of_its_range_ends_with_one_line_and_code_2(words, told, ca
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize("words, told", [
+    (["--steps", "many"], "--steps"), (["--nope", "1"], "--nope"), (["--share"], "--share"),
+    (["--steps", "1.5"], "--steps"),
+])  # fmt: skip
+def test_words_that_are_no_options_end_with_one_line_and_code_2(words, told, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(Options, lambda options: pytest.fail("begun"), None, args=words)
+    line = capsys.readouterr().err
+    assert ended.value.code == command_line.REFUSED and line.count("\n") == 1
+    assert line.startswith("error: ") and told in line and line.endswith("See --help.\n")
+
+
+def test_help_is_printed_as_it_is(capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(Options, lambda options: pytest.fail("begun"), "What it does.", args=["--help"])
+    printed = capsys.readouterr()
+    assert ended.value.code == 0 and "What it does." in printed.out and "--levels.position" in printed.out
+
+
 def test_numbers_in_their_ranges_pass_and_so_does_a_number_that_is_left_out():
     check_options(Options())
     check_options(Options(steps=1, share=1.0, seeds=(3, 4)))

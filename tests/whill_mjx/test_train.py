@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,17 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from whill_mjx import command_line
 from whill_mjx.batch import make_batch
+from whill_mjx.command_line import OptionError
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.evaluation.intervals import wilson_interval
 from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.folders import FolderRefused
 from whill_mjx.learning.checks import Stopper, keep_best, read_best
 from whill_mjx.learning.setup import find_preset, functional_env, make_training_env, with_repeat
 from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
 from whill_mjx.tasks.tasks import Corridor, ObstacleCourse, make_task
-from whill_mjx.train import TrainOptions, choose_preset, main, prepare_vehicle
+from whill_mjx.train import Trained, TrainOptions, begin, best_params, choose_preset, main
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +209,119 @@ def test_a_bad_vehicle_file_is_refused_before_anything_is_written(tmp_path):
     bad = tmp_path / "vehicle.toml"
     bad.write_text("schema = 9\nkind = 'micromobility-vehicle'\n")
     with pytest.raises(ValueError, match="schema is 9; this version reads schema 1"):
-        prepare_vehicle(TrainOptions(out=tmp_path / "run", vehicle=bad))
+        main(TrainOptions(out=tmp_path / "run", vehicle=bad, preset="smoke"))
     assert not (tmp_path / "run").exists()
+
+
+def contents(folder):
+    """Every file below a folder and its bytes, but for the locks."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "lock" not in path.name)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def heavier(folder, path):
+    """The vehicle file of a run with another mass, as a file of its own."""
+    text = (folder / "vehicle.toml").read_text()
+    body = text.index("[body.mass]")
+    path.write_text(text[:body] + text[body:].replace("value = 52.0", "value = 140.0", 1))
+    return path
+
+
+@pytest.mark.parametrize("name, words", [
+    ("vehicle", r"vehicle is whill_cr \w+ there and whill_cr \w+ here"),
+    ("seed", "seed is 0 there and 7 here"),
+    ("learner", "learner is dreamer there and ppo here"),
+    ("layout", "task.layout is randomised there and fixed here"),
+    ("lr", "dreamer.lr is 0.0003 there and 0.01 here"),
+])  # fmt: skip
+def test_another_run_in_the_same_folder_is_refused_and_nothing_is_touched(run, name, words, tmp_path):
+    options, _ = run
+    value = {"vehicle": heavier(options.out, tmp_path / "heavy.toml"), "seed": 7, "learner": "ppo", "layout": "fixed",
+             "lr": 0.01}[name]  # fmt: skip
+    before = contents(options.out)
+    with pytest.raises(FolderRefused, match=f"holds another run: .*{words}.*Choose another --out, or give the old"):
+        main(dataclasses.replace(options, **{name: value}))
+    assert contents(options.out) == before
+
+
+def test_a_vehicle_file_that_was_changed_in_the_folder_of_a_run_is_refused(run, tmp_path):
+    options, _ = run
+    target = options.out / "vehicle.toml"
+    before = target.read_text()
+    heavier(options.out, target)
+    try:
+        for given in (None, options.vehicle):
+            with pytest.raises(OptionError, match=r"whill_cr \w+.* whill_cr \w+"):
+                main(dataclasses.replace(options, vehicle=given))
+    finally:
+        target.write_text(before)
+
+
+def test_more_steps_and_what_changes_no_result_may_be_asked_of_a_run(run):
+    options, _ = run
+    more = dataclasses.replace(options, steps=400, episodes=3, export="last", vehicle=None)
+    before = contents(options.out)
+    with begin(more, choose_preset(more)) as vehicle:
+        assert vehicle == options.out / "vehicle.toml"
+    assert contents(options.out) == before
+
+
+@pytest.mark.parametrize("loss", ["no folder", "no file", "broken file", "broken arrays"])
+def test_lost_best_parameters_do_not_cost_a_finished_training_its_export(run, loss, tmp_path, capsys):
+    options, _ = run
+    shutil.copytree(options.out / "best", tmp_path / "best")
+    told = json.loads((options.out / "best.json").read_text())
+    (tmp_path / "best.json").write_text("{" if loss == "broken file" else json.dumps(told))
+    if loss == "no folder":
+        shutil.rmtree(tmp_path / "best")
+    elif loss == "no file":
+        (tmp_path / "best.json").unlink()
+    elif loss == "broken arrays":
+        largest = max((tmp_path / "best").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
+        largest.write_bytes(b"")
+    asked = dataclasses.replace(options, out=tmp_path)
+    assert best_params(asked, choose_preset(asked), Trained({}, 10**6, 0, 0.0)) is None
+    assert loss == "no file" or "best" in capsys.readouterr().err
+
+
+def test_colleagues_can_read_what_the_users_umask_lets_them(run):
+    options, _ = run
+    umask = os.umask(0)
+    os.umask(umask)
+    for path in options.out.rglob("*"):
+        if path.is_dir() and "policy" not in path.parts:
+            assert path.stat().st_mode & 0o777 == 0o777 & ~umask, path
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ["report.html", "vehicle.toml", "policy"])
+def test_a_folder_with_somebodys_files_is_refused_before_the_training(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FolderRefused, match=f"holds {name} of something else"):
+        main(TrainOptions(out=tmp_path, vehicle=Path("whill_cr"), preset="smoke"))
+    assert contents(tmp_path) == {name: b"mine"}
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("words, told", [
+    ("--steps 0", "--steps 0: must be at least 1"), ("--seed -1", "--seed -1: must be at least 0"),
+    ("--lr nan", "--lr nan: must be above 0"), ("--lr -1", "--lr -1"), ("--episodes 0", "--episodes 0"),
+    ("--train-ratio inf", "--train-ratio inf"), ("--stop-success 2", "--stop-success 2.0: must be at least 0 and"),
+    ("--checkpoint-every-s nan", "--checkpoint-every-s nan"), ("--instances 0", "--instances 0"),
+    ("--devices 99", "devices = 99"), ("--task nope", r"--task nope: unknown \(known: obstacle_course, corridor\)"),
+    ("--preset nope", "--preset nope: unknown"), ("--safety nope", "--safety nope: unknown"),
+    ("--vehicle nope", "unknown vehicle 'nope'.*whill_cr_paper"), ("--change lr=NaN", "lr=NaN"),
+    ("--change batch_size=0", "batch_size = 0: it must be at least 1"), ("--change nope=1", "changes no setting"),
+    ("--change mults=3", "give a finite value like it"), ("--log nowhere", "--log nowhere: no such dataset"),
+    ("--vehicle whill_cr --log .", "nothing is fitted"),
+    ("--learner ppo --instances 3 --change minibatches=7", "split"),
+])  # fmt: skip
+def test_a_mistake_in_the_command_ends_with_one_line_and_writes_nothing(words, told, tmp_path, capsys):
+    command = ["--preset", "smoke", "--out", str(tmp_path / "run"), *words.split()]
+    with pytest.raises(SystemExit, match=f"error: .*{told}") as ended:
+        command_line.run(TrainOptions, main, None, args=command)
+    assert ended.value.code == command_line.REFUSED and capsys.readouterr().err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.quick

@@ -115,6 +115,8 @@ def _parse_axis(text: str) -> Axis:
             numbers = np.array([float(part.removesuffix("x")) for part in parts])
     except ValueError as error:
         raise ValueError(f"{text!r}: {error}; write NAME=a,b,c or NAME=low:high:count.") from error
+    if not numbers.size:
+        raise ValueError(f"{text!r}: has no value; write NAME=a,b,c or NAME=low:high:count.")
     if not np.isfinite(numbers).all() or (name in ("light", "latency_s") and numbers.min() < 0):
         raise ValueError(f"{text!r}: values must be finite, and light and latency_s not negative.")
     return Axis(name, tuple(float(np.round(number, 9)) for number in numbers), relative)

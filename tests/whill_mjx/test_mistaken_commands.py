@@ -1,0 +1,113 @@
+"""A mistake in a command ends with one line that names it, before any work, and nothing is written."""
+
+from __future__ import annotations
+
+import shlex
+
+import marker_seeker
+import pytest
+
+from whill_mjx import command_line, drive, evaluate, export_mjcf, look
+
+pytestmark = pytest.mark.quick
+COMMANDS = {
+    "look": (look.Look, look.main, True),
+    "drive": (drive.DriveOptions, drive.cli, False),
+    "export_mjcf": (export_mjcf.Options, export_mjcf.main, True),
+    "evaluate": (evaluate.EvaluateOptions, evaluate.main, False),
+}
+
+
+def mistaken(command, words, capsys):
+    """Exit code and the single line that a command ends with."""
+    options, main, positional = COMMANDS[command]
+    with pytest.raises(SystemExit) as ended:
+        command_line.run(options, main, None, positional=positional, args=shlex.split(words))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return ended.value.code, lines[0]
+
+
+@pytest.mark.parametrize("command, words, told", [
+    ("look", "--scene nope", "unknown scene 'nope' (known: obstacle_course, corridor, gallery, all)"),
+    ("look", "--layout nope", "--layout nope: unknown (known: randomised, fixed)"),
+    ("look", "--worlds 0", "--worlds 0: must be at least 1"),
+    ("look", "--steps 0", "--steps 0: must be at least 1"),
+    ("look", "--scale -3", "--scale -3: must be at least 1"),
+    ("look", "--seed -1", "--seed -1: must be at least 0"),
+    ("look", "--out a.jpg", "--out a.jpg: must end in .png"),
+    ("look", "--out folder.png", "--out folder.png: is a folder"),
+    ("look", "--out file/a.png", "file is a file, not a folder"),
+    ("drive", "--out new --noise --noise-levels.position nan", "--noise-levels.position nan: must be at least 0"),
+    ("drive", "--out new --noise-levels.v -1", "--noise-levels.v -1.0: must be at least 0"),
+    ("drive", "--out new --scenario.dt 0", "--scenario.dt 0.0: must be at least 0.001"),
+    ("drive", "--out new --scenario.dt nan", "--scenario.dt nan"),
+    ("drive", "--out new --scenario.length inf", "--scenario.length inf"),
+    ("drive", "--out new --scenario.omega 0", "--scenario.omega 0.0: a figure-eight needs"),
+    ("drive", "--out new --sensors.imu-rate nan", "imu_rate is nan Hz"),
+    ("drive", "--out new --manoeuvre", "--manoeuvre: none is given"),
+    ("drive", "--out new --replicates 0", "--replicates 0: must be at least 1"),
+    ("drive", "--out new --seed -1", "--seed -1: must be at least 0"),
+    ("drive", "--out new --vehicle nope", "unknown vehicle 'nope'"),
+    ("drive", "--out new --vehicle nope.toml", "nope.toml: no such vehicle file"),
+    ("drive", "--out new --manoeuvre nope", "unknown manoeuvre 'nope'"),
+    ("drive", "--out new --effects nope", "unknown effect 'nope'"),
+    ("drive", "--out file", "--out file: exists already"),
+    ("drive", "--out file/new", "file is a file, not a folder"),
+    ("export_mjcf", "whill_cr --physics-dt nan", "--physics-dt nan: must be at least 0.0001"),
+    ("export_mjcf", "whill_cr --physics-dt 0", "--physics-dt 0.0: must be at least 0.0001"),
+    ("export_mjcf", "nope", "unknown vehicle 'nope'"),
+    ("export_mjcf", "nope.toml", "nope.toml: no such vehicle file"),
+    ("export_mjcf", "whill_cr --out file", "--out file: exists already"),
+    ("export_mjcf", "whill_cr --out file/new", "file is a file, not a folder"),
+    ("evaluate", "nowhere", "nowhere"),
+    ("evaluate", "planner --task nope", "--task nope: unknown (known: obstacle_course, corridor)"),
+    ("evaluate", "planner --episodes 0", "--episodes 0: must be at least 1"),
+    ("evaluate", "planner --batch -2", "--batch -2: must be at least 1"),
+    ("evaluate", "planner --sweep-episodes 0", "--sweep-episodes 0: must be at least 1"),
+    ("evaluate", "planner --spread nan", "--spread nan: must be at least 0 and below 1"),
+    ("evaluate", "planner --near -1", "--near -1.0: must be at least 0"),
+    ("evaluate", "planner --seed -1", "--seed -1: must be at least 0"),
+    ("evaluate", "planner --videos -1", "--videos -1: must be at least 0"),
+    ("evaluate", "planner --set gates", "'gates' is not NAME=VALUE"),
+    ("evaluate", "planner --set gate=1", "no field 'gate'"),
+    ("evaluate", "planner --set goal_x=nan", "--set goal_x=nan: must be finite"),
+    ("evaluate", "planner --set gate_x=1", "--set gate_x=1: 1 numbers where 2 are needed"),
+    ("evaluate", "planner --set max_steps=0", "must be at least 1"),
+    ("evaluate", "planner --sweep nope=1", "unknown axis 'nope'"),
+    ("evaluate", "planner --sweep nope", "'nope' is no axis of a sweep"),
+    ("evaluate", "planner --sweep light=1:2", "light=1:2"),
+    ("evaluate", "planner --sweep light=0:1:0", "light=0:1:0"),
+    ("evaluate", "planner --sweep light=0:1:-4", "light=0:1:-4"),
+    ("evaluate", "planner --sweep light=nan", "light=nan"),
+    ("evaluate", "planner --sweep yaw_scrub.nope=1", "no parameter 'nope'"),
+    ("evaluate", "planner --sweep vehicle=whill_cr,nope", "unknown vehicle 'nope'"),
+    ("evaluate", "planner --baselines nope", "'nope' is not NAME=VALUE"),
+    ("evaluate", "planner --vehicle nope", "unknown vehicle 'nope'"),
+    ("evaluate", "planner --out file", "--out file: is a file, not a folder"),
+    ("evaluate", "planner --out file/new", "file is a file, not a folder"),
+    ("evaluate", "planner --out mine", "--out mine: holds report.html of something else"),
+    ("evaluate", "planner --out training", "--out training: holds results of whill_mjx.train, not of"),
+])  # fmt: skip
+def test_a_mistake_ends_with_one_line_and_code_2(command, words, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "report.html").write_text("mine")
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training" / "run.json").write_text('{"kind": "whill_mjx.train", "identity": {"seed": 0}}')
+    before = sorted(tmp_path.rglob("*"))
+    code, line = mistaken(command, words, capsys)
+    assert told in line and code == command_line.REFUSED
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"preset": {"task": 3}}', "\ufeff{}"])
+def test_a_damaged_note_beside_a_policy_is_named(text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    marker_seeker.write(tmp_path / "run" / "policy")
+    (tmp_path / "run" / "run.json").write_text(text, encoding="utf-8")
+    code, line = mistaken("evaluate", "run/policy --out new", capsys)
+    assert code == command_line.REFUSED and "run.json: does not say how the policy's task was set" in line
+    assert not (tmp_path / "new").exists()
