@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from whill_mjx.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
+from whill_mjx.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
+    say_loading()
 
 import jax
 import numpy as np
@@ -31,7 +33,6 @@ from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
 from whill_mjx.folders import claim_folder
-from whill_mjx.heartbeat import Heartbeat, say
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 

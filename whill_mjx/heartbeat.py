@@ -24,6 +24,12 @@ def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def say_loading() -> None:
+    """Say that the imports of a command take some seconds, unless only its help is asked for."""
+    if not {"-h", "--help"} & set(sys.argv[1:]):
+        say("loading JAX and the simulator")
+
+
 class Heartbeat:
     """A thread that writes at least every `every_s` seconds: a refreshed progress bar, or the stage and its time.
 

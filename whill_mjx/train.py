@@ -29,9 +29,11 @@ from whill_mjx.command_line import (
     refusing,
     run,
 )
+from whill_mjx.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
+    say_loading()
 
 import jax
 
@@ -45,7 +47,6 @@ from whill_mjx.evaluation.episodes import Course, episode_keys
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.folders import Claim, claim_folder, write_whole
-from whill_mjx.heartbeat import Heartbeat, say
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
@@ -224,6 +225,7 @@ def finish(
     """Train, evaluate and export."""
     learn = train_policy if options.learner == "dreamer" else train_baseline
     result = learn(options, preset, vehicle, stage)
+    stage("preparing the final evaluation")
     if not parallel.is_first_process():
         return {}
     best = best_params(options, preset, result) if options.learner == "dreamer" else None
