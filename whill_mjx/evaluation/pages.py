@@ -60,6 +60,7 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         axes.plot(x[index, length[index]], y[index, length[index]], "o", color=ENDINGS[how], markersize=3)
         axes.set_title(f"{ENDED[how]}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
         _scale_bar(axes)
+    figure.get_layout_engine().set(h_pad=0.12)
     _legend(figure, {ending(episodes, index) for index in range(count)})
     return _save(figure, out)
 
@@ -79,7 +80,8 @@ def _legend(figure: Any, endings: set[str]) -> None:
     handles: list[Any] = [Line2D([], [], color=colour, label=f"path: {ENDED[how]}")
                           for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
     handles += [
-        Line2D([], [], color="grey", marker="o", linestyle="", markersize=4, label="end of the drive (start: left)"),
+        Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
+               label="end of the drive axle's path (the body reaches farther)"),
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]

@@ -31,10 +31,11 @@ def reward_curve(
     for label, value in (reference or {}).items():
         top.axhline(value, linestyle="--", linewidth=1, color="grey")
         top.annotate(label, (0.01, value), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
-    for name, label in (("eval/success", "success"), ("eval/collision", "collision"), ("eval/timeout", "time-out")):
+    for name, label, colour in (("eval/success", "success", "tab:green"), ("eval/collision", "collision", "tab:red"),
+                                ("eval/timeout", "time-out", "tab:orange")):  # fmt: skip
         points = [(line["env_steps"], line[name]) for line in lines if name in line]
         if points:
-            bottom.plot(*zip(*points, strict=True), "o-", label=label, markersize=3, linewidth=1)
+            bottom.plot(*zip(*points, strict=True), "o-", color=colour, label=label, markersize=3, linewidth=1)
     top.set_ylabel("return")
     bottom.set_ylabel("share of evaluation episodes")
     each = f"each {action_repeat} control periods" if action_repeat > 1 else "each one control period"
