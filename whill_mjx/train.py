@@ -242,7 +242,7 @@ def finish(
     seconds = time.perf_counter() - started
     evaluation["seconds"] = {"this_command": seconds, "training": result.wall_s}
     write_json(options.out / "evaluation.json", evaluation)
-    write_index(options.out, evaluation)
+    write_index(options.out, evaluation, options.task)
     share, interval = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
     baselines = [name for name in ("planner", "random") if name in evaluation]
     others = ", ".join(f"{name} {evaluation[name]['success']:.0%}" for name in baselines)

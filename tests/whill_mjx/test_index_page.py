@@ -21,8 +21,8 @@ def run(tmp_path):
     for name in ("drives.png", "failures.mp4", "fit/report.html", "fit/trajectories.png", "policy/policy.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-    evaluation = {"task": {"name": "obstacle_course"}, "env_steps": 400, "policy": FIGURES, "random": FIGURES}
-    return tmp_path, write_index(tmp_path, evaluation)
+    evaluation = {"env_steps": 400, "policy": FIGURES, "random": FIGURES}
+    return tmp_path, write_index(tmp_path, evaluation, "obstacle_course")
 
 
 def test_the_page_shows_what_is_there_and_every_link_leads_to_a_file(run):

@@ -33,7 +33,7 @@ FILES = {
 DRIVERS = {"policy": "the policy", "planner": "planner that knows the scene", "random": "random actions"}
 
 
-def write_index(out: Path, evaluation: dict[str, Any]) -> Path:
+def write_index(out: Path, evaluation: dict[str, Any], task: str) -> Path:
     """Write the page of a training; it links the files beside it by relative paths."""
     there = {name: text for name, text in PICTURES.items() if (out / name).is_file()}
     training = [name for name in there if not name.startswith("fit/")]
@@ -44,7 +44,7 @@ def write_index(out: Path, evaluation: dict[str, Any]) -> Path:
         sections.append(html.Section("Vehicle", lead + _shown(fit)))
     files = [(name, text) for name, text in FILES.items() if (out / name).is_file()]
     sections.append(html.Section("Files", html.links(files)))
-    title = f"Training: {evaluation['task']['name'].replace('_', ' ')}"
+    title = f"Training in the task {task.replace('_', ' ')}"
     write_whole(out / INDEX, html.html_page(title, sections, f"{evaluation['env_steps']} environment steps"))
     return out / INDEX
 
