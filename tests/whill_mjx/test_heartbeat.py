@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 from tqdm import tqdm
 
+from whill_mjx import train
 from whill_mjx.heartbeat import Heartbeat, say
 
 pytestmark = pytest.mark.quick
@@ -60,3 +62,20 @@ def test_a_line_does_not_tear_an_open_bar(capsys):
     with tqdm(total=10, desc="training", file=sys.stderr, ascii=True):
         say("two evaluations in a row")
     assert "two evaluations in a row" in re.split("[\r\n]+", capsys.readouterr().err)
+
+
+def test_a_training_shows_signs_of_life_in_a_slow_stage_and_a_line_before_each(monkeypatch, tmp_path):
+    """The stage, faked here, lasts until the heartbeat has written about it three times."""
+    lines = Lines("compiling", 4)
+
+    def slow(options, preset, vehicle, stage):
+        stage("compiling")
+        assert lines.enough.wait(60), "no sign of life during the slow stage"
+        raise InterruptedError
+
+    monkeypatch.setattr(train, "train_policy", slow)
+    monkeypatch.setattr(train, "Heartbeat", lambda: Heartbeat(every_s=0.05))
+    monkeypatch.setattr(sys, "stderr", lines)
+    with pytest.raises(InterruptedError):
+        train.main(train.TrainOptions(out=tmp_path / "run", vehicle=Path("whill_cr_ramp"), preset="smoke"))
+    assert lines.written.startswith("preset smoke; devices: ")
