@@ -3,25 +3,36 @@ PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
 BIN := $(VENV)/bin
+COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: train test test-quick test-long lint clean
+
+# $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
+define beating
+	@( seconds=0; while sleep 8; do seconds=$$((seconds + 8)); echo "  installing for $$seconds s"; done ) & beat=$$!; \
+		trap "kill $$beat 2>/dev/null" EXIT INT TERM; $(1)
+endef
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is older than 3.11: call make with PYTHON=python3.11 (or newer)"; exit 1; }
 	@$(PYTHON) -m ensurepip --version >/dev/null 2>&1 || \
 		{ echo "$(PYTHON) cannot make virtual environments; on Debian or Ubuntu run: apt-get install -y python3-venv"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@echo "Making the virtual environment $(VENV)."
+	$(call beating,$(PYTHON) -m venv $(VENV))
 
 # jax[cuda13] is added where nvidia-smi answers.
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	@if nvidia-smi -L >/dev/null 2>&1; then extra=cuda; else extra=; fi; \
-		$(PIP) install --quiet -c constraints.txt -e ".$${extra:+[$$extra]}"
+	@if nvidia-smi -L >/dev/null 2>&1; then \
+		echo "Installing whill-mjx with JAX for NVIDIA GPUs into $(VENV): once, several minutes and GB."; \
+		else echo "Installing whill-mjx with JAX, MuJoCo and ONNX into $(VENV): once, 1 to 5 minutes, 1.5 GB."; fi
+	$(call beating,$(PIP) install -c constraints.txt -e "$$(nvidia-smi -L >/dev/null 2>&1 && echo '.[cuda]' || echo .)")
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) install --quiet -c constraints.txt -e ".[dev,ros]"
+	@echo "Installing what the tests need (pytest, ruff, mypy, ROS 2 messages) into $(VENV): once, about a minute."
+	$(call beating,$(PIP) install -c constraints.txt -e ".[dev$(COMMA)ros]")
 	@touch $@
 
 train: $(VENV)/.installed

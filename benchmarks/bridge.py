@@ -373,7 +373,7 @@ def installed_mb(*names: str) -> float:
 
 def main() -> None:
     parts = ("steady", "episodes", "faults", "fuzz", "policy")
-    parser = argparse.ArgumentParser(description="Measure the bridge.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge", description="Measure the bridge.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each steady run")
     parser.add_argument("--resets", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5, help="of each fault")

@@ -215,4 +215,4 @@ def _draw_kernel(position, rotation, scene, quality=None, tiling=None):
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, prog="python -m benchmarks.camera", description=__doc__))

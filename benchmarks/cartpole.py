@@ -214,7 +214,9 @@ def summary(
 
 def parse() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.cartpole", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", choices=("balance", "swingup", "grid"), default="balance")
     parser.add_argument("--sight", choices=("image", "joints", "both"), default="image")
     parser.add_argument("--preset", default="size12m", help="tiny, cpu, size1m, size12m, ...")

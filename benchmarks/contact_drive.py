@@ -51,7 +51,10 @@ def largest_errors(seed: int, iterations: int) -> dict[str, tuple[float, float]]
 
 def main() -> None:
     """Fit every chair, print and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.contact_drive", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002], help="days of the plant")
     parser.add_argument("--iterations", type=int, default=60, help="of the fit: until nothing moves")
     options = parser.parse_args()

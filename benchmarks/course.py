@@ -75,13 +75,13 @@ def run(options: argparse.Namespace) -> None:
     if not (options.out / "policy").exists():
         print("no proofs of sight: there is no policy file", flush=True)
         return
-    told = evaluation_command.main(
+    evaluated = evaluation_command.main(
         evaluation_command.EvaluateOptions(
             str(options.out / "policy"), out=options.out / "sight", episodes=options.episodes, layout=options.layout,
             blind=BLIND, videos=0,
         )
     )  # fmt: skip
-    note["sight"] = {kind: told["drivers"][f"policy {kind}"]["success"] for kind in BLIND}
+    note["sight"] = {kind: evaluated["drivers"][f"policy {kind}"]["success"] for kind in BLIND}
     write_json(options.out / "course.json", {**note, **result})
 
 
@@ -130,8 +130,8 @@ def together(options: argparse.Namespace) -> None:
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
     options.out.mkdir(parents=True, exist_ok=True)
-    told = {"task": options.task, "layout": options.layout, "exploring_starts": starts}
-    (options.out / "environment.json").write_text(json.dumps(told) + "\n")
+    noted = {"task": options.task, "layout": options.layout, "exploring_starts": starts}
+    (options.out / "environment.json").write_text(json.dumps(noted) + "\n")
     result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
                    checkpoint_every_s=1e9, progress=False, time_limit_s=limit)
     if result.env_steps < steps:
@@ -254,7 +254,9 @@ def planner(options: argparse.Namespace) -> None:
 
 def parse() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.course", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("run")
     one.add_argument("--out", type=Path, required=True)
@@ -268,7 +270,7 @@ def parse() -> argparse.Namespace:
     one.add_argument("--steps", type=int)
     one.add_argument("--eval-every", type=int, help="environment steps; the preset's unless given")
     one.add_argument("--lr", type=float, help="learning rate; the preset's unless given")
-    one.add_argument("--targets", action="store_true", help="the world model also tells what the simulator knows")
+    one.add_argument("--targets", action="store_true", help="the world model also predicts what the simulator knows")
     one.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="other settings of the learner")
     one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
@@ -300,7 +302,7 @@ def parse() -> argparse.Namespace:
     several.set_defaults(call=collect)
     tried = commands.add_parser("ablation")
     tried.add_argument("--runs", type=Path, nargs="+", required=True)
-    tried.add_argument("--metric", default="return", help="name of what is told of the evaluations in the log")
+    tried.add_argument("--metric", default="return", help="figure of the evaluations in the log")
     tried.add_argument("--device", required=True, help="on which they were made")
     tried.set_defaults(call=ablation)
     ceiling = commands.add_parser("planner")

@@ -24,19 +24,19 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     evaluation it is the last evaluation inside the run; it counts as `stopped` where steps were left.
 
     Raises:
-        ValueError: there is no note, and no device is told; or there was no evaluation.
+        ValueError: there is no note and no device is given; or there was no evaluation.
     """
     metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
     if (path / "course.json").exists():
-        told = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
-        starts = {"exploring_starts": told["exploring_starts"]} if "exploring_starts" in told else {}
+        noted = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
+        starts = {"exploring_starts": noted["exploring_starts"]} if "exploring_starts" in noted else {}
         return {**starts, **json.loads((path / "course.json").read_text()), "metrics": metrics}
     if device is None:
         raise ValueError(f"{path}: has no course.json. Name the device on which it was made (--device).")
     begun = json.loads((path / "run.json").read_text())
-    told = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
-    told["exploring_starts"] = begun["preset"]["exploring_starts"]
-    content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **told}
+    noted = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
+    noted["exploring_starts"] = begun["preset"]["exploring_starts"]
+    content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **noted}
     if (path / "evaluation.json").exists():
         return {**content, **json.loads((path / "evaluation.json").read_text())}
     last = last_evaluation(path, begun["preset"], metrics)

@@ -47,4 +47,4 @@ def main(options: Options) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, prog="python -m benchmarks.environment", description=__doc__))

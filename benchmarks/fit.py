@@ -310,4 +310,4 @@ def main(settings: Benchmark) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Benchmark, description=__doc__))
+    main(tyro.cli(Benchmark, prog="python -m benchmarks.fit", description=__doc__))

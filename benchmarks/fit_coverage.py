@@ -59,7 +59,7 @@ def draw_truth(space: Space, random: np.random.Generator) -> np.ndarray:
 
 
 def typical_vehicle() -> Any:
-    """The physical model with all that a fit gives it, at usual values: on most bounds nothing could be told."""
+    """The physical model with all that a fit gives it, at usual values: at most bounds no log determines them."""
     start = with_effects(preset_params(WHILL_CR, "physical"), MORE)
     return set_values(start, tuple(USUAL), jnp.asarray(list(USUAL.values())))
 
@@ -92,7 +92,7 @@ def plant_log(folder: Path, seed: int, vehicle: str = "chair") -> tuple[Log, dic
 def plant_values(chair: Any, spec: VehicleSpec) -> dict[str, float]:
     """The values of the physical model that a chair of the contact plant has.
 
-    Speeds and poses tell forces only per mass: the model's mass is nominal, so that its torques and its inertias are
+    Speeds and poses fix forces only per mass: the model's mass is nominal, so that its torques and its inertias are
     the chair's times the ratio of the masses. The chair's controller is sampled: its integral counts every jump of the
     wanted speed half a tick too long, which is a feed-forward of that speed (Euler and Maclaurin).
     """
@@ -140,7 +140,7 @@ def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, 
     """Fit one log, KIND_NNN with a kind of `KINDS`, and note each known value with its estimate.
 
     Args:
-        folder: where what the log tells is kept, as evidence/LABEL.npz.
+        folder: keeps what the intervals are made of, as evidence/LABEL.npz.
         compiled: folder of what the processes share.
     """
     log, truth = _drawn(label, compiled)
@@ -152,7 +152,7 @@ def job(label: str, iterations: int, folder: Path, compiled: Path) -> dict[str, 
 
 
 def told_again(kept: Mapping[str, Any], compiled: Path) -> dict[str, Any]:
-    """A job's result with what the present code says that its log tells where its search ended; no search is done.
+    """A job's result with the evidence of its log where its search ended, by the present code; no search is done.
 
     Args:
         kept: result of `job`.
@@ -175,7 +175,7 @@ def _rows(estimates: Sequence[Estimate], truth: Mapping[str, float]) -> dict[str
 
 
 def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
-    """Keep what a log tells, whole or not at all."""
+    """Keep the evidence of a log, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
     np.savez_compressed(temporary, names=np.array(space.names), low=space.low, high=space.high, initial=space.initial,
@@ -184,7 +184,7 @@ def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
 
 
 def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """A job's result with the intervals that the present code gives to what its log tells.
+    """A job's result with the intervals that the present code makes from its evidence.
 
     Raises:
         ValueError: that was not kept.
@@ -206,23 +206,23 @@ def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def summarise(results: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, dict[str, Any]]:
     """Figures of all logs of one kind: coverage and median half-width per parameter, lowest and highest coverage.
 
-    An interval counts where the log tells the parameter: elsewhere it is the parameter's range, which always holds it.
+    An interval counts where the log determines the parameter: elsewhere it is the whole range.
     """
     figures, covered = {}, []
     names = list(dict.fromkeys(name for one in results for name in one["parameters"]))
     for name in names:
         rows = [one["parameters"][name] for one in results if name in one["parameters"]]
-        told = [row for row in rows if row["identifiable"] and name not in NUISANCE]
-        figures[f"{prefix}identifiable_{name}"] = figure([len(told) / len(rows)], "share")
-        if not told:
+        known = [row for row in rows if row["identifiable"] and name not in NUISANCE]
+        figures[f"{prefix}identifiable_{name}"] = figure([len(known) / len(rows)], "share")
+        if not known:
             continue
-        inside = float(np.mean([row["low"] <= row["truth"] <= row["high"] for row in told]))
+        inside = float(np.mean([row["low"] <= row["truth"] <= row["high"] for row in known]))
         figures[f"{prefix}coverage_90_{name}"] = figure([inside], "share")
         figures[f"{prefix}half_width_90_{name}"] = figure(
-            [float(np.median([(row["high"] - row["low"]) / 2 for row in told]))], "of the parameter")
+            [float(np.median([(row["high"] - row["low"]) / 2 for row in known]))], "of the parameter")
         figures[f"{prefix}bias_{name}"] = figure(
-            [float(np.median([row["value"] - row["truth"] for row in told]))], "of the parameter")
-        if len(told) >= TOLD * len(rows):
+            [float(np.median([row["value"] - row["truth"] for row in known]))], "of the parameter")
+        if len(known) >= TOLD * len(rows):
             covered.append(inside)
     figures[f"{prefix}coverage_90_min"] = figure([min(covered)], "share")
     figures[f"{prefix}coverage_90_max"] = figure([max(covered)], "share")

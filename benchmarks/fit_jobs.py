@@ -70,7 +70,7 @@ def read_results(folder: Path, pattern: str = "*") -> list[dict[str, Any]]:
 
 def on_device(figures: dict[str, dict[str, Any]], results: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """The figures, said to be of the device and versions of the first result rather than of where they are collected;
-    no version is told where that result did not note any."""
+    no version is given where that result noted none."""
     first = results[0]
     return {name: {**one, "device": first.get("device", one["device"]), "versions": first.get("versions", {})}
             for name, one in figures.items()}
@@ -100,7 +100,7 @@ def reporter(label: str) -> Callable[[int, str], None]:
 class RememberedCosts:
     """Costs J of an objective that are kept in a file: a search that was stopped goes on as if it had not been.
 
-    A search with the same seed asks for the same points again as long as it is told the same costs.
+    A search with the same seed asks for the same points again as long as it gets the same costs.
     """
 
     def __init__(self, objective: Any, path: Path):

@@ -80,7 +80,7 @@ def mrclam(settings: Benchmark) -> None:
     log = load_mrclam(settings.shared / "data" / "measured" / "mrclam")
     log = split(log, ("robot1", "robot2", "robot3"), ("robot4", "robot5"))
     for preset in settings.presets:
-        # Poses alone tell little of such slow robots within a bin: a short global search finds the better starts.
+        # Within a bin, poses alone contain little on such slow robots: a short global search finds the better starts.
         config = replace(measured_config(settings, preset), method="both", trials=96, starts=3)
         fit = fit_log(thin(log, settings.windows // 2), config)
         figures = gains(evaluate(fit, log.held_out)["summary"]["held_out"], f"mrclam_{preset}")

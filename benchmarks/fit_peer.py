@@ -10,7 +10,7 @@ vehicle with all else from a fit to another day, as a vehicle file has it, or, w
 it yet. Both fit the controller's gains and limit, the yaw inertia and where the centre of mass is, to poses and
 speeds, from the preset's values of these, by Levenberg and Marquardt, and know the delay of a command. The clock of
 each stops when its error, the mean position RMSE over the fitted trials, is as low as both get in the end; for the
-one whose model is nearer to the truth that is long before its own end, which is told as well. Beside it stands the
+one whose model is nearer to the truth that is long before its own end, which is reported too. Beside it stands the
 search of `sysid.fit` without options, which looks for other valleys too (`default_search`).
 """
 
@@ -233,8 +233,8 @@ def fit_ours(log: Log, settings: Peer) -> tuple[Curve, Curve, dict[str, float], 
     def by_default(objective: Any) -> np.ndarray:
         points = starts.draw(objective, [0], log.spec.track, 0)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS)
-        told = make_features_objective(objective, log.spec.track).renewed(coarse.u)
-        return gradient_search(told, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
+        binned = make_features_objective(objective, log.spec.track).renewed(coarse.u)
+        return gradient_search(binned, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
 
     def timed(search: Callable[[Any], np.ndarray]) -> tuple[Curve, np.ndarray, float]:
         began = time.perf_counter()
@@ -309,4 +309,4 @@ def main(settings: Peer) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Peer, description=__doc__))
+    main(tyro.cli(Peer, prog="python -m benchmarks.fit_peer", description=__doc__))

@@ -22,7 +22,7 @@ from sysid.logs.log import Log, load_log
 from sysid.search import least_squares, starts, tpe
 from sysid.search.comparison import Judge, arrivals, trace
 from sysid.search.fitting import Problem, choose, fitted_plant
-from sysid.search.result import Trace
+from sysid.search.result import Stages, Trace
 from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
 from sysid.search.studies import BATCH
 from sysid.search.valleys import from_all, gradient_search
@@ -88,8 +88,10 @@ def start_job(
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
     def whitened() -> dict[str, Any]:
-        told = choose(problem.objective, np.array(coarse["u"]), track, FitConfig(), report)
-        found, _, _ = gradient_search(told, problem.space, np.array([coarse["u"]]), iterations, FitConfig(), report)
+        stages = Stages(report, 3)
+        objective = choose(problem.objective, np.array(coarse["u"]), track, FitConfig(), stages)
+        at = np.array([coarse["u"]])
+        found, _, _ = gradient_search(objective, problem.space, at, iterations, FitConfig(), stages)
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
     drawn = staged(folder / f"{label}_drawn.json", lambda: timed(draw))
@@ -191,15 +193,16 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int, who
     drawn = time.perf_counter()
     coarse = starts.fit(problem.objective, points, track, FEATURE_ITERATIONS, report)
     fitted = time.perf_counter()
-    told = choose(problem.objective, coarse.u, track, FitConfig(), report)
+    stages = Stages(report, 3)
+    objective = choose(problem.objective, coarse.u, track, FitConfig(), stages)
     ends = np.concatenate([coarse.u[None], coarse.starts[1:]])
-    fine = from_all(told, problem.space, ends, iterations, robust=True, progress=report)
+    fine = from_all(objective, problem.space, ends, iterations, robust=True, progress=report)
     seconds = time.perf_counter() - began
     done = {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
             "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn}
     if not whole:
         return done
-    found, _, _ = gradient_search(told, problem.space, fine.u[None], iterations, FitConfig(), report)
+    found, _, _ = gradient_search(objective, problem.space, fine.u[None], iterations, FitConfig(), stages)
     return {**done, "whole": time.perf_counter() - began, "whole_cost": found.cost}
 
 

@@ -160,7 +160,9 @@ def compare_times(other: Path, repeats: int) -> dict[str, dict]:
 
 def main() -> None:
     """Count, compare and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.house", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--against", type=Path, help="another checkout of the project")
     parser.add_argument("--lowered", action="store_true", help="compare lowered programs with it")
     parser.add_argument("--times", action="store_true", help="compare seconds with it")

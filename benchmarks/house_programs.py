@@ -123,7 +123,7 @@ def loop() -> float:
 
 def main() -> None:
     """Write digests or seconds as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.house_programs", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file to write")
     parser.add_argument("--lowered", action="store_true", help="digests of programs")
     parser.add_argument("--times", action="store_true", help="seconds of a fit and a loop")

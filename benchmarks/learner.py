@@ -127,7 +127,9 @@ def _bind(function: Callable[..., Any], arguments: tuple) -> Callable[[], Any]:
 
 def arguments() -> argparse.ArgumentParser:
     """The options."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.learner", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--preset", help="size; size12m on an accelerator and cpu on a CPU unless given")
     parser.add_argument("--batch-size", type=int)
     parser.add_argument("--unroll", type=int)

@@ -141,7 +141,7 @@ def one_loop(
 
 
 def config_of(settings: Benchmark, vehicle: Any) -> LoopConfig:
-    """A delay of the outside pose that was named is held: it was told by the gyro, not by the base model."""
+    """A delay of the outside pose that was named is held: the gyro determines it, not the base model."""
     held = (PARAMETER,) if any(effect.name == NAME for effect in vehicle.effects) else ()
     return LoopConfig(physics_dt=settings.physics_dt, held=held)
 
@@ -202,7 +202,7 @@ def ladder(settings: Benchmark) -> None:
                         f"{stem}_high": figure([high], "share")}
     figures["drive_gain_over_fitted_base"] = figures["ladder_gain_all_position"]
     show(figures)
-    tell(loops)
+    report(loops)
     record("measured", CLAIM, figures, replacing="ladder_")
 
 
@@ -224,7 +224,7 @@ def change(settings: Benchmark) -> None:
             gain, low, high = interval(trials, loop["before"], loop["after"], column)
             figures |= {f"{stem}_gain": figure([gain], "share"), f"{stem}_gain_low": figure([low], "share"),
                         f"{stem}_gain_high": figure([high], "share")}
-        tell([loop])
+        report([loop])
     show(figures)
     record("measured", CLAIM, figures)
 
@@ -257,7 +257,7 @@ def mrclam(settings: Benchmark) -> None:
         config = LoopConfig(physics_dt=settings.physics_dt, held=("command_delay.delay",))
         loop = one_loop(settings, f"mrclam_{robot}", thin(log, settings.robot_windows), config, False,
                         start=start)
-        tell([loop])
+        report([loop])
         false.append(float(is_false(loop, fastest)))
         delays.append(float(any(TIMES & {one["name"], *one["class"]} for one in loop["effects"])))
     figures = {"mrclam_false": figure([sum(false)], f"of {len(ROBOTS)} robots"),
@@ -266,7 +266,7 @@ def mrclam(settings: Benchmark) -> None:
     record("measured", CLAIM, figures)
 
 
-def tell(loops: list[dict[str, Any]]) -> None:
+def report(loops: list[dict[str, Any]]) -> None:
     """Verdicts in words."""
     for loop in loops:
         print(f"{loop['verdict']} (p {loop['p_value']:.2g}): {loop['reason']}", flush=True)
@@ -288,4 +288,4 @@ def main(settings: Benchmark) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Benchmark, description=__doc__))
+    main(tyro.cli(Benchmark, prog="python -m benchmarks.measured_loop", description=__doc__))

@@ -39,7 +39,7 @@ def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> 
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.merge", description=__doc__)
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
     parser.add_argument("--only", nargs="+", default=(), metavar="NAME")
     given = parser.parse_args()

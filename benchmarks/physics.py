@@ -228,7 +228,9 @@ def record_speed(options: argparse.Namespace, on_cpu: bool) -> None:
 
 def main() -> None:
     """Print and record the parts asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.physics", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     on_cpu = jax.devices()[0].platform == "cpu"
     counts = [512, 1024, 2048] if on_cpu else [1024, 32768, 131072]
     parser.add_argument("--instances", type=int, nargs="+", default=counts)

@@ -273,4 +273,4 @@ def main(options: Options) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, prog="python -m benchmarks.scaling", description=__doc__))

@@ -1,4 +1,4 @@
-"""Effects that nobody declared: what the closed loop says of logs whose contents it is not told.
+"""Effects that nobody declared: what the closed loop finds in logs whose effects are hidden from it.
 
     python -m benchmarks.undeclared --shared            the sets of ../shared/data/undeclared against plant/plain*
     python -m benchmarks.undeclared --nulls 200 --base --scales 2 4 --pairs 10
@@ -210,4 +210,4 @@ def write_json(path: Path, content: Any) -> None:
 if __name__ == "__main__":
     import tyro
 
-    main(tyro.cli(Benchmark, description=__doc__))
+    main(tyro.cli(Benchmark, prog="python -m benchmarks.undeclared", description=__doc__))

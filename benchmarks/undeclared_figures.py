@@ -75,7 +75,7 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
 
 
 def driven_of(row: Mapping[str, Any]) -> Driven:
-    """What a recorded row is of; rows of before there were other vehicles and noise levels do not tell."""
+    """What a recorded row is of; older rows, from before there were other vehicles and noise levels, do not say."""
     return Driven(row.get("noise", 1.0), row.get("vehicle", "chair"))
 
 
@@ -131,7 +131,7 @@ def calibrate(work: Path) -> None:
     if len(nulls) < LEAST:
         raise SystemExit(f"{work}: {len(nulls)} logs with nothing in them, judged against sets 0, 2, 4 ... of "
                          f"reference days; {LEAST} are needed. Drive more with --nulls and --reference-sets.")
-    values = np.clip([one["p_value"] for one in nulls], 1e-4, 1 - 1e-3)  # what is smaller tells of tails
+    values = np.clip([one["p_value"] for one in nulls], 1e-4, 1 - 1e-3)  # smaller values say more of tails
     a, b, _, _ = stats.beta.fit(values, floc=0, fscale=1)
     sets = sets_of(nulls)
     content = {"a": float(a), "b": float(b), "logs": len(nulls), "sets": sets, **provenance()}
@@ -186,7 +186,7 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
 
 def warned(one: dict[str, Any]) -> bool:
     """Whether a name comes with a warning (`sysid.follow_up.trust.warnings`); one is that more is left than days differ
-    by, which verdicts of before others were kept tell too."""
+    by; older verdicts contain that too."""
     return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
 
 

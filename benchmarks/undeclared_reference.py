@@ -105,8 +105,8 @@ def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Pre
 
 def _key(days: Sequence[Log], config: LoopConfig) -> str:
     """Of everything that a fit depends on: code, versions, data and settings."""
-    told = repr((sorted(code_hashes().items()), [day.sha256 for day in days], config))
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    settings = repr((sorted(code_hashes().items()), [day.sha256 for day in days], config))
+    return hashlib.sha256(settings.encode()).hexdigest()[:16]
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -1,6 +1,6 @@
-"""The simulator behind the vehicle's topics, so that the policy node cannot tell it from the chair.
+"""The simulator behind the vehicle's topics, so that the policy node sees no difference from the chair.
 
-    python -m bridge.simulate --task corridor --episodes 10
+    python -m bridge.simulate RUN/policy --episodes 10
 
 Time runs like the wall clock. The command received by the middle of a control period drives the whole period; an image
 shows its end. Between two episodes the camera is silent for RESET_SILENCE, which is longer than the age the policy node
@@ -75,17 +75,21 @@ class ChairSimulator:
     one control period.
     """
 
-    def __init__(self, task: str = "corridor", vehicle: str | None = None, **changes: Any) -> None:
+    def __init__(
+        self, task: str = "corridor", vehicle: str | Path | None = None, size: tuple[int, int] = (64, 64),
+        **changes: Any,
+    ) -> None:
         """Compile the environment of a task with some of its fields changed, and of a vehicle file or preset.
 
-        Without a vehicle: the built-in chair.
+        Without a vehicle: the built-in chair. `size` is height and width of the camera image.
         """
         import jax
 
         from whill_mjx import env as environment
         from whill_mjx.tasks.tasks import make_task
 
-        env, params = environment.make_env(make_task(task, **changes, action_repeat=1), vehicle)
+        fields = {**changes, "action_repeat": 1}
+        env, params = environment.make_env(make_task(task, **fields), vehicle, height=size[0], width=size[1])
         self.period = float(env.model.config.control_dt)
         self._low = np.array([env.task.v_min, -env.task.omega_max])
         self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
@@ -309,7 +313,19 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     except (ImportError, AttributeError, ValueError) as error:
         raise SystemExit(f"bridge.simulate: --simulator {options.simulator}: {error}. It must be MODULE:FACTORY, "
                          "called with task and vehicle. Correct it or leave it out.") from error
-    return factory(task=options.task, vehicle=options.vehicle, **dict(options.set))
+    changes = dict(options.set)
+    if options.policy is None:
+        return factory(task=options.task or "corridor", vehicle=options.vehicle, **changes)
+    from whill_mjx.evaluation.policy_world import read_world
+
+    try:
+        world = read_world(options.policy)
+    except ValueError as error:
+        raise SystemExit(f"bridge.simulate: {error}") from error
+    same = options.task in (None, world.task)
+    fields = {**world.fields, **changes} if same else changes
+    return factory(task=options.task or world.task, vehicle=options.vehicle or world.vehicle,
+                   size=(world.height, world.width), **fields)
 
 
 def field(text: str) -> tuple[str, Any]:
@@ -325,11 +341,15 @@ def field(text: str) -> tuple[str, Any]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="bridge.simulate", description="Serve the simulator on the vehicle's topics.")
-    parser.add_argument("--task", default="corridor")
+    parser = argparse.ArgumentParser(prog="python -m bridge.simulate",
+                                     description="Serve the simulator on the vehicle's topics.")
+    parser.add_argument("policy", nargs="?", type=Path, help="folder of a policy or of its training: task, gates, "
+                        "vehicle and camera are those that it was trained with")
+    parser.add_argument("--task", help="default: that of the policy, or corridor")
     parser.add_argument("--set", type=field, action="append", default=[], metavar="NAME=VALUE",
                         help="change a field of the task, such as gates=1 or layout=fixed; repeat for more")
-    parser.add_argument("--vehicle", help="vehicle file; default: the task's own vehicle")
+    parser.add_argument("--vehicle", help="vehicle file or built-in vehicle; default: that of the policy, "
+                        "or the task's own")
     parser.add_argument("--episodes", type=int, default=0, help="end after so many; 0: never")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=float, default=10.0, help="wait so long for a driver before the first one [s]")

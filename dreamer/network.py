@@ -36,7 +36,7 @@ class Network:
     observations: Shapes
     """uint8 images and float32 vectors by name."""
     outputs: tuple[str, ...] = ("action",)
-    """Names of the outputs. The last one is what is compared: it must tell every difference."""
+    """Names of the outputs. The last one is compared, so every difference must show in it."""
 
     @property
     def tensors(self) -> tuple[list[str], list[str]]:
@@ -121,7 +121,7 @@ def _name_outputs(model: Any, names: list[str]) -> None:
 def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
     """Largest differences of ONNX and JAX over random observations.
 
-    The difference of one step, both from JAX's state, tells whether the export is right, and is what is judged. The
+    The difference of one step, both from JAX's state, shows whether the export is right; it is what is judged. The
     difference after many steps, each from its own state, is noted as well: a recurrent network can amplify rounding,
     most of all on noise, which it was never trained on. Where an argmax latent falls on a tie, rounding decides and
     both continue on different states: such a step is counted as a flip and the states are made equal again.

@@ -76,7 +76,7 @@ def total(tree: Any) -> Any:
 
 
 def gather(x: jax.Array, axis: int) -> jax.Array:
-    """The shares of all devices joined along an axis, for what only the whole batch tells."""
+    """The shares of all devices joined along an axis, for what needs the whole batch."""
     return jax.lax.all_gather(x, AXIS, axis=axis, tiled=True) if _divided() else x
 
 

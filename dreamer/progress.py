@@ -23,6 +23,7 @@ class Progress:
         self._enabled, self._total, self._start = enabled, total, start
         self._began = self._shown = time.monotonic()
         self._bar: Any = None
+        self._notes: dict[str, str] = {}
         if enabled:
             try:
                 from tqdm import tqdm
@@ -31,8 +32,13 @@ class Progress:
             except ImportError:
                 pass
 
+    def note(self, figures: dict[str, str]) -> None:
+        """Show these figures from now on, until others of the same name come."""
+        self._notes |= figures
+
     def show(self, done: int, figures: dict[str, str]) -> None:
-        """Move to `done` steps and show the figures."""
+        """Move to `done` steps and show the figures, the noted ones first."""
+        figures = self._notes | figures
         if self._bar is not None:
             self._bar.set_postfix(figures, refresh=False)
             self._bar.update(min(done, self._total) - self._bar.n)

@@ -1,4 +1,4 @@
-"""What an environment shows and what it is told: shapes of observations, and kinds of actions.
+"""Shapes of observations, and kinds of actions.
 
 An observation is one array or a dict of arrays, and its rank says what it is: (H, W, C) is an image of bytes, (D,) a
 vector of floats. A depth image or a LiDAR scan is either. An action is a point in [-1, 1]^A or one of n classes; the
@@ -242,7 +242,7 @@ def actions(spec: ActionSpec) -> Box | Discrete:
 
 
 def actions_of(params: dict[str, Any]) -> Box | Discrete:
-    """The kind of action that an agent's parameters were made for, told by the width of its policy's output."""
+    """The kind of action that an agent's parameters were made for, by the width of its policy's output."""
     width, outputs = params["dyn"]["in_action"]["w"].shape[0], params["policy"]["out"]["b"].shape[0]
     return Discrete(width) if outputs == width else Box(width)
 

@@ -139,6 +139,7 @@ def train(
     time_limit_s: float | None = None,
     devices: Sequence[jax.Device] = (),
     tensorboard: bool = False,
+    announce: Callable[[str], None] = lambda text: None,
 ) -> TrainResult:
     """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
 
@@ -170,6 +171,7 @@ def train(
         time_limit_s: end after this call has taken so long [s], as if interrupted; a later call goes on.
         devices: over which instances and batches are split, those of all processes; none takes the first one.
         tensorboard: write the logged lines to OUT/tensorboard too.
+        announce: gets a line when something begins that takes long: compilation, the training, the last checkpoint.
 
     Raises:
         ImportError: tensorboard is asked for and tensorboardX is not installed.
@@ -182,6 +184,7 @@ def train(
     mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
     if mesh is not None and not isinstance(seed, int):
         raise ValueError(f"seed = {seed}: several seeds run in one program on one device. Give one, or no devices.")
+    announce("preparing the training: first worlds and parameters")
     state, wall_before = _first_state(env, config, out, seed, resume, mesh)
     began = time.monotonic()
     steps_per_iter = env.num_envs * config.steps_per_iter
@@ -199,7 +202,9 @@ def train(
     ready = None
     if eval_ahead is not None and mesh is None and env_steps < total_steps:
         ready = _in_thread(eval_ahead, state.agent.acting)
+    announce("compiling the training program, usually 1 to 2 minutes")
     iterate = compiled(train_iteration if counted else pretrain.pretrain_iteration)
+    announce("training")
     bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
     meter, saved_at = Meter(), time.monotonic()
 
@@ -229,7 +234,9 @@ def train(
                     break
                 if ready is not None:
                     wait([ready])
-                line |= {f"eval/{name}": float(value) for name, value in eval_fn(params, line["env_steps"]).items()}
+                figures = eval_fn(params, line["env_steps"])
+                line |= {f"eval/{name}": float(value) for name, value in figures.items()}
+                bar.note(_evaluated(figures))
             log.write(line)
             waiting.pop(0)  # interrupted just before, the line is written twice and read once
             stops = stops or (params is not None and stop is not None and stop(line))
@@ -374,6 +381,12 @@ def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["
         file=sys.stderr,
     )
     return "host"
+
+
+def _evaluated(figures: dict[str, float]) -> dict[str, str]:
+    """The figures of an evaluation that a watcher wants to see."""
+    shown = {"success": f"{figures['success']:.0%}"} if "success" in figures else {}
+    return shown | ({"eval return": f"{figures['return']:.3g}"} if "return" in figures else {})
 
 
 def _headline(line: dict[str, Any]) -> dict[str, str]:

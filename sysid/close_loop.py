@@ -4,7 +4,7 @@ The base model is fitted to the reference drives. The drives in question are the
 against that vehicle: every effect of the catalogue is tried, the best are refitted together with the base parameters
 within their day-to-day spread, and the verdict is one of
 
-    named        these effects, each with the class of effects that these drives cannot tell from it
+    named        these effects, each with the class of effects that these drives cannot separate from it
     none         nothing is missing at this noise level
     unexplained  something is missing and the catalogue does not have it
 

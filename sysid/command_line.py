@@ -27,17 +27,17 @@ def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Pro
     """A bar with rate and remaining time, and the function that closes it."""
     from tqdm import tqdm
 
-    bar: Any = tqdm(total=total, desc=what, unit=unit)
+    bar: Any = tqdm(total=total, desc=what, unit=unit, dynamic_ncols=True)
 
     def advance(count: int, remark: str) -> None:
-        bar.set_postfix_str(remark, refresh=False)
+        bar.set_postfix_str(remark, refresh=count == 0)
         bar.update(min(count, max(bar.total - bar.n, 0)))
 
     return advance, bar.close
 
 
 def keep_compiled() -> None:
-    """Keep what XLA compiles for later runs, in the user's cache folder, unless JAX was told another folder
+    """Keep what XLA compiles for later runs, in the user's cache folder, unless JAX was given another folder
     (JAX_COMPILATION_CACHE_DIR) or none (JAX_ENABLE_COMPILATION_CACHE=false), or where that cannot be written.
 
     Each kind of processor has a folder of its own: a home may be shared by several.

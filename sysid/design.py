@@ -2,7 +2,7 @@
 
 Of a library of manoeuvres within limits of speed and room, the one is chosen that shrinks the uncertainty of the
 parameters most: A-optimal (the sum of variances, which the largest uncertainty rules) or D-optimal (the volume), both
-on the subspace that driving can tell at all. `best_splitting_manoeuvre` chooses the one that best separates two effects
+on the subspace that driving determines. `best_splitting_manoeuvre` chooses the one that best separates two effects
 (T-optimality: what is left of one's signature after the base parameters and the other have explained what they can).
 
 Residuals of driving logs are autocorrelated: information is divided by INFLATION, so that planned intervals are honest.
@@ -49,7 +49,7 @@ class DesignConfig:
     channels: Literal["both", "odometry", "ground_truth"] = "both"
     """What will be measured."""
     parameters: tuple[str, ...] = ()
-    """Parameters of interest; by default all that a log can tell."""
+    """Parameters of interest; by default all that a log can determine."""
     count: int = 1
     """Manoeuvres to propose, one after the other; further ones are written as NAME_2.csv, ..."""
 

@@ -1,7 +1,7 @@
 """Looks at a driving log before it is fitted: `python -m sysid.inspect DATASET [--out DIR] [--json]`.
 
 Says how regularly each stream was sampled, how the clocks differ, whether units and signs are right, what each trial
-excites, how well replicates repeat, and what no fit can tell from the log.
+excites, how well replicates repeat, and what no fit can find in the log.
 """
 
 from __future__ import annotations

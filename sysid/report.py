@@ -14,7 +14,7 @@
     profiles              name, unit, values, cost, statistic, threshold, interval (null where open), remark
     spectrum              information, combination: eigenvalues of the Fisher information (by shares of the bounds),
                           weakest first, and the parameters along their eigenvectors
-    weak_combinations     combinations of parameters that the log does not tell
+    weak_combinations     combinations of parameters that the log does not determine
     search                evaluations, seconds, cost before and after, costs of the starts, number that agree, delays
     code                  SHA-256 over the sources of the packages, their versions and those of what they run on
     errors                per trial and channel: metric -> ideal, initial, fitted
@@ -36,7 +36,8 @@ def cli() -> None:
     """Command line: `python -m sysid.report RUN`."""
     import argparse
 
-    parser = argparse.ArgumentParser(prog="sysid.report", description="Write RUN/report.html of an earlier fit.")
+    parser = argparse.ArgumentParser(prog="python -m sysid.report",
+                                     description="Write RUN/report.html of an earlier fit.")
     parser.add_argument("run", type=Path, help="folder that sysid.fit wrote")
     run = parser.parse_args().run
     try:

@@ -21,13 +21,13 @@ import jax
 from sysid import command_line
 from sysid.logs.log import Log
 from sysid.logs.measured import load_any
-from sysid.pages.html import Section, html_page, paragraph, png, table
 from sysid.pages.plots import write_search_plot
 from sysid.pages.report import code_hashes, write_report
 from sysid.search.comparison import METHODS, NEAR, Judge, arrivals, trace
 from sysid.search.fitting import make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
+from whill_mjx.html import Section, html_page, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 
 KIND = "sysid-searches"

@@ -165,18 +165,24 @@ def run(
         _stop_listening()
 
 
+def program() -> str:
+    """This command as it is typed: `python -m MODULE`, or the name of the console script."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return f"python -m {spec.name.removesuffix('.__main__')}" if spec else os.path.basename(sys.argv[0])
+
+
 def _parsed(options: type, description: str | None, positional: bool, args: list[str] | None) -> Any:
     """The options of the command line; what tyro finds wrong in them becomes one line."""
     import tyro
 
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
-    with redirect_stderr(io.StringIO()) as told:
+    with redirect_stderr(io.StringIO()) as complaint:
         try:
-            return tyro.cli(options, description=description, config=config, args=args)
+            return tyro.cli(options, prog=program(), description=description, config=config, args=args)
         except SystemExit as ended:
             if ended.code in (0, None):
                 raise
-    lines = [line.strip(FRAME) for line in told.getvalue().splitlines()]
+    lines = [line.strip(FRAME) for line in complaint.getvalue().splitlines()]
     text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
     raise OptionError(f"{text.rstrip('.')}. See --help.")
 

@@ -10,7 +10,7 @@ import jax
 LAUNCHERS = {
     "SLURM_STEP_NUM_TASKS": "SLURM", "OMPI_COMM_WORLD_SIZE": "Open MPI", "PMI_SIZE": "MPI", "JAX_NUM_PROCESSES": "JAX",
 }
-"""Variables in which launchers tell the number of processes; within SLURM, those of srun and not of the whole job."""
+"""Variables in which launchers give the number of processes; within SLURM, those of srun and not of the whole job."""
 
 
 def launched_processes(environment: Mapping[str, str] | None = None) -> tuple[int, str]:

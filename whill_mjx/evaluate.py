@@ -9,17 +9,18 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 from __future__ import annotations
 
 import math
-import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from whill_mjx.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
+from whill_mjx.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
+    say_loading()
 
 import jax
 import numpy as np
@@ -28,17 +29,16 @@ import tyro
 from whill_mjx.env import make_env
 from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
-from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
+from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
+from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
-from whill_mjx.fields import PRESET, RUN, TASK, check, check_table
-from whill_mjx.folders import claim_folder
+from whill_mjx.folders import RUN_FILE, claim_folder
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.reading import read_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 
 SCRIPTED = ("planner", "random")
 KIND = "whill_mjx.evaluate"
-OUTPUTS = ("pages.html", "paths.png", "failures.png", "failures.mp4")
+OUTPUTS = ("report.html", "paths.png", "failures.png", "failures.mp4")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class EvaluateOptions:
     """Options of the command."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Folder of an exported policy, or "planner" or "random"."""
+    """Folder of an exported policy or of its training, or "planner" or "random"."""
     task: str | None = None
     """obstacle_course or corridor; none takes the one that the policy was trained for."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 200
@@ -55,8 +55,8 @@ class EvaluateOptions:
     """Folder for everything that is written."""
     vehicle: str | None = None
     """Vehicle file or preset; none takes the one inside the policy file, else the built-in chair."""
-    layout: Literal["randomised", "fixed"] = "randomised"
-    """A new world in each episode, or always the same one."""
+    layout: Literal["randomised", "fixed"] | None = None
+    """A new world in each episode, or always the same one; none takes that of the training, else randomised."""
     set: tuple[str, ...] = ()
     """Fields of the task, such as gates=1; those that the policy was trained with are found beside it."""
     looks: Literal["task", "on", "off"] = "task"
@@ -120,7 +120,8 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
     with claim_folder(options.out, KIND, OUTPUTS) as claim:
         claim.settle({})  # an evaluation replaces an earlier one as a whole
         try:
-            return evaluate(plan, began)
+            with Heartbeat() as heartbeat:
+                return evaluate(plan, began, heartbeat.stage)
         except OSError as error:
             error.add_note("The figures so far are in the lines above; the same command begins anew.")
             raise
@@ -130,7 +131,7 @@ def make_plan(options: EvaluateOptions) -> Plan:
     """Read and check everything that an evaluation needs before it drives or writes."""
     if options.episodes < 1 or options.sweep_episodes < 1 or options.batch < 1:
         raise ValueError("episodes, sweep_episodes and batch must each be at least 1.")
-    policy = None if options.policy in SCRIPTED else load_policy(options.policy, options.runtime)
+    policy = None if options.policy in SCRIPTED else load_policy(find_policy(options.policy), options.runtime)
     task = choose_task(options, policy)
     plan = Plan(options, task, policy, [parse_sweep(text) for text in chosen_sweeps(options, task)])
     others = dict(_named(text) for text in options.baselines)
@@ -143,20 +144,24 @@ def make_plan(options: EvaluateOptions) -> Plan:
     return plan
 
 
-def evaluate(plan: Plan, began: float) -> dict[str, Any]:
-    """Drive everything and write the results to the claimed folder."""
+def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> dict[str, Any]:
+    """Drive everything and write the results to the claimed folder; `stage` gets a line when a part begins."""
     options, task, policy, main_name, course = plan.options, plan.task, plan.policy, plan.main_name, plan.course
     keys = episode_keys(options.seed, options.episodes)
     with jax.default_matmul_precision("highest"):  # float32, as on the vehicle; a GPU would round to fewer bits
-        driven = {name: _drive(course(), driver, keys) for name, driver in plan.drivers.items()}
+        driven = {}
+        for name, driver in plan.drivers.items():
+            stage(f"{name}: driving {len(keys)} episodes")
+            driven[name] = _drive(course(), driver, keys)
         for blind in dict.fromkeys(options.blind):
+            stage(f"{main_name} without sight ({blind}): driving {len(keys)} episodes")
             driven[f"{main_name} {blind}"] = course().blinded(plan.drivers[main_name], keys, blind, driven[main_name])
         summaries = {name: summarise(episodes, options.near) for name, episodes in driven.items()}
         for name, summary in summaries.items():
             say(headline(name, summary))
         results: list[Sweep] = []
         for axes in plan.sweeps:
-            say(f"sweep over {' and '.join(axis.name for axis in axes)}")
+            stage(f"sweep over {' and '.join(axis.name for axis in axes)}")
             cell_keys = episode_keys(options.seed, options.sweep_episodes)
             results.append(run_sweep(axes, cell_keys, course, plan.driver))
         evaluation = {
@@ -169,14 +174,14 @@ def evaluate(plan: Plan, began: float) -> dict[str, Any]:
             "sweeps": [result.plain() for result in results],
         }
         write_json(options.out / "evaluation.json", evaluation, allow_nan=False)  # kept, whatever becomes of pictures
-        pictures, videos = draw(options, task, course(), plan.drivers[main_name], driven, main_name, results)
+        stage("drawing pictures and videos")
+        pictures, videos = draw(options, task, course(), driven, main_name, results)
     evaluation["seconds"] = time.perf_counter() - began
     write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
     if options.html:
         from whill_mjx.evaluation.pages import page
 
-        title = f"{options.policy} on {evaluation['task']['name']}"
-        page(title, evaluation, pictures, videos, options.out / "pages.html")
+        say(f"report: {page(evaluation, pictures, videos, options.out / 'report.html')}")
     say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
     return evaluation
 
@@ -191,11 +196,10 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     check_known("--task", name, TASKS)
     known: dict[str, Any] = {field.name: field.default for field in fields(TASKS[name])}
     changes: dict[str, Any] = {}
-    begun = policy.path.parent / RUN_FILE if policy else None
-    if policy and begun and begun.is_file() and policy.task == name:
-        with refusing():
-            changes = saved_task(begun, known)
-        say(f"task: fields from {begun}")
+    if policy and policy.task == name:
+        changes = trained_fields(policy.path, name)
+        if changes:
+            say(f"task: {name}, as in the training ({policy.path.parent / RUN_FILE})")
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}
@@ -204,18 +208,9 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
         if field not in known:
             raise ValueError(f"--set {text}: task {name!r} has no field {field!r} (known: {', '.join(sorted(known))}).")
         changes[field] = _parse(value, known[field], text)
-    return make_task(name, **{**changes, "layout": options.layout})
-
-
-def saved_task(run: Path, known: Iterable[str]) -> dict[str, Any]:
-    """The fields of a training's task among the `known` ones; ValueError where its run.json is damaged."""
-    hint = "Put the file of the training there, or take it away to evaluate on the task as it is."
-    content = read_json(run, f"missing. {hint}", hint)
-    preset = check_table(str(run), RUN, content, others=True)["preset"]
-    task = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
-    rows = {field.name: field for field in TASK}
-    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
-            for name, value in task.items() if name in known}
+    if options.layout is not None:
+        changes["layout"] = options.layout
+    return make_task(name, **changes)
 
 
 def _parse(text: str, like: Any, whole: str) -> Any:
@@ -259,7 +254,7 @@ def make_driver(source: str, policy: PolicyFile | None, course: Course, options:
         return planner_driver(course.env)
     if source == "random":
         return random_driver(course.env.task.action_repeat)
-    policy = policy or load_policy(source, options.runtime)
+    policy = policy or load_policy(find_policy(source), options.runtime)
     task, size = course.env.task, (course.env.height, course.env.width)
     if (policy.height, policy.width) != size:
         raise ValueError(f"{policy.path}: takes images of {policy.height} x {policy.width}, not {size[0]} x {size[1]}.")
@@ -289,7 +284,7 @@ def headline(name: str, summary: dict[str, Any]) -> str:
 
 
 def draw(
-    options: EvaluateOptions, task: Task, course: Course, driver: Driver, driven: dict[str, Episodes], main_name: str,
+    options: EvaluateOptions, task: Task, course: Course, driven: dict[str, Episodes], main_name: str,
     sweeps: list[Sweep],
 ) -> tuple[list[Path], list[Path]]:  # fmt: skip
     """Write pictures and videos; what cannot be written for want of a package is left out and said."""
@@ -313,8 +308,8 @@ def draw(
             jobs[f"paths_{label}.png"] = lambda path, sweep=sweep: pages.sweep_paths(sweep, path, radius)
     if len(failed) and options.videos:
         def failures(path: Path) -> None:
-            shown = np.asarray(failed[: options.videos])
-            pages.episode_video(*course.film(driver, episodes.keys[shown]), path, rate)
+            shown = episodes.some(failed[: options.videos])
+            pages.episode_video(shown, *course.film(shown), path, rate)
 
         jobs["failures.mp4"] = failures
     written = []
@@ -325,11 +320,6 @@ def draw(
         except ImportError as error:
             say(f"{name} is left out: {error}. Install the base package to draw it.")
     return [path for path in written if path.suffix == ".png"], [path for path in written if path.suffix == ".mp4"]
-
-
-def say(text: str) -> None:
-    """Tell the user how far the evaluation is."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -29,6 +29,7 @@ from whill_mjx.folders import check_place, whole_file, write_whole
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.video import write_h264
 from whill_mjx.world.gallery import gallery, walk
 from whill_mjx.world.render import Intrinsics, Quality, pinhole, render, render_frame
 from whill_mjx.world.render.film import Film, develop, motion_blur
@@ -180,12 +181,14 @@ def film_of(options: Look) -> list[np.ndarray]:
 
 def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10) -> None:
     """Write frames (H, W, 3) uint8 as a video, whole or not at all."""
+    large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
+    if path.suffix != ".gif":
+        write_h264(path, large, rate)
+        return
     import imageio.v2 as imageio
 
-    large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
-    options = {"duration": 1000 / rate, "loop": 0} if path.suffix == ".gif" else {"fps": rate, "macro_block_size": 2}
     with whole_file(path) as temporary:
-        imageio.mimwrite(temporary, large, **options)  # type: ignore[arg-type]
+        imageio.mimwrite(temporary, large, duration=1000 / rate, loop=0)  # type: ignore[arg-type]
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +29,11 @@ from whill_mjx.command_line import (
     refusing,
     run,
 )
+from whill_mjx.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
+    say_loading()
 
 import jax
 
@@ -45,9 +47,10 @@ from whill_mjx.evaluation.episodes import Course, episode_keys
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.folders import Claim, claim_folder, write_whole
-from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best, say
+from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
+from whill_mjx.learning.index_page import list_results, write_index
 from whill_mjx.learning.ppo import check_minibatches
 from whill_mjx.learning.ppo_training import train_ppo
 from whill_mjx.learning.prediction import write_prediction
@@ -72,6 +75,8 @@ from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 STOPPED = "stopped; give the same command again to go on from the last checkpoint."
+Stage = Callable[[str], None]
+"""Gets a line when a stage of the command begins."""
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
 LEAST_FREE = 32_000_000
@@ -123,7 +128,7 @@ class TrainOptions:
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
-    """Let the world model also tell goal, speeds and free distances, which the simulator knows
+    """Let the world model also predict goal, speeds and free distances, which the simulator knows
     (`whill_mjx.learning.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: Annotated[float | None, SHARE] = None
@@ -164,9 +169,9 @@ def main(options: TrainOptions) -> dict[str, Any]:
     with refusing():
         preset = choose_preset(options)
         check(options, preset, processes)
-    with begin(options, preset) as vehicle:
+    with Heartbeat() as heartbeat, begin(options, preset, heartbeat.stage) as vehicle:
         say(f"preset {preset_name(options.preset)}; devices: {', '.join(str(device) for device in jax.devices())}")
-        return finish(options, preset, vehicle, started)
+        return finish(options, preset, vehicle, started, heartbeat.stage)
 
 
 def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
@@ -190,7 +195,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
 
 
 @contextmanager
-def begin(options: TrainOptions, preset: Preset) -> Iterator[Path]:
+def begin(options: TrainOptions, preset: Preset, stage: Stage = say) -> Iterator[Path]:
     """Hold RUN as this training's and yield its vehicle file; of several processes, the first does.
 
     Raises:
@@ -204,7 +209,7 @@ def begin(options: TrainOptions, preset: Preset) -> Iterator[Path]:
         return
     with claim_folder(options.out, KIND, OUTPUTS, LEAST_FREE) as claim:
         try:
-            prepare_vehicle(options, preset, claim, given)
+            prepare_vehicle(options, preset, claim, given, stage)
             parallel.agree(True)
             yield options.out / "vehicle.toml"
         except OSError as error:
@@ -213,25 +218,30 @@ def begin(options: TrainOptions, preset: Preset) -> Iterator[Path]:
             raise
 
 
-def finish(options: TrainOptions, preset: Preset, vehicle: Path, started: float) -> dict[str, Any]:
+def finish(
+    options: TrainOptions, preset: Preset, vehicle: Path, started: float, stage: Stage = say
+) -> dict[str, Any]:
     """Train, evaluate and export."""
-    result = train_policy(options, preset, vehicle) if options.learner == "dreamer" else train_baseline(
-        options, preset, vehicle
-    )
+    learn = train_policy if options.learner == "dreamer" else train_baseline
+    result = learn(options, preset, vehicle, stage)
+    stage("preparing the final evaluation")
     if not parallel.is_first_process():
         return {}
     best = best_params(options, preset, result) if options.learner == "dreamer" else None
     chosen, other, name = result, best, "policy_best"
     if options.export == "best" and best is not None:
         chosen, other, name = best, result, "policy_last"
-    evaluation = evaluate_policy(options, preset, vehicle, chosen)
+    evaluation = evaluate_policy(options, preset, vehicle, chosen, stage)
     write_json(options.out / "evaluation.json", evaluation)  # kept, whatever becomes of the export
+    stage("exporting the policy")
     policy = export(options, preset, vehicle, chosen, options.out / "policy")
     if other is not None:
+        stage(f"exporting {name}")
         export(options, preset, vehicle, other, options.out / name)
     seconds = time.perf_counter() - started
     evaluation["seconds"] = {"this_command": seconds, "training": result.wall_s}
     write_json(options.out / "evaluation.json", evaluation)
+    write_index(options.out, evaluation, options.task)
     share, interval = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
     baselines = [name for name in ("planner", "random") if name in evaluation]
     others = ", ".join(f"{name} {evaluation[name]['success']:.0%}" for name in baselines)
@@ -239,6 +249,8 @@ def finish(options: TrainOptions, preset: Preset, vehicle: Path, started: float)
         f"success {share:.0%} (95 % interval {interval[0]:.0%} to {interval[1]:.0%}), {others}; policy file {policy}; "
         f"{seconds / 60:.1f} min"
     )
+    for line in list_results(options.out):
+        say(line)
     return evaluation
 
 
@@ -292,7 +304,9 @@ def given_vehicle(options: TrainOptions) -> Vehicle | None:
     return None if options.vehicle is None else load_vehicle(options.vehicle)
 
 
-def prepare_vehicle(options: TrainOptions, preset: Preset, claim: Claim, given: Vehicle | None = None) -> None:
+def prepare_vehicle(
+    options: TrainOptions, preset: Preset, claim: Claim, given: Vehicle | None = None, stage: Stage = say
+) -> None:
     """Settle what RUN is and write RUN/vehicle.toml: the given vehicle, that of the run so far, or one fitted to a log.
 
     Raises:
@@ -308,7 +322,7 @@ def prepare_vehicle(options: TrainOptions, preset: Preset, claim: Claim, given: 
         log = options.log or _shipped_log()
         data = _hash_of(log)
         if not known or (not begun and known["data"] != data):
-            fitted = _fitted(log, options.out / "fit")
+            fitted = _fitted(log, options.out / "fit", stage)
             vehicle = load_vehicle(fitted)
     if vehicle is None:
         raise OptionError(f"--out {options.out}: its vehicle.toml is missing. Give the vehicle by --vehicle.")
@@ -341,23 +355,27 @@ def _has_lines(path: Path) -> bool:
     return path.exists() and path.stat().st_size > 0
 
 
-def _fitted(log: Path, out: Path) -> Path:
-    """Vehicle file fitted to a driving log."""
+def _fitted(log: Path, out: Path, stage: Stage) -> Path:
+    """Vehicle file fitted to a driving log; its result is said in a few lines."""
     from sysid import FitConfig, fit_dataset
     from sysid.command_line import progress_bar
+    from sysid.pages.fit_page import in_words
     from sysid.search.fitting import expected_steps
 
-    say(f"vehicle: fitting to {log.name}")
+    stage(f"vehicle: fitting to the driving log {log.name}, usually 1 to 3 minutes")
     config = FitConfig(quick=True)
     progress, close = progress_bar(expected_steps(config))
     try:
-        fit_dataset(log, out, config=config, progress=progress)
+        report = fit_dataset(log, out, config=config, progress=progress)
     finally:
         close()
+    for line in in_words(report):
+        say(f"  {line}")
+    say(f"  report of the fit: {out / 'report.html'}")
     return out / "vehicle.toml"
 
 
-def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
+def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: Stage = say) -> Trained:
     """Train the world model and its policy, with an evaluation every `eval_every` steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
@@ -380,11 +398,12 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path) -> Traine
         stop=stopper,
         devices=devices,
         tensorboard=options.tensorboard,
+        announce=stage,
     )
     return Trained(jax.device_get(result.agent.acting), result.env_steps, result.updates, result.wall_s)
 
 
-def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trained:
+def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: Stage = say) -> Trained:
     """Train the model-free baseline with as many environment steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
@@ -410,6 +429,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path) -> Trai
         functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
         preset.eval_every, stopper, say, eval_ahead=not devices,
         checkpoint_every_s=options.checkpoint_every_s, last_step=stopper.total_steps(preset.total_steps),
+        announce=stage, progress=True,
     ))  # fmt: skip
 
 
@@ -453,7 +473,9 @@ def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Co
     return dreamer_policy(preset, result.params, control_dt)
 
 
-def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained) -> dict[str, Any]:
+def evaluate_policy(
+    options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, stage: Stage = say
+) -> dict[str, Any]:
     """Drive the final evaluation with the policy, the planner and random actions; write pictures and videos."""
     from whill_mjx.evaluation import pictures
 
@@ -462,16 +484,18 @@ def evaluate_policy(options: TrainOptions, preset: Preset, vehicle: Path, result
     drivers = {"policy": driver, "random": random_driver(preset.task.action_repeat)}
     if options.planner:
         drivers["planner"] = planner_driver(course.env)
-    driven = evaluate_drivers(course, drivers, FINAL_SEED + options.seed, options.episodes)
-    summary = write_report(options.out, course, driver, driven, options.videos, say)
+    driven = evaluate_drivers(course, drivers, FINAL_SEED + options.seed, options.episodes, stage)
+    stage("drawing pictures and videos of the final evaluation")
+    summary = write_report(options.out, course, driven, options.videos, say)
     references: dict[str, float] = {name: summary[name]["return"] for name in drivers if name != "policy"}
     try:
         pictures.reward_curve(
-            options.out / "metrics.jsonl", options.out / "reward_curve.png", preset.task.action_repeat, references
+            options.out / "metrics.jsonl", options.out / "reward_curve.png", references, preset.task.action_repeat
         )
     except ImportError as error:
         say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
     if options.videos and options.learner == "dreamer" and preset.learner.representation == "reconstruct":
+        stage("drawing what the world model predicts")
         try:
             key = jax.random.key(FINAL_SEED + options.seed)
             write_prediction(options.out / "prediction.gif", preset, vehicle, result.params, options.videos, key)

@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> Path:
     """Parse the command line and write the dataset; returns its folder."""
     table = "\n".join(f"  {name} [{entry.unit}], base {entry.base:g}: {entry.form}" for name, entry in EFFECTS.items())
     parser = argparse.ArgumentParser(
-        prog="benchmarks.plant", description=__doc__, epilog=f"effects:\n{table}",
+        prog="python -m benchmarks.plant", description=__doc__, epilog=f"effects:\n{table}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, help="dataset folder to write; it must not exist")
@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> Path:
     parser.add_argument("--no-ground-truth", action="store_true", help="leave out the outside pose")
     parser.add_argument("--manoeuvres", nargs="+", help="some of the nine")
     parser.add_argument("--replicates", type=int, default=3)
-    parser.add_argument("--answers", type=Path, help="file, outside the dataset, that tells what was driven")
+    parser.add_argument("--answers", type=Path, help="file, outside the dataset, for what was driven")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--vehicle", choices=VEHICLES, default="chair")
     given = parser.parse_args(arguments)

@@ -91,7 +91,7 @@ def plot(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], out: Path) 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print both spreads per channel and write the picture."""
-    parser = argparse.ArgumentParser(prog="benchmarks.plant.compare", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.plant.compare", description=__doc__)
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--seed", type=int, default=1)

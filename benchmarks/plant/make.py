@@ -62,7 +62,7 @@ def make_log(
         ground_truth: whether the outside pose is written.
         manoeuvres: names out of the nine, or command tables (T, 3) t, v, omega by name; default: the nine.
         replicates: drives of each manoeuvre.
-        answers: file that tells what was driven; it must lie outside `out`.
+        answers: file for what was driven; it must lie outside `out`.
         processes: 1 drives here, more in as many processes.
         vehicle: of `chair.VEHICLES`.
         contact: how the contacts are computed.

@@ -41,7 +41,7 @@ def change(plain: dict[str, np.ndarray], other: dict[str, np.ndarray], unit: dic
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables of the README."""
-    parser = argparse.ArgumentParser(prog="benchmarks.plant.study", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.plant.study", description=__doc__)
     parser.add_argument("--reference", type=Path, help="dataset of the chair that the plain plant imitates")
     parser.add_argument("--effects", nargs="*", default=list(EFFECTS))
     parser.add_argument("--factor", type=float, default=1.0, help="of the base sizes")

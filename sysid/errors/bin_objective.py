@@ -1,7 +1,7 @@
 """What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself leave.
 
 Disturbances push a vehicle off its course, and a pose adds up all of them: errors of whole poses are correlated over a
-drive, and least squares of them let a few late ones outvote what every moment tells. Motion within a bin of a quarter
+drive, and least squares of them let a few late ones outvote every other moment. Motion within a bin of a quarter
 of a second, seen from the vehicle itself, has errors that hardly reach beyond it; a vector autoregression makes them
 white (`sysid.errors.noise`), and where wheels are pulled hard, bins count by the noise that they have there. Least
 squares of those are generalised least squares: intervals are what curvature says. Source: Aitken (1936).
@@ -29,7 +29,7 @@ from sysid.replay.records import Simulated
 from sysid.search import least_squares
 
 LONG = 8
-"""Bins of memory of the filter, where a log tells so much: the noise of a pose itself cancels from bin to bin, which a
+"""Bins of memory of the filter, where a log allows so much: the noise of a pose itself cancels from bin to bin, which a
 short memory takes for a vehicle that drifts."""
 ROWS = 10  # times as many bins as the filter has coefficients in each row
 
@@ -42,7 +42,7 @@ class FeatureObjective:
     space: Space
     trials: tuple[Trial, ...]
     track: float
-    """Of the vehicle [m]; tells how hard its wheels are pulled."""
+    """Of the vehicle [m]; shows how hard its wheels are pulled."""
     features: Features
     target: np.ndarray  # (B, K, C) measured features
     mask: np.ndarray  # (B, K, C) weights of the bins
@@ -133,8 +133,8 @@ class FeatureObjective:
         left, level = self.target - at, roughness(at, self.features.width, self.track)
         mask = shown / fit_roughness(left, shown, level)[level]
         bins, channels = left.shape[1:]
-        told = len(left) * max(bins - LONG, 0) >= ROWS * LONG * channels
-        return replace(self, mask=mask, whitener=fit_whitener(left, mask, LONG if told else ORDER))
+        enough_rows = len(left) * max(bins - LONG, 0) >= ROWS * LONG * channels
+        return replace(self, mask=mask, whitener=fit_whitener(left, mask, LONG if enough_rows else ORDER))
 
     def pieces(self, count: int) -> np.ndarray:
         """(K C,) in which of so many pieces of its drive each residual is."""

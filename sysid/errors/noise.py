@@ -59,7 +59,7 @@ def fit_whitener(series: np.ndarray, mask: np.ndarray, order: int = ORDER) -> Wh
     now, weight = scaled[:, order:], mask[:, order:].prod(-1)
     rows = weight.reshape(-1) > 0
     x, y = past.reshape(-1, past.shape[-1])[rows], now.reshape(-1, channels)[rows]
-    if len(x) < 10 * x.shape[-1]:  # too short to tell a memory
+    if len(x) < 10 * x.shape[-1]:  # too short to show a memory
         return Whitener(scale, np.zeros((order, channels, channels)), np.eye(channels))
     solution = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[-1]), x.T @ y)  # (order C, C)
     left = y - x @ solution

@@ -1,8 +1,8 @@
 """What is known of a vehicle before its log is fitted: the bounds of its parameters, or a vehicle file.
 
 A parameter of which a log says next to nothing would follow folds of the cost to an end of its range, and take along
-what the log tells only together with it. Bounds alone, as a normal distribution as wide as they are, hold it back; what
-a log tells they hardly move.
+what is determined only together with it. Bounds alone, as a normal distribution as wide as they are, hold it back; what
+a log determines they hardly move.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Prior:
     mean: np.ndarray  # (P,)
     sd: np.ndarray  # (P,)
     share: float = 1.0
-    """Factor on its precision: residuals of drives are autocorrelated and count more often than they tell."""
+    """Factor on its precision: residuals of drives are autocorrelated and count more often than their information."""
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """(N, P) of unit coordinates (N, P), to be squared."""
@@ -55,7 +55,7 @@ def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], sprea
     """Prior around the space's initial values.
 
     A parameter with an interval is known that well, and may differ by `spread` of its value on another day. One
-    without was not told by its log, and only its bounds are known.
+    without was not determined by its log, and only its bounds are known.
     """
     mean = space.to_unit(space.initial)
     slope = np.maximum(space.slope(mean), 1e-12)

@@ -18,7 +18,7 @@ STEP = 0.01
 """Half the distance between the two ends of a difference, as a share of the parameter's range."""
 
 LOG_SPAN = 10.0
-# Parameters that no driving log tells, or that only act through another one; they keep their value unless named.
+# Parameters that no driving log determines, or that only act through another one; they keep their value unless named.
 FIXED = {
     "air_drag.area": "acts only as a product with air_drag.c_d",
     "pid_drive.integral_limit": "never reached in ordinary driving",
@@ -29,18 +29,18 @@ FIXED = {
 NUISANCE = {
     "torque_drive.period": "it is fitted for what others go along with; the cost bends too little for an interval",
 }
-"""Searched, but never reported as told: what its curvature at one point says holds nowhere else."""
+"""Searched, but never reported as determined: what its curvature at one point says holds nowhere else."""
 BENT = ("body.com_z",)
-"""Of which a log tells the less or the more by their own value: the load that driving shifts goes with the height."""
-LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns tell how high the mass lies
+"""A log determines them better or worse by their own value: the load that driving shifts goes with the height."""
+LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns show how high the mass lies
 
 
 RATIO, YAW, ALONG = "wheel_inertia.ratio", "body.yaw_inertia", "body.com_x"
-TERMS = {RATIO: "drives tell the inertia that motors turn, of which that of the wheels is one of two terms"}
-"""Searched by their logarithm, but told as they are: intervals reach as far down as up."""
+TERMS = {RATIO: "drives fix the inertia that motors turn, of which that of the wheels is one of two terms"}
+"""Searched by their logarithm, but reported as they are: intervals reach as far down as up."""
 PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torque_drive.kff", "wheel_damping.damping",
                "rolling_resistance.mu_r", "yaw_scrub.torque", "lateral_damping.c_front")
-"""Torques and forces that drives tell per inertia that they speed up, wheels included."""
+"""Torques and forces that drives fix per inertia that they speed up, wheels included."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Turned:
     yaw: float
     """By how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]."""
     driven: float
-    """Where the driven wheels are in the chassis frame [m]: centrifugal force tells how far before them the mass is."""
+    """Where the driven wheels are in the chassis frame [m]: centrifugal force shows how far before them the mass is."""
 
     @classmethod
     def of(cls, spec: VehicleSpec) -> Turned:
@@ -64,7 +64,7 @@ class Turned:
 
     @property
     def besides(self) -> dict[str, tuple[float, float]]:
-        """What is told per inertia, as a constant and a share of the wheel's inertia that count besides its value."""
+        """Fixed per inertia, as a constant and a share of the wheel's inertia that count besides its value."""
         return {**dict.fromkeys(PER_INERTIA, (0.0, 0.0)), YAW: (0.0, self.yaw), ALONG: (-self.driven, 0.0)}
 
 
@@ -119,7 +119,7 @@ class Space:
 
     def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Unit coordinates (N, P), which may lie outside the range, a step (N, P) from u (N, P): along the valley of
-        all that is told per inertia.
+        all that drives fix per inertia.
 
         Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
         wheels' is one of two terms: in these coordinates that valley is curved, the more so the lighter the vehicle,
@@ -136,10 +136,10 @@ class Space:
         for i, name in enumerate(self.names):
             if name in besides:
                 constant, share = besides[name]
-                told = (at[:, i] + constant + share * wheel) / inertia
-                move = (moves[:, i] + share * heavier - told * heavier) / inertia
-                told = told * np.exp(move / told) if self.log[i] else told + move
-                values[:, i] = told * grown - constant - share * later
+                grown_value = (at[:, i] + constant + share * wheel) / inertia
+                move = (moves[:, i] + share * heavier - grown_value * heavier) / inertia
+                grown_value = grown_value * np.exp(move / grown_value) if self.log[i] else grown_value + move
+                values[:, i] = grown_value * grown - constant - share * later
         return np.where([name in besides for name in self.names], self._unit(values), end)
 
     def subset(self, keep: Sequence[str]) -> Space:
@@ -174,7 +174,7 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
 
 
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
-    """What a fit searches unless told otherwise: all but `FIXED`, and the height of the mass where wheels may skid.
+    """What a fit searches by default: all but `FIXED`, and the height of the mass where wheels may skid.
 
     Args:
         asked: effects that were asked for; lateral damping of driven wheels, which slip besides, is searched only then.

@@ -26,14 +26,14 @@ def squared_errors(trial: Trial, prediction: Prediction) -> Squares:
         out["ground_truth"] = {
             "trajectory": (truth.t, np.square(simulated.x - truth.x) + np.square(simulated.y - truth.y)),
             "yaw": (truth.t, np.square(simulated.yaw - truth.yaw))}
-    told, replayed = trial.odometry, prediction.odometry
-    if told is not None and replayed is not None:
-        mine = {"velocity": np.square(replayed.v - told.v), "angular_velocity": np.square(replayed.omega - told.omega)}
-        if told.x is not None and told.y is not None and told.yaw is not None:
+    seen, replayed = trial.odometry, prediction.odometry
+    if seen is not None and replayed is not None:
+        mine = {"velocity": np.square(replayed.v - seen.v), "angular_velocity": np.square(replayed.omega - seen.omega)}
+        if seen.x is not None and seen.y is not None and seen.yaw is not None:
             assert replayed.x is not None and replayed.y is not None and replayed.yaw is not None
-            mine["trajectory"] = np.square(replayed.x - told.x) + np.square(replayed.y - told.y)
-            mine["yaw"] = np.square(replayed.yaw - told.yaw)
-        out["odometry"] = {metric: (told.t, values) for metric, values in mine.items()}
+            mine["trajectory"] = np.square(replayed.x - seen.x) + np.square(replayed.y - seen.y)
+            mine["yaw"] = np.square(replayed.yaw - seen.yaw)
+        out["odometry"] = {metric: (seen.t, values) for metric, values in mine.items()}
     return out
 
 

@@ -1,9 +1,9 @@
-"""The next drive: the one that tells apart effects which these drives do not.
+"""The next drive: the one that separates effects which these drives do not.
 
 Rivals are an accepted effect, the others of its class, and those whose refit came close to it. Each is simulated at its
 own fitted values on every drive of a library. From the difference of two, what base parameters within their day-to-day
 spread and the other's own coordinates can absorb is projected out; what is left, in standard deviations of the noise,
-is how well a drive tells them apart. The drive with the largest worst case is proposed. All drives last as long as the
+is how well a drive separates them. The drive with the largest worst case is proposed. All drives last as long as the
 log's longest trial: they go through the replay that the search has compiled.
 """
 
@@ -82,13 +82,13 @@ class Rival:
 
 
 def next_manoeuvre(result: Result) -> dict[str, Any] | None:
-    """The drive that best tells the rivals of a verdict apart; None where the verdict has none.
+    """The drive that best separates the rivals of a verdict; None where the verdict has none.
 
     Returns:
         `name`, `parameters` {v [m/s], omega [rad/s], seconds, dt [s]} and `start` {x, y [m], heading [rad]} of the
-        drive, `splits` (the effects that it tells apart), `expected_separation` (standard deviations, the worst pair of
+        drive, `splits` (the effects that it separates), `expected_separation` (standard deviations, the worst pair of
         these, one drive), `replicates` (drives after which that is `ENOUGH`), `file`, and `not_split`: pairs of effects
-        that no drive tells apart, with the best `separation` and the `sensor` that would. Where no drive tells
+        that no drive separates, with the best `separation` and the `sensor` that would. Where no drive tells
         anything, name, parameters, start and file are None.
     """
     rounds = rivals_of(result)
@@ -291,8 +291,8 @@ def _held(result: Result, fit: Refit) -> np.ndarray:
     cross = matrix[:size, size:]
     out = np.zeros_like(matrix)
     out[:size, :size] = result.evidence.precision
-    told = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
-    covariance, start = np.linalg.inv(told + 1e-9 * np.eye(len(told))), 0
+    separable = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
+    covariance, start = np.linalg.inv(separable + 1e-9 * np.eye(len(separable))), 0
     for one, q in zip(fit.hypotheses, fit.split, strict=True):
         part = slice(start, start + len(q))
         covariance[part, part] += result.prepared.wander.at(
@@ -303,18 +303,18 @@ def _held(result: Result, fit: Refit) -> np.ndarray:
 
 
 def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, library: Sequence[Drive]) -> dict[str, Any]:
-    """The drive with the largest worst case over the pairs that any drive tells apart."""
+    """The drive with the largest worst case over the pairs that any drive separates."""
     reach = separation.max(0)
-    told = reach >= LEAST
+    separable = reach >= LEAST
     missing = [{"effects": [a.effect, b.effect], "separation": float(reach[k]),
-                "sensor": sensor_for(a.effect, b.effect)} for k, (a, b) in enumerate(pairs) if not told[k]]
-    if not told.any():
+                "sensor": sensor_for(a.effect, b.effect)} for k, (a, b) in enumerate(pairs) if not separable[k]]
+    if not separable.any():
         return {"name": None, "parameters": None, "start": None, "splits": [], "file": None,
                 "expected_separation": float(reach.min()), "replicates": None, "not_split": missing}
-    worst = separation[:, told].min(1)
+    worst = separation[:, separable].min(1)
     best = int(np.argmax(worst))
     drive, least = library[best], float(worst[best])
-    splits = [one.effect for k, pair in enumerate(pairs) if told[k] for one in pair]
+    splits = [one.effect for k, pair in enumerate(pairs) if separable[k] for one in pair]
     repeats = min(math.ceil((ENOUGH / max(least, 1e-6)) ** 2), MOST_REPEATS)
     x, y, heading = drive.start
     return {"name": drive.manoeuvre,
@@ -325,7 +325,7 @@ def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, libr
 
 def sensor_for(a: str, b: str) -> str:
     """What separates two effects that no drive separates: a sensor that measures one of them by itself."""
-    return card_of(a).sensor or card_of(b).sensor or "motor currents, which tell how much force the drives need"
+    return card_of(a).sensor or card_of(b).sensor or "motor currents, which show how much force the drives need"
 
 
 def write_next_command(out: Path, proposal: dict[str, Any] | None) -> Path | None:

@@ -1,7 +1,7 @@
 """What these very drives can show: how often they raise a false alarm, and how surely an effect is noticed.
 
 Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
-Linear, like the scan: `--refit-nulls` tells the false alarms of the whole procedure.
+Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SEED = 3  # beside that of the scan's nulls
 POWER = 0.8
 REACH, HALVINGS = 8.0, 7  # range of factors around a first guess, and how often it is halved
 FACTORS = (0.25, 0.5, 1.0, 2.0)
-"""Sizes of a named effect, over the fitted one, whose power is told."""
+"""Sizes of a named effect, over the fitted one, whose power is reported."""
 
 
 Effect = tuple[Columns, np.ndarray]

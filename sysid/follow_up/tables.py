@@ -17,7 +17,7 @@ from sysid.missing.unexplained import PHASES, WHEELS, align, wave_turns
 from whill_mjx.effects.unnamed import ACROSS, KNOTS, MAP, PERIODIC, QUANTITIES
 
 SMOOTHING = (0.01, 0.1, 1.0, 10.0)
-"""Weights of the tables' second differences that are tried, as shares of what the drives tell of a knot."""
+"""Weights of the tables' second differences that are tried, as shares of the drives' information on a knot."""
 SHRINK = 0.01  # of that weight, on the tables themselves
 MOST_TERMS = 3
 WORTH = 0.05  # share of the held-back gain that a further term must add
@@ -122,10 +122,10 @@ def penalties(products: Products, precision: np.ndarray, smoothing: float, table
     size = len(precision)
     out = np.zeros(products.matrix.shape[1:])
     out[:size, :size] = precision
-    told = np.diag(products.matrix.sum(0))[size:]
+    information = np.diag(products.matrix.sum(0))[size:]
     for half in range(2):
         part = slice(size + half * KNOTS, size + (half + 1) * KNOTS)
-        weight = max(float(told[half * KNOTS : (half + 1) * KNOTS].mean()), 1e-9)
+        weight = max(float(information[half * KNOTS : (half + 1) * KNOTS].mean()), 1e-9)
         out[part, part] = smoothing * weight * table.roughness
     return out
 

@@ -11,7 +11,7 @@ from sysid.verdict.result import Result
 
 CONFIDENCE = 0.95
 FOLLOWED = 0.9
-"""Largest share of a direction that one manoeuvre tells with which what it leaves is made larger."""
+"""Largest share of a direction's information in one manoeuvre with which its residual is enlarged."""
 NEARLY = 0.9
 """Share of the largest size that is looked for from which a size is at its end."""
 MOVED = 0.01
@@ -34,7 +34,7 @@ def warnings(result: Result) -> list[str]:
     found, alpha = result.search, result.config.thresholds.alpha
     if found.verdict != "named":
         return []
-    said = [f"{', '.join(found.crowd)} cannot be told from it either: more than a class may have for a name to be "
+    said = [f"{', '.join(found.crowd)} cannot be separated from it either: more than a class may have for a name to be "
             "worth much"] if found.crowd else []
     said += [f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
              "catalogue does not have may do what is left of both"
@@ -42,7 +42,7 @@ def warnings(result: Result) -> list[str]:
     said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
              for name in at_the_end(result)]
     named = {one.hypothesis.effect for one in found.accepted}
-    said += [f"these drives do not tell whether {one.effect} {each.falsifier.says}: an effect of another law may do it"
+    said += [f"these drives do not show whether {one.effect} {each.falsifier.says}: an effect of another law may do it"
              for one in result.stood if one.effect in named for each in one.falsifiers
              if each.falsifier.by in LAW and each.outcome == "untold"]
     gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
@@ -116,7 +116,7 @@ def deviations(final: Refit, result: Result) -> np.ndarray:
     what the coordinates seem to be on days without the effect.
 
     What a manoeuvre leaves is smaller than its error by what the fit followed it: the more, the more of a direction it
-    tells (bias-reduced linearisation, Bell and McCaffrey 2002). Where it tells nearly all, none can contradict it.
+    informs (bias-reduced linearisation, Bell and McCaffrey 2002). Where it has nearly all, none can contradict it.
     """
     groups = result.evidence.groups
     matrix, size = with_prior(final, result.evidence.precision), len(final.u)
@@ -124,9 +124,9 @@ def deviations(final: Refit, result: Result) -> np.ndarray:
     moved = []
     for group in groups:
         flat = final.jacobian[list(group)].reshape(-1, len(matrix))
-        told, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
+        shares, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
         score = along.T @ (root @ (flat.T @ final.residual[list(group)].reshape(-1)))
-        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(told, 0.0, FOLLOWED)))))
+        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(shares, 0.0, FOLLOWED)))))
     variance = np.maximum(np.diag(root.T @ root), np.square(moved).sum(0))[size:]
     wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
               for one, q in zip(final.hypotheses, final.split, strict=True)]

@@ -45,7 +45,7 @@ from whill_mjx.vehicle.types import VehicleParams
 KINDS = ("push", "brake")
 """A wrench whatever the motion, or one that turns with its direction."""
 ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
-"""Quantities that only an outside pose tells; replicates, which start elsewhere, differ in them."""
+"""Quantities that only an outside pose shows; replicates, which start elsewhere, differ in them."""
 REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
 FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
 LEAST = 0.1
@@ -165,7 +165,7 @@ def find_unnamed(result: Result) -> Unnamed | None:
         return found
     if found.table.quantity in WHEELS:
         trials = result.log.training
-        if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing tells them apart
+        if len({one.start for one in trials}) < len(trials):  # without an outside pose nothing separates them
             names = list(result.reference.space.names)
             return replace(found, vehicle=set_values(found.vehicle, names, get_values(fitted_before(result), names)))
         plant = with_start_angles(result.plant, trials, found.angles)
@@ -336,7 +336,7 @@ def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
 
 def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
     """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
-    held-out ones too: nothing else tells it."""
+    held-out ones too: nothing else shows it."""
     batch, measured = make_batch(trials, result.plant.dt, RECORD_DT)
     replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
     seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])

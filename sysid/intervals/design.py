@@ -28,11 +28,11 @@ Criterion = Literal["a", "d"]
 
 @dataclass(frozen=True)
 class Plan:
-    """One candidate and what it would tell."""
+    """One candidate and its information."""
 
     candidate: Candidate
     deviation: np.ndarray
-    """(P,) standard deviations after the drive, in unit coordinates; those of the bounds where nothing tells."""
+    """(P,) standard deviations after the drive, in unit coordinates; those of the bounds where nothing is known."""
     trace: float
     """Sum of variances over the identifiable subspace, relative to that before the drive."""
     volume: float
@@ -112,7 +112,7 @@ def rank(
     candidates: Sequence[Candidate], found: np.ndarray, prior: np.ndarray, paths: Sequence[np.ndarray],
     starts: Sequence[tuple[float, float, float]], criterion: Criterion = "a",
 ) -> list[Plan]:
-    """Candidates by what they tell, best first.
+    """Candidates by their information, best first.
 
     Args:
         found: (B, P, P) information of each.
@@ -146,7 +146,7 @@ def propose(
     Args:
         intervals: what is known, by parameter name.
         count: how many manoeuvres, chosen one after the other.
-        names: parameters of interest; by default all that a log can tell.
+        names: parameters of interest; by default all that a log can determine.
 
     Returns:
         The chosen ones, all plans for the first choice (best first), the space, and the deviations (P,) before.
@@ -213,7 +213,7 @@ def best_splitting_manoeuvre(
     candidates: Sequence[Candidate], noise: Noise = DEFAULT, channels: str = "both", plant: Plant | None = None,
     apply: Callable[[Any], Any] | None = None,
 ) -> tuple[str, Command, float]:
-    """The manoeuvre that best tells effect a from effect b.
+    """The manoeuvre that best separates effect a from effect b.
 
     Args:
         params: the base vehicle.
@@ -225,7 +225,7 @@ def best_splitting_manoeuvre(
 
     Returns:
         Name, command and z-value: the less of both directions, a beside b and b beside a. Below about 3 no candidate
-        tells them apart, and another sensor is needed.
+        separates them, and another sensor is needed.
     """
     scores = splitting_scores(spec, params, base_space, effect_a_params, effect_b_params, candidates, noise, channels,
                               plant, apply)

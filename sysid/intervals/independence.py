@@ -3,7 +3,7 @@
 Residuals of a driving log are mostly autocorrelated, so that the usual (J^T J)^-1 understates the errors several times.
 Trials are independent drives: the variance is that of their sums (`sysid.intervals.sandwich`), whatever the
 correlation within a
-drive. Where too few trials tell a parameter, or where they happen to differ less than pieces of them do, blocks are
+drive. Where too few trials inform a parameter, or where they happen to differ less than pieces of them do, blocks are
 pieces of trials, and errors are no less than those of independent samples. What replicates share is no noise but what
 the model gets wrong about a manoeuvre; where they share more than chance would have it, manoeuvres are the independent
 blocks. Errors may also be shared at a place of their drives alone: where wheels break away, the mean of many drives is
@@ -27,7 +27,7 @@ from sysid.intervals.sandwich import Sandwich, sandwich
 
 CONFIDENCE = 0.90
 ENOUGH = 2.0
-"""Degrees of freedom from which the variance between blocks is taken: three or four drives that tell a parameter."""
+"""Degrees of freedom from which the variance between blocks is taken: three or four drives that inform of one."""
 CHANCE = 0.05
 """Probability below which what replicates share is taken for the model's error."""
 FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are drawn together
@@ -35,7 +35,7 @@ FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are dr
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a log tells at a fitted point: sums over K pieces of each of B trials, in P unit coordinates."""
+    """Information of a log at a fitted point: sums over K pieces of each of B trials, in P unit coordinates."""
 
     u: np.ndarray  # (P,)
     scores: np.ndarray  # (B, K, P) J^T r of pieces of trials
@@ -58,7 +58,7 @@ class Evidence:
 
     @property
     def scale(self) -> float:
-        """How many times squared errors count what they tell: of pieces, or one by one where that is more."""
+        """How many times squared errors count the same information: of pieces, or one by one where that is more."""
         pieces = float(np.square(self.scores).sum()) / max(float(np.trace(self.blocks.sum((0, 1)))), 1e-12)
         return max(self.variance, pieces, 1e-12)
 
@@ -89,9 +89,9 @@ class Kind:
         return np.moveaxis((add @ flat.reshape(len(label), -1)).reshape(-1, *flat.shape[1:]), 0, 1)
 
     @property
-    def tells(self) -> np.ndarray:
+    def counts(self) -> np.ndarray:
         """(P,) whether the blocks are enough to know their variance."""
-        return (self.sandwich.told > 0.5) & (self.sandwich.freedom >= ENOUGH)
+        return (self.sandwich.informed > 0.5) & (self.sandwich.freedom >= ENOUGH)
 
 
 def errors_of(evidence: Evidence, confidence: float = CONFIDENCE) -> Errors:
@@ -108,7 +108,7 @@ def errors_of(evidence: Evidence, confidence: float = CONFIDENCE) -> Errors:
             found.append(np.abs(moved) / np.maximum(reach, 1e-300))
         if name != "manoeuvres":
             share = np.quantile(np.concatenate(found), confidence, axis=0)
-            needed = np.where(kind.tells | (name == "pieces"), np.maximum(needed, share), needed)
+            needed = np.where(kind.counts | (name == "pieces"), np.maximum(needed, share), needed)
     known = inverse @ evidence.precision @ inverse * evidence.share  # what the prior's own error adds
     covariances = [kind.sandwich.covariance(kind.sums(evidence.scores[None])[0]) for kind in kinds.values()]
     return Errors(np.sqrt(deviation**2 + np.diag(known)), needed * quantile, max(covariances, key=np.trace) + known)
@@ -168,10 +168,10 @@ def _widest(
     widest = np.maximum(deviation["pieces"], independent), np.tile(quantile["pieces"], (len(scores), 1))
     for name in ("drives", "manoeuvres", "places"):
         if name in kinds:
-            told = kinds[name].tells & (deviation[name] * quantile[name] > widest[0] * widest[1])
+            informed = kinds[name].counts & (deviation[name] * quantile[name] > widest[0] * widest[1])
             if name == "manoeuvres":  # a few at most
-                told = (kinds[name].sandwich.told > 0.5) & (deviation[name] > widest[0])
-            widest = np.where(told, deviation[name], widest[0]), np.where(told, quantile[name], widest[1])
+                informed = (kinds[name].sandwich.informed > 0.5) & (deviation[name] > widest[0])
+            widest = np.where(informed, deviation[name], widest[0]), np.where(informed, quantile[name], widest[1])
     return widest
 
 

@@ -2,7 +2,7 @@
 
 An interval from curvature at the fitted point is a parabola's; a profile follows walls, valleys and saturation, may be
 one-sided, and shows where a parameter is free of the data. Squares of autocorrelated residuals count more often than
-they tell, so that their increase is divided by as much as the sandwich variance of the parameter exceeds that of
+they inform, so that their increase is divided by as much as the sandwich variance of the parameter exceeds that of
 independent residuals: near its minimum the profile then agrees with the intervals of `sysid.intervals.uncertainty`.
 Source of the scaling: Rotnitzky and Jewell (1990).
 """
@@ -23,7 +23,7 @@ from sysid.search.result import Progress
 
 POINTS = 9
 ITERATIONS = 4
-BETTER = 0.02  # of the threshold by which another point must be better to be told
+BETTER = 0.02  # of the threshold by which another point must be better to be reported
 REACH = 2.0
 """How far the grid reaches, in half-widths of the interval from curvature."""
 
@@ -67,7 +67,7 @@ def profile(
     """Profile likelihoods at the fitted point u (P,), all points of a grid searched together.
 
     Args:
-        known: intervals at u, which set the grid's reach; a parameter that is not told gets its whole range.
+        known: intervals at u, which set the grid's reach; a parameter that is not determined gets its whole range.
         names: which parameters.
         points: of the grid, besides u itself.
         robust: u minimises the Huber loss.
@@ -137,6 +137,6 @@ def _scale(objective: Told, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -
     ridge = 1e-9 * max(float(np.diag(hessian).max()), 1e-12)
     naive = np.diag(np.linalg.inv(hessian + ridge * np.eye(len(u))))
     ratio = np.maximum(sd**2 / naive, 1e-12)
-    told = np.array([one.identifiable for one in known.estimates])
-    usual = float(np.median(ratio[told])) if told.any() else float(np.median(ratio))
-    return np.where(told, ratio, usual)
+    determined = np.array([one.identifiable for one in known.estimates])
+    usual = float(np.median(ratio[determined])) if determined.any() else float(np.median(ratio))
+    return np.where(determined, ratio, usual)

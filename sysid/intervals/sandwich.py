@@ -1,7 +1,7 @@
 """Variances of least-squares estimates whose errors are correlated within blocks, and how well those are known.
 
 Contributions to the gradient are added within a block before they are squared, so that any correlation within it
-counts as often as it tells; blocks are taken as independent. The residual of a block is smaller than its errors,
+counts as often as its information; blocks are taken as independent. The residual of a block is smaller than its errors,
 because the estimate follows them: each is divided by the root of what the fit leaves of independent errors, I - H_gg
 (CR2), which is unbiased for those. Few blocks, or few that matter to a parameter, know their own variance badly: its
 degrees of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 LEAST_LEFT = 1e-3
-"""Of a direction of which a block keeps less than this share of its errors, its residual tells nothing."""
+"""Of a direction of which a block keeps less than this share of its errors, its residual says nothing."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Sandwich:
 
     moves: np.ndarray  # (G, P, P): of each block's J^T r, corrected for what the estimates follow
     freedom: np.ndarray  # (P,) degrees of freedom of the variances
-    told: np.ndarray  # (P,) expected variance for independent errors, over what it is then
+    informed: np.ndarray  # (P,) expected variance for independent errors, over what it is then
 
     def covariance(self, scores: np.ndarray) -> np.ndarray:
         """(P, P) of the estimates, from J_g^T r_g (G, P) of each block at the minimum."""

@@ -1,12 +1,12 @@
-"""Confidence intervals of fitted parameters, and which of them the log cannot tell.
+"""Confidence intervals of fitted parameters, and which of them the log cannot determine.
 
-What a log tells at the fitted point is summed over pieces of its trials; which of them have errors of their own
+The information of a log at the fitted point is summed over pieces of its trials; which of them have errors of their own
 `sysid.intervals.independence` decides. Slopes are averaged over the errors (`sysid.search.slopes`): by differences
 over a fixed share of
-their ranges, delays are told half as well as they are, and friction, slip and torque limits up to one and a half times.
+their ranges, delays seem half as well known as they are; friction, slip and torque limits up to one and a half times.
 
-What a log tells of the height of the mass depends on that height. An estimate that came out where the log tells much
-would have a narrow interval, whatever it tells of the truth. Such an interval reaches as far as the information between
+A log's information on the height of the mass depends on that height. An estimate that came out where it is large
+would have a narrow interval, whatever the truth is. Such an interval reaches as far as the information between
 adds up to: its half-width h at the fit and h' at the end that this has are measured, and the end lies where
 the integral of dx / h(x) is 1, with h a straight line through both. Where h does not change this is the usual interval.
 It is what a variance-stabilising transformation of the parameter would give (Bartlett 1947).
@@ -29,11 +29,11 @@ from sysid.search.slopes import average_slopes, likely, likely_by
 
 PIECES = 8
 """That each trial is cut into."""
-PASSES = 2  # of averaging slopes: over errors as differences tell them, and as averaged slopes do
+PASSES = 2  # of averaging slopes: over errors by differences, and by averaged slopes
 PRIOR_SD = UNKNOWN
 """Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
 UNIDENTIFIABLE = 0.5
-"""Share of the prior's standard deviation above which a parameter counts as not told by the log."""
+"""Share of the prior's standard deviation above which a parameter counts as not determined by the log."""
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
 FOLLOW = 2  # iterations of all others at the end of an interval
 NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
@@ -49,7 +49,7 @@ class Estimate:
     initial: float
     value: float
     low: float
-    """Lower end of the confidence interval; that of the bounds where the log does not tell."""
+    """Lower end of the confidence interval; that of the bounds where the log does not determine it."""
     high: float
     identifiable: bool
     remark: str
@@ -78,7 +78,7 @@ class Uncertainty:
         return found
 
     def weak_combinations(self) -> list[str]:
-        """Directions that the log does not tell, as the parameters that make them up."""
+        """Directions that the log does not determine, as the parameters that make them up."""
         return [parts for value, parts in self.spectrum() if value * PRIOR_SD**2 < 1.0 / UNIDENTIFIABLE**2]
 
 
@@ -88,13 +88,13 @@ def estimate(
     """Intervals of the parameters at the fitted point u (P,).
 
     Args:
-        robust: u minimises the Huber loss: residuals beyond its bend pull with a constant force and tell no curvature.
+        robust: u minimises the Huber loss: residuals beyond its bend pull with a constant force and add no curvature.
     """
     return uncertainty_of(evidence_of(objective, u, robust), objective.space, confidence)
 
 
 def evidence_of(objective: Told, u: np.ndarray, robust: bool = False) -> Evidence:
-    """What the drives of an objective tell at the fitted point u (P,); `robust` as of `estimate`."""
+    """Information of the drives of an objective at the fitted point u (P,); `robust` as of `estimate`."""
     found = _evidence_at(objective, u, robust)
     return replace(found, ahead=_ahead(objective, found, robust))
 
@@ -133,7 +133,7 @@ def stretched(ahead: np.ndarray) -> np.ndarray:
 
 
 def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Evidence:
-    """What drives tell at any point u (P,), by slopes averaged over errors of a covariance `over` (P, P): those of
+    """Information of drives at any point u (P,), by slopes averaged over errors of a covariance `over` (P, P): those of
     slopes at u unless it is given."""
     space = objective.space
     if over is not None:
@@ -144,11 +144,11 @@ def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray 
         for _ in range(PASSES):
             residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
     residual, jacobian = (without_prior(objective, one) for one in (residual, jacobian))  # it is no measurement
-    told = jacobian
+    bent = jacobian
     if robust:
-        told = jacobian * (np.abs(residual) <= HUBER)[..., None]
+        bent = jacobian * (np.abs(residual) <= HUBER)[..., None]
         residual = residual * huber_weight(residual)
-    scores, blocks = _pieces(objective, jacobian, residual, told)
+    scores, blocks = _pieces(objective, jacobian, residual, bent)
     variance = max(float(np.square(residual).sum()) / max(objective.counted - space.size, 1), 1e-12)
     groups = _manoeuvres(objective)
     alike = shared_error(objective.own_frame(residual), groups)
@@ -160,7 +160,7 @@ def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray 
 
 
 def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDENCE) -> Uncertainty:
-    """Intervals by what a log tells."""
+    """Intervals from the information of a log."""
     u, errors = evidence.u, errors_of(evidence, confidence)
     information, directions = np.linalg.eigh(evidence.blocks.sum((0, 1)) / evidence.scale)
     reach = errors.quantile * errors.deviation * np.array([[-1], [1]]) * stretched(evidence.ahead)  # (2, P)
@@ -185,12 +185,12 @@ def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDE
 
 
 def inflation(objective: Told, u: np.ndarray) -> float:
-    """How many times the squared residuals count what they tell: their sum over neighbours against that one by one."""
+    """How often the squared residuals count the same information: their sum over neighbours against that one by one."""
     residual, jacobian = (without_prior(objective, array[0]) for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
     pieces = _pieces(objective, jacobian, residual * huber_weight(residual), jacobian)[0].reshape(-1, len(u))
-    told = np.diag(hessian) > 1e-9 * np.diag(hessian).max()
-    return max(float(np.median(np.square(pieces).sum(0)[told] / np.diag(hessian)[told])), 1.0)
+    bent = np.diag(hessian) > 1e-9 * np.diag(hessian).max()
+    return max(float(np.median(np.square(pieces).sum(0)[bent] / np.diag(hessian)[bent])), 1.0)
 
 
 def _manoeuvres(objective: Told) -> np.ndarray:
@@ -203,16 +203,16 @@ def _manoeuvres(objective: Told) -> np.ndarray:
 
 
 def _pieces(
-    objective: Told, jacobian: np.ndarray, residual: np.ndarray, told: np.ndarray
+    objective: Told, jacobian: np.ndarray, residual: np.ndarray, bent: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """J^T r (B, PIECES, P) and J^T J (B, PIECES, P, P) of pieces of trials, all channels of a piece together.
 
     Args:
-        told: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss tell no curvature.
+        bent: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss add no curvature.
     """
     piece = objective.pieces(PIECES)
     piece = np.pad(piece, (0, residual.shape[1] - len(piece)))  # errors of the start belong to the first piece
     parts = [np.flatnonzero(piece == k) for k in range(PIECES)]
     scores = [np.einsum("bkp,bk->bp", jacobian[:, part], residual[:, part]) for part in parts]
-    blocks = [told[:, part].swapaxes(1, 2) @ jacobian[:, part] for part in parts]
+    blocks = [bent[:, part].swapaxes(1, 2) @ jacobian[:, part] for part in parts]
     return np.stack(scores, axis=1), np.stack(blocks, axis=1)

@@ -173,7 +173,7 @@ def cut(
 
 
 def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float, float]]:
-    """Begin and end [s] of each drive: motion, told or measured, with up to LEAD seconds of standstill around it."""
+    """Begin and end [s] of each drive: commanded or measured motion, with up to LEAD s of standstill around it."""
     t, moving = _motion(tables)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], moving, [False]]).astype(int)))
     runs = [(t[a], t[min(b, len(t) - 1)]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -202,8 +202,8 @@ def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     t = np.arange(begin, end, 0.02)
     command = tables["command"]
     held = np.searchsorted(command[:, 0], t, side="right") - 1
-    told = np.where(held[:, None] >= 0, command[np.maximum(held, 0), 1:], 0.0)
-    moving = (np.abs(told[:, 0]) > STILL) | (np.abs(told[:, 1]) > STILL)
+    commanded = np.where(held[:, None] >= 0, command[np.maximum(held, 0), 1:], 0.0)
+    moving = (np.abs(commanded[:, 0]) > STILL) | (np.abs(commanded[:, 1]) > STILL)
     if "odometry" in tables:
         v, omega = (np.interp(t, tables["odometry"][:, 0], tables["odometry"][:, k]) for k in (4, 5))
         moving |= (np.abs(v) > MOVING["v"]) | (np.abs(omega) > MOVING["omega"])

@@ -1,4 +1,4 @@
-"""What a log excites, how well its drives repeat, and what therefore no fit can tell from it."""
+"""What a log excites, how well its drives repeat, and what therefore no fit can find in it."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def sanity(log: Log) -> list[str]:
                 found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
-        ratios = [ours / told for ours, told in lengths if told > 1.0 and np.isfinite(ours)]
+        ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
@@ -130,7 +130,7 @@ def sanity(log: Log) -> list[str]:
     if gone:
         found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "
                      f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
-                     "against it tell little of a model; a fit leaves such trials out.")
+                     "against it say little of a model; a fit leaves such trials out.")
     return found
 
 
@@ -140,10 +140,10 @@ def _gain(trial: Trial, channel: str, index: int) -> float | None:
     if rates is None:
         return None
     held = command_in_force(trial.command, rates[0] - 0.3)  # the response takes a while; only the rough size counts
-    told = np.where(held >= 0, (trial.command.v, trial.command.omega)[index - 1][np.maximum(held, 0)], 0.0)
-    if told.std() < 0.05:
+    commanded = np.where(held >= 0, (trial.command.v, trial.command.omega)[index - 1][np.maximum(held, 0)], 0.0)
+    if commanded.std() < 0.05:
         return None
-    centred = told - told.mean()
+    centred = commanded - commanded.mean()
     return float(centred @ rates[index] / (centred @ centred))
 
 
@@ -165,7 +165,7 @@ def _length_told(trial: Trial) -> float:
 
 @dataclass(frozen=True)
 class Blind:
-    """One thing that the log cannot tell."""
+    """One thing that the log does not determine."""
 
     cause: str
     hidden: str
@@ -174,7 +174,7 @@ class Blind:
 
 
 def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
-    """What no fit can tell from the training trials of a log, with the drive or sensor that would tell it."""
+    """What the training trials of a log do not determine, with the drive or sensor that would."""
     trials = log.training or log.trials
     found = [excitations[trial.name] for trial in trials]
     rules: list[tuple[bool, str, str, str]] = [
@@ -199,7 +199,7 @@ def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
         (_few(found, "v", 0.1), "one speed", "resistance that grows with speed, air drag; acceleration limit apart "
          "from delay and lag", "drive the same manoeuvre at half and at full speed"),
         (max((e.step_sizes for e in found), default=0) < 3, "steps of hardly any different size",
-         "delay, lag and acceleration limit apart from one another: only their scaling with the step tells them apart",
+         "delay, lag and acceleration limit apart from one another: only their scaling with the step separates them",
          "add random steps (manoeuvre random_steps) or a sweep of step sizes"),
         (_one_heading(found), "one heading of the room",
          "slope and side force apart from a difference of the wheel radii: they act along fixed directions of the room",

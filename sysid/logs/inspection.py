@@ -148,7 +148,7 @@ def text(found: dict[str, Any]) -> str:
         lines.append(f"  {_span(group['trials'])}: {spread}")
     if not found["replicates"]:
         lines.append("  none")
-    lines += ["", "What this log cannot tell"]
+    lines += ["", "What this log cannot determine"]
     for blind in found["blind_spots"]:
         lines += [f"  {blind['cause']} -> {blind['hidden']}", f"      remedy: {blind['remedy']}"]
     return "\n".join(lines)

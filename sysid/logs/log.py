@@ -311,10 +311,10 @@ def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Comma
 
 def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[float, float]:
     """Speed [m/s] and yaw rate [rad/s] at the start; exactly 0 at rest, whatever the sensors' noise."""
-    told = float(command.v[0]), float(command.omega[0])
-    if command.t[0] > 0 or max(abs(told[0]), abs(told[1])) < 1e-6:
+    at_start = float(command.v[0]), float(command.omega[0])
+    if command.t[0] > 0 or max(abs(at_start[0]), abs(at_start[1])) < 1e-6:
         return 0.0, 0.0
-    speeds = told if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
+    speeds = at_start if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
     return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
 
 

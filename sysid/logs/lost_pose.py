@@ -1,6 +1,6 @@
 """Trials whose outside pose was lost: its yaw contradicts a yaw rate that was measured on the vehicle.
 
-Scan matching fails where the vehicle turns fast or its surroundings tell little: the pose jumps, and may stay wrong for
+Scan matching fails where the vehicle turns fast or its surroundings show little: the pose jumps, and may stay wrong for
 the rest of the trial. No vehicle model is asked: the outside yaw must follow the integral of the rate, however late it
 is and with whatever factor a gyro of its kind may have.
 """

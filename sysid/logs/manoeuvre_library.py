@@ -130,7 +130,7 @@ def library(limits: Limits | None = None) -> tuple[Candidate, ...]:
     limits = limits or Limits()
     found = []
     for name in (*MANOEUVRES, *OWN):
-        for size in SIZES if name != "standstill" else ():  # tells noise and bias, no parameter of the vehicle
+        for size in SIZES if name != "standstill" else ():  # shows noise and bias, no parameter of the vehicle
             v, omega = size * limits.v_max, size * limits.omega_max
             if name in REVERSING:
                 v = min(v, -size * limits.v_min)

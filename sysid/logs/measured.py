@@ -37,7 +37,7 @@ LARGEST = 1e6  # m, rad or rad/s that a measured value stays below
 CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
-MOVING = 0.05  # m of track or wheel travel below which a window tells nothing
+MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
 # The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
 GYRO_SIGN = {"warthog_gravel": -1.0}
 MRCLAM_WINDOW = 15.0  # s
@@ -113,7 +113,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
 
 
 def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -> Log:
-    """Load MRCLAM robots as consecutive windows in which the robot was told to move."""
+    """Load MRCLAM robots as consecutive windows in which the robot was commanded to move."""
     folder = Path(folder)
     trials: list[Trial] = []
     notes = []

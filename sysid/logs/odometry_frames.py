@@ -1,6 +1,6 @@
 """Odometry that is computed at fixed times and reported at others: each row is of the frame before it.
 
-Wheel odometry is computed every few milliseconds and sent at another rate. A row then tells where the vehicle was at
+Wheel odometry is computed every few milliseconds and sent at another rate. A row then says where the vehicle was at
 the latest frame, and its stamp is up to a period later: at 1 m/s and 20 ms, 2 cm. Where these ages differ from row to
 row they show in steady driving, as steps that are not as long as the time between their stamps: no model is needed.
 Ages that all rows share do not show; a fit has `sensor_delay` for them.
@@ -16,7 +16,7 @@ import numpy as np
 from sysid.logs.log import Trial, command_in_force
 from sysid.replay.cores import on_all_cores
 
-ROWS = 8  # of a stretch of steady driving, in which what a parabola over time does not explain is told by the ages
+ROWS = 8  # of a stretch of steady driving, in which what a parabola over time does not explain is explained by the ages
 STEADY = 0.3  # s for which the command must have been in force
 LEAST = 0.2  # m/s or rad/s of steady driving
 STRETCHES = 30  # that are needed
@@ -75,7 +75,7 @@ def find_period(trials: Sequence[Trial]) -> float | None:
     rate = _best_rate(part, finer, part.trial)[0]
     finest = rate + (finer[1] - finer[0]) * np.linspace(-1.0, 1.0, 2 * FINER + 1)
     rate, lowest, highest = _best_rate(part, finest, part.trial, FINER * PHASES)
-    # Rows at multiples of a time tell a rate roughly; clocks are set to round ones.
+    # Rows at multiples of a time show a rate roughly; clocks are set to round ones.
     round_ones = [float(round(rate)), 1e3 / round(1e3 / rate)]
     rate = next((one for one in round_ones if lowest <= one <= highest), rate)
     left = unexplained(part, 1 / rate, part.trial, FINER * PHASES)
@@ -83,7 +83,7 @@ def find_period(trials: Sequence[Trial]) -> float | None:
 
 
 def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> Stretches | None:
-    """Where a trial's odometry tells of steady driving, forward or turning; None where it never does.
+    """Where a trial's odometry shows steady driving, forward or turning; None where it never does.
 
     Args:
         number: of the trial.
@@ -129,7 +129,7 @@ def unexplained(part: Stretches, period: float, group: np.ndarray, phases: int =
 
 def ages_of(t: np.ndarray, period: float, phase: np.ndarray | float) -> np.ndarray:
     """By how much rows at t are older than their stamps [s], with frames at (n + phase) periods."""
-    since = t / period - phase + 1e-6  # a row at a frame tells that frame
+    since = t / period - phase + 1e-6  # a row at a frame is of that frame
     return period * (since - np.floor(since))
 
 

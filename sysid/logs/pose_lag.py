@@ -1,7 +1,7 @@
-"""How late the outside pose is, told without a vehicle model.
+"""How late the outside pose is, found without a vehicle model.
 
 The outside yaw follows the integral of a rate measured on the vehicle, and its path that of the speed; how much later
-is told by whole drives, with one factor for all. A yaw rate of the body (a gyro) settles it. The odometry tells of the
+is found from whole drives, with one factor for all. A yaw rate of the body (a gyro) settles it. The odometry shows the
 wheels, and a body that lags behind them looks like a late pose; where it is all there is, the delay has to beat a
 first-order lag. Before a drive the vehicle went on as in its first instant, as `whill_mjx.effects.pose_delay` has it.
 """
@@ -36,7 +36,7 @@ class PoseLag:
     high: float
     """95 % interval of it, from blocks left out in turn [s]."""
     p: float
-    """Probability of so much better a prediction of held-back blocks if the delay told nothing: signs of blocks."""
+    """Probability of so much better a prediction of held-back blocks if the delay meant nothing: signs of blocks."""
     share: float
     """Share of the held-back error that it removes."""
 
@@ -49,22 +49,22 @@ def pose_lag(trials: Sequence[Trial], blocks: Sequence[Sequence[int]], rates: Ra
         rates: yaw rates of the body; without them the odometry is taken.
 
     Returns:
-        None where the drives tell nothing: no odometry, no turns, fewer than two blocks.
+        None where the drives show nothing: no odometry, no turns, fewer than two blocks.
     """
     sums = {i: one for i, trial in enumerate(trials) if (one := _sums(trial, rates)) is not None}
-    told = [block for block in ([i for i in block if i in sums] for block in blocks) if block]
-    if len(told) < 2:
+    usable = [block for block in ([i for i in block if i in sums] for block in blocks) if block]
+    if len(usable) < 2:
         return None
-    gains, before = np.zeros(len(told)), 0.0
+    gains, before = np.zeros(len(usable)), 0.0
     for half in (0, 1):
-        other = list(range(1 - half, len(told), 2))
-        fitted, judged = sum(told[half::2], []), sum((told[b] for b in other), [])
+        other = list(range(1 - half, len(usable), 2))
+        fitted, judged = sum(usable[half::2], []), sum((usable[b] for b in other), [])
         null, late = (_foretold([sums[i][which] for i in fitted], [sums[i][which] for i in judged]) for which in (0, 1))
         each = dict(zip(judged, null - late, strict=True))
-        gains[other] = [sum(each[i] for i in told[b]) for b in other]
+        gains[other] = [sum(each[i] for i in usable[b]) for b in other]
         before += float(null.sum())
-    delay = _best([sums[i][1] for i in sum(told, [])])
-    left = [_best([sums[i][1] for block in told[:b] + told[b + 1 :] for i in block]) for b in range(len(told))]
+    delay = _best([sums[i][1] for i in sum(usable, [])])
+    left = [_best([sums[i][1] for block in usable[:b] + usable[b + 1 :] for i in block]) for b in range(len(usable))]
     spread = float(np.sqrt((len(left) - 1) * np.var(left)))
     reach = float(stats.t.ppf(0.975, len(left) - 1)) * max(spread, float(GRID[1]) / 2)
     return PoseLag(delay, max(delay - reach, 0.0), delay + reach, sign_flips(gains),

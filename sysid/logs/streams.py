@@ -2,7 +2,7 @@
 
 Offsets come from shifting one signal against the other until they fit best. Between command and motion the vehicle's
 own response lies in between; a first-order lag is therefore fitted together with the shift, and what remains is the sum
-of clock offset and transport delay, which no drive can tell apart.
+of clock offset and transport delay, which no drive can separate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SMOOTHING = 0.2  # s, over which positions are differenced
 LAGS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)  # s, first-order responses that are tried
 GAP = 2.5  # sampling periods without a sample
 MOVING = 0.05  # m/s or rad/s, above which a vehicle should not repeat its pose
-MIN_SIGNAL = {"v": 0.03, "omega": 0.03}  # m/s, rad/s of standard deviation below which a channel tells no shift
+MIN_SIGNAL = {"v": 0.03, "omega": 0.03}  # m/s, rad/s of standard deviation below which a channel shows no shift
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
     held = command_in_force(trial.command, t)
     found = {}
     for name, command, measured in (("v", trial.command.v, v), ("omega", trial.command.omega, omega)):
-        told = np.where(held >= 0, command[np.maximum(held, 0)], 0.0)
-        if told.std() > MIN_SIGNAL[name] and (shift := find_shift(told, measured, lags=LAGS)) is not None:
+        commanded = np.where(held >= 0, command[np.maximum(held, 0)], 0.0)
+        if commanded.std() > MIN_SIGNAL[name] and (shift := find_shift(commanded, measured, lags=LAGS)) is not None:
             found[name] = shift
     return found
 

@@ -15,9 +15,9 @@ from sysid.logs.log import Trial
 from sysid.missing.evidence import Columns
 
 ASSUMED_DAYS = 4.0
-"""How many days the mean over all hypotheses counts as, beside what the days tell of one."""
+"""How many days the mean over all hypotheses counts as, beside the days' information on one."""
 EXCESS = 0.06
-"""Standard deviation of a day's excess where reference days do not tell."""
+"""Standard deviation of a day's excess where reference days do not determine it."""
 
 EVEN = 0.97  # least correlation of two commands for their drives to be compared bin by bin
 
@@ -77,8 +77,8 @@ class Reference:
             for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
                 courses[group] = course
             apart.append(scatter(white, courses))
-        told = [one for one in apart if np.isfinite(one)]
-        return float(np.clip(-np.mean(told), 0.0, 1.0)) if told else 0.0
+        finite = [one for one in apart if np.isfinite(one)]
+        return float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
 
     def expected(self, trial: Trial, bins: int) -> np.ndarray:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
@@ -148,7 +148,7 @@ class Wander:
     usual: float = 0.0
     """What smooth functions that know no physics gain on a reference day, per trial."""
     usual_size: float = 0.0
-    """Root mean square of it over the days, for a new one; 0 where reference days do not tell."""
+    """Root mean square of it over the days, for a new one; 0 where reference days do not show it."""
     scatter: float = 0.0
     """Excess of what a reference day's replicates do not share."""
 
@@ -190,7 +190,7 @@ class Wander:
 
     def smooth_limit(self, alpha: float) -> float:
         """What smooth functions gain per trial on a day with nothing in it with probability alpha; infinite where days
-        do not tell."""
+        do not show it."""
         from scipy import stats
 
         return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")

@@ -48,7 +48,7 @@ def by_own_noise(trials: Sequence[Trial], measured: Measured) -> Measured:
     """The measurements with masks that weigh each trial by what replicates of its manoeuvre differ by.
 
     Replicates that skid part by ten times as much as others. With one noise for all, the fit would follow their chance
-    and leave the others to errors that are small beside it. Few replicates tell little: their variance is drawn towards
+    and leave the others to errors that are small beside it. Few replicates say little: their variance is drawn towards
     that of all. Manoeuvres without any have that one; without replicates nothing changes.
     """
     pooled = replicate_noise(tuple(trials))

@@ -26,7 +26,7 @@ from sysid.search.result import Progress
 from whill_mjx.vehicle.parameters import set_values
 
 ASSUMED_SPREAD = 0.05
-"""Day-to-day standard deviation of a parameter, as a share of its value, where reference drives do not tell."""
+"""Day-to-day standard deviation of a parameter, as a share of its value, where reference drives do not show it."""
 ASSUMED_DAYS = 4.0
 """How many days of reference drives that assumption counts as."""
 LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
@@ -100,7 +100,7 @@ def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[
 
 
 def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:
-    """(P,) standard deviations in unit coordinates where drives do not tell."""
+    """(P,) standard deviations in unit coordinates where drives do not show them."""
     value = np.abs(space.to_values(u))
     scale = np.where(value > 0, value, space.high - space.low)
     return np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)

@@ -1,7 +1,7 @@
 """Where a residual lives that no effect of the catalogue explains.
 
 For each quantity that a motion has (time, speed, place, heading, wheel angle, command, rest), smooth functions of it
-are fitted to the white residual of some drives and asked to predict that of the others. What predicts best tells where
+are fitted to the white residual of some drives and asked to predict that of the others. What predicts best shows where
 to look: a residual that repeats with the wheel's angle is something round, one that repeats with the place, the floor.
 How far a wheel is turned when a drive begins is not known: each drive may start at its own angle.
 """
@@ -101,10 +101,10 @@ def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np
 
 def _rolled(trial: Trial, t: np.ndarray, track: float) -> np.ndarray:
     """(K, 2) m that the left and the right wheel rolled until times t (K,)."""
-    told = trial.odometry or trial.command
-    sides = np.stack([told.v - told.omega * track / 2, told.v + told.omega * track / 2], axis=-1)
-    rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(np.diff(told.t)[:, None] * sides[:-1], axis=0)])
-    return np.stack([np.interp(t, told.t, rolled[:, k]) for k in range(2)], axis=-1)
+    speeds = trial.odometry or trial.command
+    sides = np.stack([speeds.v - speeds.omega * track / 2, speeds.v + speeds.omega * track / 2], axis=-1)
+    rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(np.diff(speeds.t)[:, None] * sides[:-1], axis=0)])
+    return np.stack([np.interp(t, speeds.t, rolled[:, k]) for k in range(2)], axis=-1)
 
 
 def align(products: np.ndarray, moments: np.ndarray, turns: np.ndarray, penalty: np.ndarray

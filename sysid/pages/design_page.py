@@ -1,4 +1,4 @@
-"""How a proposed manoeuvre reads: a text, and a page with its path, its commands and what the others would tell."""
+"""How a proposed manoeuvre reads: a text, and a page with its path, its commands and what the others would show."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
-from sysid.pages.html import Cell, Section, charts, html_page, paragraph, table
 from sysid.pages.svg import PALETTE, Line, line_chart
+from whill_mjx.html import Cell, Section, charts, html_page, paragraph, table
 from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed
@@ -36,7 +36,7 @@ def text(
     lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
     blind = blind_parameters(plans, space)
     if blind:
-        lines.append("no candidate tells: " + ", ".join(blind))
+        lines.append("no candidate determines: " + ", ".join(blind))
     return "\n".join(lines)
 
 
@@ -68,8 +68,8 @@ def write_page(
         [plan.candidate.name, float(plan.candidate.command.t[-1]), plan.trace, plan.volume]
         for plan in plans]
     sections += [
-        Section("What it tells", paragraph("Standard deviations as shares of what the bounds alone tell, before and "
-                                           "after the drives; above one half counts as not told.")
+        Section("What it determines", paragraph("Standard deviations as shares of those of the bounds, before and "
+                                           "after the drives; above one half counts as not determined.")
                 + table(["parameter", "value", "before", "after"], rows)),
         Section("Other manoeuvres", paragraph("Sum of variances relative to now, and logarithm of the volume of the "
                                               "uncertainty; the less the better.")

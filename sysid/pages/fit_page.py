@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
-from sysid.pages.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
 from sysid.pages.series import Channel, TrialSeries
 from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
+from whill_mjx.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
 
 REPLAYS = ("ideal", "initial", "fitted")
 CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
@@ -89,6 +89,28 @@ def headline(report: dict[str, Any]) -> str:
     return text + f" (ideal vehicle: {number(one['ideal'])} m)."
 
 
+def in_words(report: dict[str, Any], shown: int = 6) -> list[str]:
+    """A few plain lines on a fit, for a terminal: the error, the parameters that changed most, and what is unknown."""
+    lines = [headline(report)]
+    known = [one for one in report["parameters"] if one["identifiable"]]
+    for one in sorted(known, key=_change, reverse=True)[:shown]:
+        low, high = one["interval"]
+        lines.append(f"{one['name']}: {one['initial']:.4g} -> {one['value']:.4g} {one['unit']} "
+                     f"({one['confidence']:.0%} interval {low:.4g} to {high:.4g})")
+    unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
+    if len(known) > shown:
+        lines.append(f"and {len(known) - shown} more parameters that this log determines")
+    if unknown:
+        lines.append(f"not determined by this log: {', '.join(unknown)}")
+    return lines
+
+
+def _change(one: dict[str, Any]) -> float:
+    """Change of a parameter relative to the width of its interval."""
+    low, high = one["interval"]
+    return abs(one["value"] - one["initial"]) / max(high - low, 1e-12)
+
+
 def _summary_table(part: dict[str, Any]) -> str:
     rows = []
     for channel, metrics in part.items():
@@ -103,7 +125,7 @@ def _summary_table(part: dict[str, Any]) -> str:
 
 
 def parameters(report: dict[str, Any]) -> str:
-    """Initial and fitted values with intervals; what was not fitted; what the log does not tell."""
+    """Initial and fitted values with intervals; what was not fitted; what the log does not determine."""
     rows: list[list[Any]] = []
     for one in report["parameters"]:
         low, high = one["interval"]
@@ -120,7 +142,7 @@ def parameters(report: dict[str, Any]) -> str:
              paragraph("Bar: interval (blue) and fitted value (dot) within the bounds of the search; the orange tick "
                        "is the initial value.", "dim")]
     if report["weak_combinations"]:
-        parts += [heading("Combinations that this log does not tell"), bullets(report["weak_combinations"])]
+        parts += [heading("Combinations that this log does not determine"), bullets(report["weak_combinations"])]
     if report.get("spectrum"):
         parts += [heading("Fisher information"),
                   table(["combination", "information", "standard error"], [

@@ -73,6 +73,7 @@ def provenance(report: dict[str, Any]) -> dict[str, Any]:
     return {"made_by": "sysid.fit", "dataset": report["dataset"]["name"], "dataset_sha256": report["dataset"]["sha256"],
             "preset": report["model"]["preset"], "method": report["settings"]["method"],
             "seed": report["settings"]["seed"], "cost": report["search"]["cost"],
+            "interval_confidence": uncertainty.CONFIDENCE,
             "scored_on": "held_out" if report["summary"]["held_out"] else "training", "rmse": errors,
             "not_identifiable": [one["name"] for one in report["parameters"] if not one["identifiable"]]}
 
@@ -105,6 +106,8 @@ def fit_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
+    if progress is not None:
+        progress(0, "writing the report")
     if fit.frame is not None:
         log = replace(log, trials=odometry_frames.at_frames(log.trials, fit.frame),
                       notes=(*log.notes, odometry_frames.note(fit.frame)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,11 @@ from sysid.logs.streams import speeds
 COLOURS = {"command": "tab:gray", "odometry": "tab:blue", "ground_truth": "tab:red"}
 LABELS = {"command": "command", "odometry": "odometry", "ground_truth": "outside pose"}
 
+UNITS = {"m": ("x", "y"), "rad": ("yaw",), "m/s": ("v",), "rad/s": ("omega",)}
+"""Quantities of each unit."""
+MARKS = ("o", "x")
+"""Marks of the quantities of one unit."""
+
 
 def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     """Write the picture (PNG) of a log and what `sysid.logs.inspection.inspect` found on it."""
@@ -21,11 +27,16 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(2, 2, figsize=(11.5, 8.0), layout="constrained")
-    _intervals(axes[0, 0], log)
-    _velocities(axes[0, 1], log)
-    _liveliest(axes[1, 0], log)
-    _spread(axes[1, 1], found)
+    rows = max(len(found["replicates"]), 3)
+    figure = pyplot.figure(figsize=(12.0, 8.5 + 0.25 * rows), layout="constrained")
+    parts: Any = figure.subfigures(3, 1, height_ratios=(4.2, 3.3, 1.0 + 0.25 * rows))
+    upper, middle, lower = parts
+    left, right = upper.subplots(1, 2)
+    _intervals(left, log)
+    _velocities(right, log)
+    _liveliest(middle.subplots(), log)
+    lower.suptitle("Standard deviation between replicates: no model can predict better", fontsize=11)
+    _spread(lower.subplots(1, len(UNITS), sharey=True), found)
     figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp.png")
@@ -43,16 +54,21 @@ def _label(axis: Any, title: str, across: str, up: str) -> None:
 
 def _intervals(axis: Any, log: Log) -> None:
     """Distribution of the intervals between samples."""
-    for name in COLOURS:
+    from matplotlib import ticker
+
+    for name, style in zip(COLOURS, ("-", "-", "--"), strict=True):
         streams = [getattr(trial, name) for trial in log.trials]
         steps = [np.diff(stream.t) for stream in streams if stream is not None and len(stream.t) > 1]
         if steps:
             ordered = np.sort(np.concatenate(steps)) * 1e3
-            axis.plot(ordered, np.linspace(0, 1, len(ordered)), color=COLOURS[name], label=LABELS[name])
+            axis.plot(ordered, np.linspace(0, 1, len(ordered)), style, color=COLOURS[name], label=LABELS[name])
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     axis.set_xlim(low / 3, high * 3)
     _label(axis, "Sampling: an upright line is regular", "interval between samples [ms]", "share of intervals below")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
+    axis.xaxis.set_minor_formatter("{x:g}")
 
 
 def _velocities(axis: Any, log: Log) -> None:
@@ -92,22 +108,27 @@ def _liveliest(axis: Any, log: Log) -> None:
     _label(axis, f"Command and motion: {trial.name}", "t [s]", label)
 
 
-def _spread(axis: Any, found: dict[str, Any]) -> None:
-    """Spread between replicates by manoeuvre."""
+def _spread(panels: Sequence[Any], found: dict[str, Any]) -> None:
+    """Spread between replicates: one panel a unit, one row a manoeuvre, one mark a channel."""
     groups = found["replicates"]
-    axis.set_title("Replicates: the spread that no model can beat")
-    if not groups:
-        axis.text(0.5, 0.5, "no replicates in this log", ha="center", va="center", transform=axis.transAxes)
-        axis.set_xticks([])
-        axis.set_yticks([])
-        return
     names = list(dict.fromkeys(name for group in groups for name in group["spread"]))
-    for k, name in enumerate(names):
-        axis.plot([group["spread"].get(name, np.nan) for group in groups], "o-", linewidth=0.6, markersize=4,
-                  color=f"C{k}", label=name.replace("ground_truth", "outside"))
-    axis.set_yscale("log")
-    axis.set_ylabel("standard deviation [m, rad, m/s, rad/s]")
-    axis.set_xticks(range(len(groups)), [group["trials"][0].rsplit("_", 1)[0] for group in groups], rotation=35,
-                    ha="right", fontsize=8)
-    axis.legend(fontsize=7, ncols=2)
-    axis.grid(alpha=0.3)
+    labels = [group["trials"][0].rsplit("_", 1)[0] for group in groups]
+    for axis, (unit, quantities) in zip(panels, UNITS.items(), strict=True):
+        mine = [name for name in names if name.partition(".")[2] in quantities]
+        axis.set_title(f"{' and '.join(quantities)} [{unit}]", fontsize=9)
+        if not mine:
+            axis.text(0.5, 0.5, "no replicates" if not groups else "not measured", ha="center", va="center",
+                      transform=axis.transAxes)
+            axis.set_xticks([])
+            continue
+        for name in mine:
+            channel, mark = name.partition(".")[0], MARKS[quantities.index(name.partition(".")[2])]
+            axis.plot([group["spread"].get(name, np.nan) for group in groups], range(len(groups)), mark,
+                      markersize=5, color=COLOURS.get(channel, "black"), alpha=0.8,
+                      label=f"{name.partition('.')[2]}, {LABELS.get(channel, channel)}")
+        axis.set_xlim(0.0, 1.1 * axis.get_xlim()[1])
+        axis.set_ylim(len(groups) - 0.5, -0.5)
+        axis.set_yticks(range(len(groups)), labels, fontsize=8)
+        axis.tick_params(axis="x", labelsize=7)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.2), ncols=2, frameon=False)
+        axis.grid(alpha=0.3)

@@ -11,8 +11,8 @@ import numpy as np
 from sysid.logs.log import Command, Start
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.metrics import METRICS, UNITS, integrate
-from sysid.pages.html import Section, bullets, charts, html_page, paragraph, table
 from sysid.pages.svg import PALETTE, Line, bar_chart, line_chart
+from whill_mjx.html import Section, bullets, charts, html_page, paragraph, table
 from whill_mjx.logs.dataset import write_text
 
 
@@ -59,7 +59,7 @@ def verdict(report: dict[str, Any]) -> str:
             rows.append([one["name"], one["kind"], ", ".join(one["class"]), name, p["value"], p["interval"][0],
                          p["interval"][1], p["unit"]])
     if rows:
-        parts.append(table(["effect", "kind", "cannot be told from", "parameter", "value", "95 % from", "to", "unit"],
+        parts.append(table(["effect", "kind", "or one of", "parameter", "value", "95 % from", "to", "unit"],
                            rows))
         parts.append(bullets([f"{one['name']}: {one['equation']}" for one in report["effects"] if one["equation"]]))
         for one in report["effects"]:
@@ -94,7 +94,7 @@ def predictions(effect: dict[str, Any]) -> str:
 
 
 def next_drive(proposal: dict[str, Any]) -> str:
-    """The drive that would tell the effects of a class apart."""
+    """The drive that would separate the effects of a class."""
     text = sentence(proposal)
     parts = [paragraph(f"{text[0].upper()}{text[1:]}.")]
     if proposal["name"] is not None:
@@ -242,11 +242,11 @@ def sentence(proposal: dict[str, Any]) -> str:
         parameters, start = proposal["parameters"], proposal["start"]
         times = f"{proposal['replicates']} times" if proposal["replicates"] > 1 else "once"
         parts.append(f"{proposal['name']} at up to {parameters['v']:.2g} m/s and {parameters['omega']:.2g} rad/s, "
-                     f"heading {math.degrees(start['heading']):.0f} degrees at the start, {times}, tells "
+                     f"heading {math.degrees(start['heading']):.0f} degrees at the start, {times}, separates "
                      f"{', '.join(proposal['splits'])} apart by {proposal['expected_separation']:.0f} standard "
                      f"deviations a drive ({proposal['file']})")
     for one in proposal["not_split"]:
-        parts.append(f"no drive tells {' from '.join(one['effects'])}; {one['sensor']} would")
+        parts.append(f"no drive separates {' from '.join(one['effects'])}; {one['sensor']} would")
     return "; ".join(parts)
 
 

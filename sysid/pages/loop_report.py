@@ -31,8 +31,8 @@
     unnamed           the wrench over one quantity that best predicts it (keys: `sysid.follow_up.unnamed.as_report`);
     where
                       it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
-    next_manoeuvre    the drive that would tell the effects of a class apart, written to next_command.csv; null where
-                      there is nothing to tell (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
+    next_manoeuvre    the drive that would separate the effects of a class, written to next_command.csv; null where
+                      there is nothing to separate (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
     base              base parameters: reference value, day-to-day spread, value on these drives
     manifest          everything fixed beforehand, and its SHA-256
 """
@@ -253,11 +253,11 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
     one = next((one for one in result.stood if one.effect == effect), None)
     final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
     sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
-    told = one.foretold if one else foretold(final, part, groups, precision)
+    left_out = one.foretold if one else foretold(final, part, groups, precision)
     agreement = heterogeneity(sizes, errors)
     names = [result.log.training[group[0]].manoeuvre for group in groups]
-    return {"left_out_gain": dict(zip(names, told.tolist(), strict=True)), "left_out_total": float(told.sum()),
-            "left_out_interval": list(interval_of_sum(told)),
+    return {"left_out_gain": dict(zip(names, left_out.tolist(), strict=True)), "left_out_total": float(left_out.sum()),
+            "left_out_interval": list(interval_of_sum(left_out)),
             "by_manoeuvre": [{"manoeuvre": name, "factor": float(size), "standard_error": float(error),
                               "asked": bool(asked)}
                              for name, size, error, asked in zip(names, sizes, errors, agreement.asked, strict=True)],

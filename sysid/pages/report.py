@@ -12,9 +12,9 @@ import numpy as np
 
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
-from sysid.pages.html import Section
 from sysid.pages.series import TrialSeries
 from whill_mjx.fields import Field, check_table, shown
+from whill_mjx.html import Section
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.reading import read_json
 
@@ -101,8 +101,8 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         sections: more sections, shown first.
     """
     from sysid.pages.fit_page import fit_sections
-    from sysid.pages.html import html_page
     from sysid.pages.series import FILE, load, replay
+    from whill_mjx.html import html_page
 
     run = Path(run)
     report = read_report(run)

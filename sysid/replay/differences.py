@@ -1,7 +1,7 @@
 """Derivatives of a replay by differences over a share of each parameter's range.
 
 Skidding wheels, torque limits and sampled delays make a motion rough in its parameters: the mean slope over a share of
-the range tells where the motion goes, the derivative at one point need not. Forward mode through a contact solver,
+the range shows where the motion goes, the derivative at one point need not. Forward mode through a contact solver,
 which stops after a few iterations and switches between sticking and sliding, means nothing at all. A search by
 differences ends at about the costs of one by forward mode in a fraction of the time: replays of many sets fill a
 processor's vectors, tangents do not.

@@ -294,7 +294,7 @@ def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | No
     sizes = [float(size[0]) for size, kind, owner in zip(host.geom_size, host.geom_type, host.geom_bodyid, strict=True)
              if owner == body and int(kind) in round_ones]
     if not sizes and known is None:
-        raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to tell its radius. Give wheel_radius.")
+        raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to give its radius. Give wheel_radius.")
     return max(sizes) if sizes else float(known or 0.0)
 
 

@@ -256,9 +256,9 @@ def with_surroundings(
 
     def look(state: Surrounded) -> jax.Array:
         reading = state.reading
-        told = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
+        reported = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
         pose = observe(state.inner)[:3]
-        return jnp.concatenate([pose, told, state.diverged.astype(pose.dtype)[None]])
+        return jnp.concatenate([pose, reported, state.diverged.astype(pose.dtype)[None]])
 
     def shift(state: Surrounded, start: jax.Array) -> Surrounded:
         zero = jnp.zeros_like(start[0])

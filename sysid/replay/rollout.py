@@ -197,7 +197,7 @@ def path_of(
     plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None,
     few: bool = False,
 ) -> jax.Array:
-    """States (R + 1, 9) at the records, as `Plant.observe` tells them, of one drive.
+    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive.
 
     Args:
         command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].

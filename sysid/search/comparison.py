@@ -18,7 +18,7 @@ from sysid.replay.records import Simulated
 from sysid.replay.rollout import predictions
 from sysid.search import least_squares, starts, tpe
 from sysid.search.fitting import Problem
-from sysid.search.result import Progress, Trace
+from sysid.search.result import Progress, Stages, Trace
 from sysid.search.settings import FitConfig
 from sysid.search.studies import BATCH
 from sysid.search.valleys import gradient_search
@@ -93,7 +93,7 @@ def trace(
             points = starts.draw(watched, range(start_count), track, seed)
             points = starts.fit(watched, points, track, iterations, progress).u[None]
         # As a fit does it, delays included; squares for all, so that the costs are of one kind.
-        gradient_search(watched, space, points, iterations, FitConfig(robust=False), progress)
+        gradient_search(watched, space, points, iterations, FitConfig(robust=False), Stages(progress, 2))
     kept = list(recorder.best)
     kept.append((recorder.evaluations, recorder.seconds, *kept[-1][2:]))
     count, seconds, cost, u = (np.array(column) for column in zip(*kept, strict=True))

@@ -25,7 +25,7 @@ from sysid.replay.models import Model, get_parameters, measured_effects, model_s
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.search import least_squares, slopes, starts, tpe
-from sysid.search.result import FitResult, Progress
+from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import (
     FEATURE_ITERATIONS,
     GLOBAL,
@@ -101,6 +101,7 @@ def fit_log(
     points = least_squares.random_starts(space, config.starts, config.seed)
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
+    stages = Stages(progress, 1 if config.method in GLOBAL else 3 if config.method == "lm" else 4)
     if config.method in (*GLOBAL, "both"):
         evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
         cost = "paper" if config.method in GLOBAL else "weighted"
@@ -108,37 +109,38 @@ def fit_log(
         problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in trials), "channels": config.channels,
                    "model": config.preset if model is None else model.name, "step": f"{plant.dt:g}"}
         scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
-                       progress=progress, storage=config.storage, study=config.study, problem=problem,
-                       method="cmaes" if config.method == "cmaes" else "tpe")
+                       progress=stages.begin("global search"), storage=config.storage, study=config.study,
+                       problem=problem, method="cmaes" if config.method == "cmaes" else "tpe")
         points = np.concatenate([points[:1], scan.starts])[:count]
     elif config.method == "features":
+        first = stages.begin("features of motion")
         starts.compile_ahead(objective, log.spec.track)
-        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=progress)
-        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, progress)
+        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=first)
+        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, first)
         points = coarse.u[None]
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
-    told: Told = choose(objective, points[0], log.spec.track, config, progress)
+    chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, told, profiles = gradient_search(told, space, points, iterations, config, progress)
+        search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
-        first = told.residuals(space.to_unit(space.initial)[None])
-        initial_cost = float(robust_cost(first, config.robust)[0]) / told.counted
-    known = uncertainty.estimate(told, u, robust=config.robust and config.method not in GLOBAL)
-    traced = profile(told, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+        residuals = chosen.residuals(space.to_unit(space.initial)[None])
+        initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
+    known = uncertainty.estimate(chosen, u, robust=config.robust and config.method not in GLOBAL)
+    traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(params, space.names, values)
-    earlier = told.prior if config.vehicle is not None else None
+    earlier = chosen.prior if config.vehicle is not None else None
     return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
                profiles, time.perf_counter() - began, plant, earlier, model, tuple(traced), given.frame)
 
 
 def choose(
-    objective: Objective, u: np.ndarray, track: float, config: FitConfig, progress: Progress | None = None
+    objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
 ) -> Told:
     """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
     tell.
@@ -152,16 +154,17 @@ def choose(
     """
     if config.method in GLOBAL:
         return objective
+    progress = stages.begin("whole poses") if stages else None
     near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
                         progress=progress)
     share = uncertainty.inflation(objective, near.u)
-    told: Objective | FeatureObjective = objective
+    chosen: Objective | FeatureObjective = objective
     if config.method == "features" and share >= TOGETHER:
         binned = make_features_objective(objective, track)
         if binned.enough:
-            told = binned.renewed(u)
-            share = uncertainty.inflation(told, u)
-    return told if told.prior is None else replace(told, prior=replace(told.prior, share=share))
+            chosen = binned.renewed(u)
+            share = uncertainty.inflation(chosen, u)
+    return chosen if chosen.prior is None else replace(chosen, prior=replace(chosen.prior, share=share))
 
 
 @dataclass(frozen=True)

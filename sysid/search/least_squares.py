@@ -157,7 +157,7 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
 
     Of a grid over the range of each parameter the best point below and the best above, the others following by one
     damped Gauss-Newton step. Points that cost what u does are left out: a search from there comes back to where it was.
-    What lies behind such level ground comes first, since no derivative tells of it: a limit that was never met, say.
+    What lies behind such level ground comes first, since no derivative shows it: a limit that was never met, say.
     The rest is in the order of its costs.
     """
     tangent = _Tangent.at(objective, u, robust)
@@ -205,7 +205,7 @@ def profile_delays(
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
     A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
-    by one damped Gauss-Newton step, which tells whether another valley is as deep.
+    by one damped Gauss-Newton step, which shows whether another valley is as deep.
 
     Returns:
         Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.

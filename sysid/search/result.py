@@ -11,6 +11,23 @@ Progress = Callable[[int, str], None]
 """Called with the number of evaluations just done and a short remark."""
 
 
+class Stages:
+    """Numbered stages of a search: costs of two stages are of two objectives, so a reader must know which one runs."""
+
+    def __init__(self, progress: Progress | None, count: int) -> None:
+        """Take where the progress goes, and the number of stages."""
+        self._progress, self._count, self._number = progress, count, 0
+
+    def begin(self, name: str) -> Progress | None:
+        """Begin the next stage; its progress."""
+        self._number += 1
+        progress, title = self._progress, f"stage {self._number} of {self._count}, {name}"
+        if progress is None:
+            return None
+        progress(0, title)
+        return lambda count, remark: progress(count, f"{title}: {remark}")
+
+
 @dataclass(frozen=True)
 class FitResult:
     """Best point of a search, in unit coordinates."""

@@ -12,7 +12,7 @@ from sysid.search.studies import BATCH
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
-TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count what they tell
+TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count the same information
 FEATURE_ITERATIONS = 20
 GLOBAL = tuple(BATCH)  # methods that end with their global search
 
@@ -49,7 +49,7 @@ class FitConfig:
     robust: bool = True
     """Count large residuals linearly (Huber): a model is least exact where wheels skid."""
     parameters: tuple[str, ...] = ()
-    """Names to fit; by default all that a driving log can tell."""
+    """Names to fit; by default all that a driving log can determine."""
     effects: tuple[str, ...] = ()
     """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
     profile: tuple[str, ...] = ()

@@ -23,7 +23,7 @@ SCAN = 256
 """Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
 KEPT, FIRST = 8, 3
 """The best of them, and the iterations of a search from each: two of eight lead to the deepest valley, and their costs
-do not tell which; what a few iterations bring nearly does."""
+do not show which; what a few iterations bring nearly does."""
 FOLLOWED, STEPS = 2, 20
 """How many of those are searched further, and in how many iterations at most."""
 EDGE = 0.02  # of the range, at both ends, without random points

@@ -1,4 +1,4 @@
-"""Global search with Optuna, asked and told in batches: tree-structured Parzen estimator, or CMA-ES."""
+"""Global search with Optuna, in batches: tree-structured Parzen estimator, or CMA-ES."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The gradient search on poses, and where else it looks: costs of drives have many valleys.
 
 A search ends in the valley that it starts in. Others are looked for at the ends of ranges, far along them, and at other
-delays; what a drive hardly tells, or tells only beyond a limit, is found so.
+delays; so parameters are found that a drive hardly determines, or only beyond a limit.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from functools import partial
 
 import numpy as np
 
+from sysid.errors.bin_objective import FeatureObjective
 from sysid.errors.pose_objective import Told
 from sysid.errors.space import Space
 from sysid.search import least_squares, slopes
-from sysid.search.result import FitResult, Progress
+from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
@@ -31,11 +32,11 @@ WORTH = 0.001  # share of the cost that another valley must save for the floor t
 
 def gradient_search(
     objective: Told, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
-    progress: Progress | None,
+    stages: Stages | None,
 ) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
-    What drives hardly tell by itself, how far a suspension sags, say, may be right in another valley, and the range
+    What drives hardly determine, such as how far a suspension sags, may be right in another valley, and the range
     between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
     right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
     on a grid, and LM tries another valley that is about as deep. The floors of valleys are jagged: at the end slopes
@@ -43,6 +44,9 @@ def gradient_search(
     again, since what hid them may be gone.
     Nothing of this is done without `config.elsewhere`.
     """
+
+    binned = isinstance(objective, FeatureObjective)
+    progress = stages.begin("motion in bins" if binned else "whole poses to the end") if stages else None
 
     def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
         return from_all(objective, space, starts, iterations, config.robust, progress)
@@ -54,6 +58,7 @@ def gradient_search(
 
     result = search(objective, starts, iterations)
     objective, result = renew(objective, result, result.starts)
+    progress = stages.begin("checks from other starts") if stages else None
     follow = partial(search, objective)
     if config.elsewhere:
         result = _from_ends(follow, objective, result, iterations, config.robust)

@@ -13,7 +13,7 @@ from sysid.missing.joint_fit import Refit
 ALPHA = 0.05
 """Of the test whether manoeuvres differ on a size."""
 POWER = 0.8
-"""Least power of a manoeuvre to tell an effect from none, for it to be asked; and of that test, to be believed."""
+"""Least power of a manoeuvre to separate an effect from none, for it to be asked; and of that test, to be believed."""
 SCATTER = 0.5
 """Standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see."""
 RESAMPLES = 2000
@@ -23,7 +23,7 @@ RESAMPLES = 2000
 class Heterogeneity:
     """Cochran's test that an effect has one size in all manoeuvres that excite it."""
 
-    asked: np.ndarray  # (G,) bool, manoeuvres that by themselves would tell the effect from none
+    asked: np.ndarray  # (G,) bool, manoeuvres that by themselves would separate the effect from none
     q: float
     """Squared differences from the mean over their variances, about chi-squared with one less than asked where the size
     is one."""
@@ -48,8 +48,8 @@ def heterogeneity(factor: np.ndarray, error: np.ndarray) -> Heterogeneity:
     q (k - 1) / (k - 1 + c s^2) is about chi-squared, with c = sum w - sum w^2 / sum w and w = 1 / e^2 (DerSimonian and
     Laird 1986).
     """
-    told = special.ndtri(1 - ALPHA / 2) + special.ndtri(POWER)
-    asked = error < 1 / told
+    visible = special.ndtri(1 - ALPHA / 2) + special.ndtri(POWER)
+    asked = error < 1 / visible
     freedom = int(asked.sum()) - 1
     if freedom < 1:
         return Heterogeneity(asked, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -111,7 +111,7 @@ def sizes_apart(
 
 def disagreement(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:
     """By how much the size of an effect differs from manoeuvre to manoeuvre beyond the noise, as a share of it: the
-    root mean square about the mean, each manoeuvre counting by what it tells."""
+    root mean square about the mean, each manoeuvre weighted by its information."""
     factor, error = sizes_apart(fit, part, groups, precision)
     weight = error**-2
     if weight.sum() < 1e-6:

@@ -1,11 +1,11 @@
 """What may be said of drives that stand alone: no reference days, and no manoeuvre driven twice.
 
-The noise is then only what the base model leaves of the drives themselves, so nothing tells whether that is too much.
+The noise is then only what the base model leaves of the drives themselves, so nothing shows whether that is too much.
 Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
 be a lucky correlate of something else. It is named where blocks of drives speak for it: they agree on its size, and
-the gain of each is foretold by the others. Of effects that are not told apart the simplest is.
+the gain of each is foretold by the others. Of effects that are not separated the simplest is.
 
-Where there is no odometry either, nothing tells whether wheels fell short of the command or the vehicle of its wheels,
+Where there is no odometry either, nothing shows whether wheels fell short of the command or the vehicle of its wheels,
 while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
 acceleration and drag bend to the same few speeds.
 """
@@ -22,11 +22,11 @@ from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.found import Search, Thresholds
 from whill_mjx.effects import card_of
 
-UNTOLD = "neither replicates nor reference drives tell the noise, so whether anything else is missing cannot be told"
+UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
 
 
 def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
-    """Whether neither a reference nor replicates tell the noise of some trials."""
+    """Whether neither a reference nor replicates show the noise of some trials."""
     return not known and not repeated(trials)
 
 
@@ -55,12 +55,12 @@ def judged(
 
 def of_wheels(found: Search) -> list[str]:
     """What speaks against each named effect that an outside pose alone does not show, in words."""
-    return [f"{one.effect} stands out, but without odometry nothing tells what the wheels did: log their speeds"
+    return [f"{one.effect} stands out, but without odometry nothing shows what the wheels did: log their speeds"
             for one in found.final.hypotheses if not card_of(one.effect).shown_by_pose]
 
 
 def simplest(found: Search) -> None:
-    """Of effects that the drives do not tell apart, name the one with the fewest parameters: by how much better another
+    """Of effects that the drives do not separate, name the one with the fewest parameters: by how much better another
     one fits means nothing where the noise is not known."""
     if len(found.accepted) != 1:
         return
@@ -80,10 +80,10 @@ def doubts(
     fit, out = found.final, []
     for one, part in zip(fit.hypotheses, fit.parts, strict=True):
         differ = disagreement(fit, part, groups, precision)
-        told = foretold(fit, part, groups, precision)
-        lost = float(-told[told < 0].sum())
+        gains = foretold(fit, part, groups, precision)
+        lost = float(-gains[gains < 0].sum())
         if differ > thresholds.differ:
             out.append(f"{one.effect} stands out, but blocks of drives differ by {differ:.0%} on its size")
-        elif told.sum() <= 0 or lost > thresholds.loss * (told.sum() + lost):
+        elif gains.sum() <= 0 or lost > thresholds.loss * (gains.sum() + lost):
             out.append(f"{one.effect} stands out, but is wrong about blocks of drives that were held back")
     return out

@@ -92,9 +92,9 @@ def _same(effect: str, falsifier: Falsifier, size: np.ndarray, covariance: np.nd
     contrast = np.full(2, -falsifier.least)
     contrast[weak] = 1.0
     error = float(np.sqrt(contrast @ covariance @ contrast))
-    told = stats.t(max(freedom, 1))
-    p = float(min(2 * told.cdf(float(contrast @ size) / error), 1.0))  # the weaker of two was picked
-    power = float(told.cdf((falsifier.least - falsifier.else_) / error + told.ppf(alpha / 2)))
+    law = stats.t(max(freedom, 1))
+    p = float(min(2 * law.cdf(float(contrast @ size) / error), 1.0))  # the weaker of two was picked
+    power = float(law.cdf((falsifier.least - falsifier.else_) / error + law.ppf(alpha / 2)))
     outcome = "falsified" if p < alpha else "holds" if power >= POWER else "untold"
     return Tested(effect, falsifier, outcome, tuple(size.tolist()), error, p, power)
 
@@ -109,10 +109,10 @@ def _absent(
     gain = _gain(moved_last(fit, fit.parts.index(part)), part.stop - part.start, precision)
     p = float(p_excess(left / count)) if count else 1.0
     share = left / _gain(fit, len(fit.q), precision)
-    told = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
-    outcome = "falsified" if p < alpha and share > LEFT else "holds" if told else "untold"
+    visible = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
+    outcome = "falsified" if p < alpha and share > LEFT else "holds" if visible else "untold"
     return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
-                  1.0 if told else 0.0)
+                  1.0 if visible else 0.0)
 
 
 def _gain(fit: Refit, count: int, precision: np.ndarray) -> float:

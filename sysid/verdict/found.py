@@ -59,7 +59,7 @@ class Thresholds:
     instead: float = 0.7
     """Most that they may gain instead of it, as a share of what it gains."""
     little: float = 0.1
-    """What one must explain of it that manoeuvres tell of each other."""
+    """Minimum share of the remaining error that an effect must explain on left-out manoeuvres."""
     foretold: float = 0.7
     """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
     same: float = 0.2
@@ -83,7 +83,7 @@ class Thresholds:
     between: float = 0.5
     """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
     alike: float = 0.9
-    """|cos| of two effects' signatures above which they are not told apart."""
+    """|cos| of two effects' signatures above which they are not separated."""
 
 
 @dataclass

@@ -21,8 +21,8 @@ def stand(
     tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
     for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
         sizes, errors = sizes_apart(fit, part, groups, refitter.precision)
-        told = foretold(fit, part, groups, refitter.precision)
-        out.append(Stood(one.effect, sizes, errors, heterogeneity(sizes, errors), told, interval_of_sum(told),
+        gains = foretold(fit, part, groups, refitter.precision)
+        out.append(Stood(one.effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains),
                          tuple(tested[number])))
     return out
 

@@ -2,7 +2,7 @@
 
 Where poses are stamped on receipt they are old by an unknown time, and irregular: their noise within a bin is many
 times that of a whole drive, in which it does not add up. A base model that is fitted without the delay imitates a part
-of it by tyres that slip too easily, and hides it. So the delay is told without a vehicle model, by what was measured on
+of it by tyres that slip too easily, and hides it. The delay is found without a vehicle model, by what was measured on
 the vehicle itself (`sysid.logs.pose_lag`); then the base model is fitted to whole poses with it, both from where it was
 and from where its first fit began. Without the delay it is fitted from the same starts, so that these are no reason to
 be better. Later fits hold the delay: they would bend it to what the base model lacks.

@@ -83,7 +83,7 @@ def scan_pairs(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, similar: np.ndarray,
     alike: float, draws: int = DRAWS, seed: int = 0,
 ) -> PairScan:
-    """Scan all pairs of different effects that these drives tell apart, and calibrate on simulated nulls.
+    """Scan all pairs of different effects that these drives separate, and calibrate on simulated nulls.
 
     Args:
         spread: (P, P) day-to-day covariance of the base parameters.

@@ -202,10 +202,10 @@ def pair_round(
         h = hypotheses.index(fit.hypotheses[-1])
         one = candidate_of(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
         part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
-        told = foretold(fit, part, evidence.groups, refitter.precision)
+        gains = foretold(fit, part, evidence.groups, refitter.precision)
         if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
                 or disagreement(fit, part, evidence.groups, refitter.precision) > thresholds.differ
-                or interval_of_sum(told)[0] <= 0):
+                or interval_of_sum(gains)[0] <= 0):
             return
         members.append(replace(one, own=True))
     members[0] = replace(members[0], refit=alone[0], share=explained(alone[0]))
@@ -219,7 +219,7 @@ def _class_of(
     best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
     thresholds: Thresholds,
 ) -> list[str]:
-    """Effects that these drives do not tell from the best: nearly as good a fit, alike signatures, or a
+    """Effects that these drives do not separate from the best: nearly as good a fit, alike signatures, or a
     fit so much better than imitating the best would bring that the truth may lie between the two."""
     mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}

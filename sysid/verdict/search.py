@@ -142,10 +142,10 @@ def _own(
     inside = beside(one.refit.products(refitter.precision), len(q))
     size = float(q @ inside @ q)
     if differ <= thresholds.same and _within(size / one.gain, 1 / thresholds.foretold):
-        told = foretold(one.refit, part, groups, refitter.precision)
-        lost = float(-told[told < 0].sum())
-        if _within(float(told.sum()) / one.gain, 1 / thresholds.foretold) and lost <= thresholds.loss * (
-                told.sum() + lost):
+        gains = foretold(one.refit, part, groups, refitter.precision)
+        lost = float(-gains[gains < 0].sum())
+        if _within(float(gains.sum()) / one.gain, 1 / thresholds.foretold) and lost <= thresholds.loss * (
+                gains.sum() + lost):
             return True
     if one.share - share < thresholds.own * left or differ > thresholds.differ:
         return False

@@ -44,7 +44,7 @@ def vehicle_after(result: Result) -> Any:
 def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     """A vehicle refitted to whole poses and speeds, as `sysid.fit` does, from where the search left it.
 
-    The search weighs short motions, which tell effects apart; what adds up over a whole drive is told by its poses. The
+    The search weighs short motions, which separate effects; poses show what adds up over a whole drive. The
     refit may move base parameters and the accepted effects' own, and against a reference what every fit to poses has
     besides (`measured_effects`, without the losses, which may be what is asked for): the search takes their part for
     the wander of days. Drives without one would only be fitted closer by them: on a measured robot the errors of drives
@@ -63,8 +63,8 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
                   and np.isfinite(float(get_values(vehicle, [name])[0])) and name not in result.config.held]
     space = make_space(vehicle, result.log.spec, names)
     spread = np.zeros((space.size, space.size))
-    told = result.reference.space.size
-    spread[:told, :told] = result.reference.spread
+    count = result.reference.space.size
+    spread[:count, :count] = result.reference.spread
     drives, held = drives_of(result, trials, vehicle)
     u = fit_poses(drives, trials, space, held, spread, iterations)
     return vehicle if u is None else set_values(

@@ -185,7 +185,7 @@ def test_a_name_that_leaves_more_than_days_differ_by_comes_with_a_warning(slopin
         assert not said if text is None else len(said) == 1 and text in said[0]
     assert not warnings(replace(sloping, search=replace(sloping.search, verdict="none", excess=(1.0, 1.0))))
     crowded = replace(sloping.search, excess=(1.0, 0.0), crowd=["backlash"])
-    assert "backlash cannot be told from it either" in warnings(replace(sloping, search=crowded))[0]
+    assert "backlash cannot be separated from it either" in warnings(replace(sloping, search=crowded))[0]
 
 
 @pytest.mark.parametrize(("by", "outcome", "warns"), [("speed", "untold", True), ("speed", "holds", False),

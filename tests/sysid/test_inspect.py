@@ -195,7 +195,7 @@ def test_replicate_spread_is_the_deviation_between_drives():
 def test_the_command_writes_text_json_and_picture(tmp_path, capsys):
     main(InspectConfig(CHAIR, out=tmp_path / "seen"))
     printed = capsys.readouterr().out
-    assert "What this log cannot tell" in printed and "figure_eight_1*" in printed
+    assert "What this log cannot determine" in printed and "figure_eight_1*" in printed
     found = json.loads((tmp_path / "seen" / "inspect.json").read_text())
     assert found["log"]["sha256"] == load_log(CHAIR).sha256
     assert found["streams"]["ground_truth"]["rate"] == pytest.approx(20, rel=0.01)

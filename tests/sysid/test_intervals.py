@@ -148,8 +148,8 @@ def test_the_variance_of_few_blocks_is_unbiased_where_errors_are_independent():
         found.append(np.diag(one.covariance(scores)))
         plain.append(np.square(scores @ inverse).sum(0))
     told = np.diag(inverse)
-    np.testing.assert_allclose(np.mean(found, 0), told * one.told, rtol=0.1)
-    assert one.told[:2] == pytest.approx(1.0, rel=1e-6)
+    np.testing.assert_allclose(np.mean(found, 0), told * one.informed, rtol=0.1)
+    assert one.informed[:2] == pytest.approx(1.0, rel=1e-6)
     assert (np.mean(plain, 0) < 0.85 * told).all()
     # Satterthwaite: the degrees of freedom say how much the variance itself varies.
     np.testing.assert_allclose(2 * np.mean(found, 0) ** 2 / np.var(found, 0), one.freedom, rtol=0.25)

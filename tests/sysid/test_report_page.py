@@ -16,11 +16,11 @@ from conftest import TRUTH, unicycle_plant
 import sysid.report as report_module
 from sysid.pages import series as series_module
 from sysid.pages.fit_page import autocorrelation, choose, worse
-from sysid.pages.html import Cell, Section, html_page, number, png, table
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
 from sysid.pages.svg import Line, bar_chart, interval_bar, line_chart
 from sysid.replay.rollout import make_batch, predictions, simulate
+from whill_mjx.html import Cell, Section, html_page, number, png, table
 
 pytestmark = pytest.mark.quick
 

@@ -13,6 +13,7 @@ from sysid.errors.space import Space
 from sysid.intervals import uncertainty
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search import least_squares, tpe
+from sysid.search.result import Stages
 from sysid.search.settings import FitConfig
 from sysid.search.valleys import gradient_search
 
@@ -371,3 +372,16 @@ def test_a_diverged_simulation_is_dear_and_not_a_number_nowhere(objective):
 def test_noise_scales_are_named():
     noise = Noise(np.ones(3), np.arange(5.0), "defaults")
     assert noise.as_dict()["odometry.omega"] == 4.0
+
+
+def test_progress_names_the_stage_of_each_cost(objective):
+    """Costs of two stages are of two objectives; each remark says whose it is."""
+    said = []
+    stages = Stages(lambda count, remark: said.append((count, remark)), 2)
+    least_squares.fit(objective, UNICYCLE_SPACE, iterations=2, progress=stages.begin("whole poses"))
+    gradient_search(objective, UNICYCLE_SPACE, UNICYCLE_SPACE.to_unit(TRUTH)[None], 2,
+                    FitConfig(elsewhere=False), Stages(lambda count, remark: said.append((count, remark)), 2))
+    remarks = [remark for _, remark in said]
+    assert remarks[0] == "stage 1 of 2, whole poses" and remarks[1].startswith("stage 1 of 2, whole poses: cost ")
+    assert sum(count for count, _ in said) == len([remark for remark in remarks if "cost" in remark])
+    assert remarks[-1] == "stage 2 of 2, checks from other starts" and Stages(None, 2).begin("features") is None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import os
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +17,19 @@ from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.evaluate import EvaluateOptions, choose_task, main
 from whill_mjx.evaluation.conditions import nominal, seen_under
-from whill_mjx.evaluation.episodes import Episodes, episode_figures, summarise
+from whill_mjx.evaluation.drivers import Driver
+from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, summarise
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
-from whill_mjx.evaluation.rollouts import CHANNELS
+from whill_mjx.evaluation.rollouts import CHANNELS, rollout
 from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
+from whill_mjx.html import STYLE
+from whill_mjx.tasks.tasks import make_task
 from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
 from whill_mjx.vehicle.presets import preset
+from whill_mjx.video import write_h264
 
 
 @pytest.fixture(scope="module")
@@ -185,14 +191,16 @@ def test_bootstrap_interval_of_normal_numbers_is_that_of_the_t_distribution():
 
 @pytest.mark.quick
 def test_the_video_shows_each_episode_until_its_end(tmp_path):
-    import imageio.v2 as imageio
+    import cv2
 
     episodes = made_up([[1.0] * 6] * 2, [("collision", 0.2), ("timeout", 0.5)])
     frames = np.zeros((2, 6, 16, 16, 3), np.uint8)
     frames[:] = (40 * np.arange(6))[None, :, None, None, None]
     above = np.zeros((2, 6, 32, 16, 3), np.uint8)
     path = episode_video(episodes, frames, above, tmp_path / "two.mp4", 10.0, scale=2)
-    shown = np.array(imageio.mimread(path), float)
+    film = cv2.VideoCapture(str(path))
+    shown = np.array([film.read()[1] for _ in range(15)], float)
+    assert not film.read()[0]
     assert shown.shape == (15, 96, 64, 3)
     np.testing.assert_allclose(shown[[0, 2, 5, 14], 16, 16].mean(-1), [0, 80, 80, 80], atol=12)
     np.testing.assert_allclose(shown[[0, 2, 5, 14], 16, 48].mean(-1), [0, 80, 200, 200], atol=12)
@@ -256,3 +264,64 @@ def test_task_fields_come_from_the_run_the_policy_and_the_command(seeker):
         choose_task(EvaluateOptions(str(seeker), set=("gate=1",)), policy)
     with pytest.raises(ValueError, match="is no int"):
         choose_task(EvaluateOptions(str(seeker), set=("gates=two",)), policy)
+
+
+@pytest.fixture(scope="module")
+def swerving():
+    """A corridor and eight drives of a driver that never drives alike twice; some end at a wall, some do not."""
+    course = Course(*make_env(make_task("corridor", max_steps=60)))
+    drives = itertools.count()
+
+    def begin(state, key):
+        shape = jax.ShapeDtypeStruct((), jnp.float32)
+        moment = jax.pure_callback(lambda key: np.float32(next(drives)), shape, jax.random.key_data(key),
+                                   vmap_method="sequential")  # fmt: skip
+        return jax.random.uniform(jax.random.fold_in(key, moment.astype(int)), minval=-1.0) * (moment % 2)
+
+    driver = Driver("swerving", begin, lambda turn, state, image, key: (turn, jnp.stack([1.0, turn])))
+    keys = jax.random.split(jax.random.key(5), 8)
+    recorded = jax.jit(lambda params: rollout(course.env, params, keys, driver, frames=True))(course.vehicles(keys))
+    whole = jax.device_get(recorded)
+    episodes = Episodes(whole.trace, whole.ends, whole.scene, keys, course.env.model.config.control_dt)
+    return course, episodes, whole.frames
+
+
+def test_a_film_shows_the_recorded_drives_though_their_driver_would_drive_otherwise_now(swerving):
+    """Two of eight drives are filmed in a batch of two: pixel by pixel what the camera saw when they were recorded."""
+    course, episodes, seen = swerving
+    crashed = np.flatnonzero(episodes.ends["collision"] > 0.5)
+    assert 0 < len(crashed) < 8
+    chosen = np.array([crashed[0], np.flatnonzero(episodes.ends["collision"] < 0.5)[0]])
+    frames, above = course.film(episodes.some(chosen))
+    assert above.shape[:2] == frames.shape[:2] == (2, 61)
+    for film, index in zip(frames, chosen, strict=True):
+        last = episodes.length[index]
+        np.testing.assert_array_less(np.abs(film[:last].astype(int) - seen[index][:last]).mean((1, 2, 3)), 1.0)
+    end = above[0, episodes.length[crashed[0]]]
+    assert np.any(above[0, 0] != end)
+
+
+def test_a_video_is_written_without_a_fork_of_this_process(tmp_path, recwarn):
+    """JAX warns of os.fork beside its threads; a hook counts forks, which a plain start of ffmpeg does not need."""
+    forks = []
+    os.register_at_fork(before=lambda: forks.append(1))
+    jax.block_until_ready(jnp.ones(3) + 1)  # its threads run
+    path = write_h264(tmp_path / "grey.mp4", [np.full((16, 16, 3), 40 * k, np.uint8) for k in range(4)], 10.0)
+    assert path.stat().st_size > 500 and not forks
+    assert not [one for one in recwarn if "fork" in str(one.message)]
+
+
+def test_a_video_that_cannot_be_written_says_what_ffmpeg_said(tmp_path):
+    with pytest.raises(OSError, match="ffmpeg ended with code"):
+        write_h264(tmp_path / "nothing.unknown", [np.zeros((16, 16, 3), np.uint8)], 10.0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evaluated):
+    out, _ = evaluated
+    text = (out / "report.html").read_text()
+    assert STYLE in text
+    for words in ("smallest clearance [m]", "time to the goal [s]", "the policy: it sees only its first image"):
+        assert words in text
+    for key in ("min_clearance_m", "time_to_goal_s", "acceleration_rms_m_s2"):
+        assert key not in text

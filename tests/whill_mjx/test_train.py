@@ -45,6 +45,7 @@ def test_a_run_leaves_everything_a_user_needs(run):
     left = {path.name for path in options.out.iterdir()}
     assert left >= {
         "run.json", "config.json", "vehicle.toml", "metrics.jsonl", "reward_curve.png", "drives.png", "camera.mp4",
+        "index.html",
         "prediction.gif",
         "drives.npz", "evaluation.json", "checkpoints", "policy", "best", "best.json", "failures.png", "failures.mp4",
     }  # fmt: skip

@@ -141,3 +141,11 @@ def test_an_unfinished_write_leaves_the_old_file(saved, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         save_vehicle(saved, spec, params)
     assert saved.read_text() == before
+
+
+def test_the_file_says_what_its_intervals_are(tmp_path):
+    spec, params = preset("whill_cr_ramp")
+    origin = {"interval_confidence": 0.9}
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, params, {"body.mass": (50.0, 55.0)}, origin)
+    assert path.read_text().startswith("# Each interval [low, high] is the 90% confidence interval")
+    assert load_vehicle(path)[2] == origin

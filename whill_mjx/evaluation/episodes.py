@@ -21,6 +21,8 @@ from whill_mjx.vehicle.dynamics import place
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.randomize import randomize_params
 
+_REPLAY = replay_driver()
+
 NEAR_M = 0.10
 """A vehicle that comes closer than this to anything has a near miss [m]."""
 BLINDS = ("blank", "freeze", "replay")
@@ -69,6 +71,11 @@ class Episodes:
         return dataclasses.replace(self, trace=self.trace[index], ends=ends, scene=scene, keys=self.keys[index])
 
 
+def _actions(episodes: Episodes) -> np.ndarray:
+    """(N, T, 2) actions of each control period."""
+    return np.stack([episodes.channel("action_v"), episodes.channel("action_omega")], -1)[:, 1:]
+
+
 def episode_keys(seed: int, count: int) -> jax.Array:
     """(N,) keys of evaluation episodes; the first n are the same for every count."""
     return jax.vmap(lambda index: jax.random.fold_in(jax.random.key(seed), index))(jnp.arange(count))
@@ -111,10 +118,16 @@ class Course:
         whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(keys)], *parts)
         return Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
 
-    def film(self, driver: Driver, keys: jax.Array) -> tuple[Episodes, np.ndarray, np.ndarray]:
-        """The same episodes again, with the camera's images (N, T + 1, H, W, 3) and views from above twice as high."""
-        params = self.vehicles(keys)
-        whole = jax.device_get(self._rollout(driver, "open", 0, frames=True)(params, keys, None, None))
+    def film(self, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
+        """Images of the camera (N, T + 1, H, W, 3) during recorded episodes, and views from above twice as high.
+
+        The recorded actions are replayed, not decided again: a policy rounds otherwise in a batch of another size, and
+        may then arrive where it collided. The views from above show the recorded places.
+        """
+        keys, actions = episodes.keys, _actions(episodes)
+        params, memory = self.vehicles(keys), (jnp.asarray(actions), jnp.zeros(len(keys), jnp.int32))
+        run = self._rollout(_REPLAY, "open", 0, frames=True)
+        frames = jax.device_get(run(params, keys, None, memory).frames)
 
         def view(params: VehicleParams, key: jax.Array, scene: Any, row: jax.Array) -> jax.Array:
             state = reset_state(self.env, params, key)
@@ -122,9 +135,7 @@ class Course:
             return top_view(self.env, dataclasses.replace(state, scene=scene, vehicle=vehicle))
 
         views = jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, None, None, 0))))
-        above = jax.device_get(views(params, keys, whole.scene, whole.trace))
-        episodes = Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
-        return episodes, whole.frames, above
+        return frames, jax.device_get(views(params, keys, episodes.scene, episodes.trace))
 
     def blinded(self, driver: Driver, keys: jax.Array, blind: str, sighted: Episodes) -> Episodes:
         """The same episodes without sight.
@@ -142,9 +153,8 @@ class Course:
             return self.drive(driver, keys, sight=blind)
         if len(keys) < 2:
             raise ValueError("one episode has no other one to take the actions from; evaluate at least two.")
-        actions = np.stack([sighted.channel("action_v"), sighted.channel("action_omega")], -1)[:, 1:]
-        memory = (jnp.asarray(np.roll(actions, 1, axis=0)), jnp.zeros(len(keys), jnp.int32))
-        return self.drive(replay_driver(), keys, memory=memory)
+        memory = (jnp.asarray(np.roll(_actions(sighted), 1, axis=0)), jnp.zeros(len(keys), jnp.int32))
+        return self.drive(_REPLAY, keys, memory=memory)
 
     def _rollout(self, driver: Driver, sight: str, late: int, frames: bool) -> Callable[..., Rollout]:
         name = (driver, sight, late, frames)

@@ -1,9 +1,7 @@
-"""Pictures, video and page of an evaluation. Imports matplotlib and imageio on demand."""
+"""Pictures, video and page of an evaluation. Imports matplotlib on demand."""
 
 from __future__ import annotations
 
-import base64
-import html
 import itertools
 from pathlib import Path
 from typing import Any
@@ -11,12 +9,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from whill_mjx.evaluation.episodes import Episodes
+from whill_mjx import html
+from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes
 from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
-from whill_mjx.folders import whole_file, write_whole
+from whill_mjx.folders import write_whole
+from whill_mjx.video import write_h264
 
 ENDINGS = {"success": "tab:green", "collision": "tab:red", "timeout": "tab:orange", "diverged": "black"}
+
+ENDED = {"success": "arrived", "collision": "collision", "timeout": "time-out", "diverged": "diverged"}
+"""Words for how an episode ended."""
 
 
 def ending(episodes: Episodes, index: int) -> str:
@@ -40,7 +43,7 @@ def draw_scene(axes: Any, scene: Any, goal_radius: float) -> None:
 
 
 def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: int = 12, columns: int = 4) -> Path:
-    """Small maps of the first `count` episodes: boxes, goal region, path coloured by how it ended."""
+    """Small maps of the first `count` episodes with a legend and a scale bar; paths are coloured by how they ended."""
     plt = _pyplot()
     count = min(count, episodes.count)
     columns = min(columns, count)
@@ -55,8 +58,34 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         how, rows_driven = ending(episodes, index), slice(0, length[index] + 1)
         axes.plot(x[index, rows_driven], y[index, rows_driven], "-", color=ENDINGS[how], linewidth=1.5)
         axes.plot(x[index, length[index]], y[index, length[index]], "o", color=ENDINGS[how], markersize=3)
-        axes.set_title(f"{how}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
+        axes.set_title(f"{ENDED[how]}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
+        _scale_bar(axes)
+    figure.get_layout_engine().set(h_pad=0.12)
+    _legend(figure, {ending(episodes, index) for index in range(count)})
     return _save(figure, out)
+
+
+def _scale_bar(axes: Any, metres: float = 1.0) -> None:
+    """Draw a bar of this length in the lower left corner."""
+    x, y = axes.get_xlim()[0] + 0.15, axes.get_ylim()[0] + 0.15
+    axes.plot([x, x + metres], [y, y], "-", color="black", linewidth=2, solid_capstyle="butt")
+    axes.text(x + metres / 2, y + 0.08, f"{metres:g} m", ha="center", va="bottom", fontsize=6)
+
+
+def _legend(figure: Any, endings: set[str]) -> None:
+    """Say below the maps what lines and marks mean."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Line2D([], [], color=colour, label=f"path: {ENDED[how]}")
+                          for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
+    handles += [
+        Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
+               label="end of the drive axle's path (the body reaches farther)"),
+        Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
+        Patch(color="grey", label="boxes and walls, in their colours"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=8)
 
 
 def sweep_picture(sweep: Sweep, out: Path, name: str) -> Path:
@@ -134,57 +163,101 @@ def episode_video(
         rate_hz: frames per second.
         scale: enlargement.
     """
-    import imageio.v2 as imageio
-    import imageio_ffmpeg  # noqa: F401  without it imageio would take another writer for the file
-
-    writer: Any  # its type stub lacks append_data
     colours = {"success": (40, 160, 60), "collision": (210, 40, 40), "timeout": (240, 150, 30), "diverged": (0, 0, 0)}
-    fps = max(1, round(rate_hz))
-    with (
-        whole_file(out) as temporary,
-        imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer,
-    ):
-        for step in range(int(episodes.length.max()) + round(rate_hz)):
-            tiles = []
-            for index, length in enumerate(episodes.length):
-                row = min(step, int(length))
-                tile = np.concatenate([frames[index, row], above[index, row]]).repeat(scale, 0).repeat(scale, 1)
-                if step >= length:
-                    for edge in (np.s_[:6], np.s_[-6:], np.s_[:, :6], np.s_[:, -6:]):
-                        tile[edge] = colours[ending(episodes, index)]
-                tiles.append(tile)
-            writer.append_data(np.concatenate(tiles, axis=1))
+
+    def tile(index: int, length: int, step: int) -> np.ndarray:
+        row = min(step, length)
+        shown = np.concatenate([frames[index, row], above[index, row]]).repeat(scale, 0).repeat(scale, 1)
+        if step >= length:
+            for edge in (np.s_[:6], np.s_[-6:], np.s_[:, :6], np.s_[:, -6:]):
+                shown[edge] = colours[ending(episodes, index)]
+        return shown
+
+    steps = range(int(episodes.length.max()) + round(rate_hz))
+    pictures = (
+        np.concatenate([tile(index, int(length), step) for index, length in enumerate(episodes.length)], axis=1)
+        for step in steps
+    )
+    return write_h264(out, pictures, max(1, round(rate_hz)))
+
+
+WORDS = {
+    "success": "success", "collision": "collision", "timeout": "time-out", "diverged": "simulation diverged",
+    "return": "return", "min_clearance_m": "smallest clearance [m]", "path_length_m": "path length [m]",
+    "mean_speed_m_s": "mean speed [m/s]", "command_change_rad_s2": "change of the yaw-rate command [rad/s²]",
+    "acceleration_rms_m_s2": "acceleration, RMS [m/s²]",
+    "yaw_acceleration_rms_rad_s2": "yaw acceleration, RMS [rad/s²]",
+    "near_misses": "near misses per episode", "near_s": "time in near misses [s]",
+    "time_to_goal_s": "time to the goal [s]",
+}  # fmt: skip
+"""Words for the figures of a summary."""
+DRIVERS = {
+    "policy": "the policy", "planner": "planner that knows the scene", "random": "random actions",
+    "blank": "it sees black images", "freeze": "it sees only its first image",
+    "replay": "it drives actions of another episode",
+}  # fmt: skip
+"""Words for drivers and for proofs of sight."""
+CAPTIONS = {
+    "paths": "Drives of the policy from above", "failures": "Drives that failed, from above",
+    "paths_planner": "Drives of the planner from above",
+}
+"""Captions of pictures by the stem of their names."""
+
+
+def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], out: Path) -> Path:
+    """Write one page with the table of figures and the pictures; the videos stay beside it."""
+    drivers, task = evaluation["drivers"], evaluation["task"]["name"].replace("_", " ")
+    first = next(iter(drivers.values()))
+    sections = [html.Section("Figures", _figures(drivers)), html.Section("What the figures mean", _meanings(first))]
+    shown = "".join(html.png(path, _caption(path)) for path in pictures)
+    sections += [html.Section("Pictures", shown)] if pictures else []
+    moving = "".join(html.video(path.name, "Episodes that failed, as the camera saw them and from above")
+                     for path in videos)  # fmt: skip
+    sections += [html.Section("Videos", moving)] if videos else []
+    subtitle = f"{first['episodes']} episodes with each driver; computed on {evaluation['device']}"
+    write_whole(out, html.html_page(f"Evaluation of {evaluation['policy']} in the task {task}", sections, subtitle))
     return out
 
 
-def page(title: str, evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], out: Path) -> Path:
-    """One self-contained page with the table of figures and the pictures; videos are linked beside it."""
-    drivers = evaluation["drivers"]
-    names = [name for name, value in next(iter(drivers.values())).items()
-             if f"{name}_interval_95" in next(iter(drivers.values()))]
-    rows = []
-    for name in names:
-        cells = "".join(f"<td>{_cell(entry[name], entry[f'{name}_interval_95'])}</td>" for entry in drivers.values())
-        rows.append(f"<tr><th>{html.escape(name)}</th>{cells}</tr>")
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in drivers)
-    images = "".join(
-        f"<figure><img src='data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}'>"
-        f"<figcaption>{html.escape(path.name)}</figcaption></figure>"
-        for path in pictures
-    )
-    links = "".join(f"<p><video controls width='640' src='{html.escape(path.name)}'></video></p>" for path in videos)
-    style = ("body{font:14px sans-serif;margin:2em;max-width:1200px}table{border-collapse:collapse}"
-             "td,th{border:1px solid #ccc;padding:3px 8px;text-align:right}img{max-width:100%}")
-    text = (
-        f"<!doctype html><meta charset='utf-8'><title>{html.escape(title)}</title><style>{style}</style>"
-        f"<h1>{html.escape(title)}</h1><p>{next(iter(drivers.values()))['episodes']} episodes each; brackets are 95 % "
-        f"intervals.</p><table><tr><th></th>{head}</tr>{''.join(rows)}</table>{images}{links}\n"
-    )
-    write_whole(out, text)
-    return out
+def _figures(drivers: dict[str, Any]) -> str:
+    first = next(iter(drivers.values()))
+    rows: list[list[Any]] = []
+    for name in (name for name in WORDS if f"{name}_interval_95" in first):
+        row: list[Any] = [WORDS[name]]
+        for figures in drivers.values():
+            row += [_shown(name, figures[name]), _interval(name, figures[f"{name}_interval_95"])]
+        rows.append(row)
+    header = ["figure", *(text for name in drivers for text in (_driver(name), "95 % interval"))]
+    main_name = next(iter(drivers))
+    lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
+    return html.paragraph(lead, "lead") + html.table(header, rows)
 
 
-def _cell(value: float | None, interval: list[float] | None) -> str:
-    if value is None or interval is None:
-        return "-"
-    return f"{value:.3g} <small>[{interval[0]:.3g}, {interval[1]:.3g}]</small>"
+def _meanings(first: dict[str, Any]) -> str:
+    texts = {**MEANS, **OF_SUCCESSES}
+    items = [f"{WORDS[name]}: {texts[name]}" for name in texts]
+    return html.bullets([*items, f"near miss: closer than {first['near_m']:g} m to a box or a wall"])
+
+
+def _driver(name: str) -> str:
+    """A driver in words: "policy freeze" is the policy without sight."""
+    base, _, blind = name.partition(" ")
+    text = DRIVERS.get(base, base)
+    return f"{text}: {DRIVERS[blind]}" if blind in DRIVERS else text
+
+
+def _caption(path: Path) -> str:
+    stem = path.stem
+    if stem.startswith("sweep_"):
+        return f"Success over {stem.removeprefix('sweep_').replace('_', ' ')}"
+    return CAPTIONS.get(stem, f"Drives from above: {stem.removeprefix('paths_').replace('_', ' ')}")
+
+
+def _shown(name: str, value: float | None) -> str:
+    if value is None:
+        return "–"
+    return f"{100 * value:.1f} %" if name in SHARES else html.number(float(value))
+
+
+def _interval(name: str, interval: list[float] | None) -> str:
+    return "–" if interval is None else f"{_shown(name, interval[0])} to {_shown(name, interval[1])}"

@@ -10,25 +10,36 @@ import numpy as np
 from whill_mjx.folders import whole_file
 
 
-def reward_curve(metrics: Path, out: Path, action_repeat: int, reference: dict[str, float] | None = None) -> Path:
-    """Return and success against control steps, from a metrics.jsonl; `reference` adds horizontal lines of return."""
+def reward_curve(
+    metrics: Path, out: Path, reference: dict[str, float] | None = None, action_repeat: int = 1
+) -> Path:
+    """Return and success against environment steps, as the progress bar counts them.
+
+    Args:
+        metrics: metrics.jsonl of a training.
+        out: picture to write.
+        reference: adds horizontal lines of return.
+        action_repeat: control periods of a step; the axis says so.
+    """
     plt = _pyplot()
     lines = [json.loads(line) for line in metrics.read_text().splitlines()]
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
     for name, label, style in (("episode/return", "training episodes", "-"), ("eval/return", "evaluation", "o-")):
-        points = [(line["env_steps"] * action_repeat, line[name]) for line in lines if name in line]
+        points = [(line["env_steps"], line[name]) for line in lines if name in line]
         if points:
             top.plot(*zip(*points, strict=True), style, label=label, markersize=3, linewidth=1)
     for label, value in (reference or {}).items():
         top.axhline(value, linestyle="--", linewidth=1, color="grey")
         top.annotate(label, (0.01, value), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
-    for name, label in (("eval/success", "success"), ("eval/collision", "collision"), ("eval/timeout", "time-out")):
-        points = [(line["env_steps"] * action_repeat, line[name]) for line in lines if name in line]
+    for name, label, colour in (("eval/success", "success", "tab:green"), ("eval/collision", "collision", "tab:red"),
+                                ("eval/timeout", "time-out", "tab:orange")):  # fmt: skip
+        points = [(line["env_steps"], line[name]) for line in lines if name in line]
         if points:
-            bottom.plot(*zip(*points, strict=True), "o-", label=label, markersize=3, linewidth=1)
+            bottom.plot(*zip(*points, strict=True), "o-", color=colour, label=label, markersize=3, linewidth=1)
     top.set_ylabel("return")
     bottom.set_ylabel("share of evaluation episodes")
-    bottom.set_xlabel("control steps (0.1 s), summed over instances")
+    each = f"each {action_repeat} control periods" if action_repeat > 1 else "each one control period"
+    bottom.set_xlabel(f"environment steps ({each}), summed over instances")
     bottom.set_ylim(-0.02, 1.02)
     for axes in (top, bottom):
         axes.grid(alpha=0.3)

@@ -25,8 +25,6 @@ from whill_mjx.vehicle.model import VehicleModel
 from whill_mjx.vehicle.types import VehicleParams
 
 RUNTIMES = ("jax", "onnxruntime")
-RUN_FILE = "run.json"
-"""In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
 OTHER_RUNTIME = "Evaluate with the runtime 'onnxruntime' instead."
 
 
@@ -85,7 +83,7 @@ def load_policy(path: str | Path, runtime: str = "jax") -> PolicyFile:
         after = {name: value.astype(carry[name].dtype) for name, value in zip(carry, values, strict=True)}
         return after, action
 
-    vehicle, unpacked = _vehicle_file(path, checked)
+    vehicle, unpacked = vehicle_file(path, checked)
     return PolicyFile(
         path=path, task=contract.task, low=contract.low, high=contract.high, height=contract.height,
         width=contract.width, rate_hz=contract.rate_hz, action_repeat=contract.action_repeat,
@@ -119,7 +117,7 @@ def _is_ground(model: VehicleModel, effect: Any) -> bool:
     return bool(world.ground)
 
 
-def _vehicle_file(path: Path, checked: CheckedPolicy) -> tuple[Path | None, tempfile.TemporaryDirectory | None]:
+def vehicle_file(path: Path, checked: CheckedPolicy) -> tuple[Path | None, tempfile.TemporaryDirectory | None]:
     """The vehicle file beside the policy; that of a zip is unpacked."""
     if checked.vehicle is None:
         return None, None

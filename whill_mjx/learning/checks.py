@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dreamer import checkpoint, parallel
+from whill_mjx.heartbeat import say
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import write_json
 
@@ -57,9 +57,9 @@ def read_best(out: Path) -> dict[str, float] | None:
     if not path.is_file():
         return None
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        return {**told, **{name: float(told[name]) for name in ("success", "return")},
-                "env_steps": int(told["env_steps"])}  # fmt: skip
+        saved = json.loads(path.read_text(encoding="utf-8"))
+        return {**saved, **{name: float(saved[name]) for name in ("success", "return")},
+                "env_steps": int(saved["env_steps"])}  # fmt: skip
     except (ValueError, KeyError, TypeError):
         say(f"{path}: is damaged and left aside; the best evaluation before it is not known.")
         return None
@@ -77,8 +77,8 @@ class Stopper:
         path = self._out / "stopped.json"
         if self._success is None or not path.is_file():
             return planned
-        told = json.loads(path.read_text())
-        return min(planned, int(told["env_steps"])) if told["success"] == self._success else planned
+        saved = json.loads(path.read_text())
+        return min(planned, int(saved["env_steps"])) if saved["success"] == self._success else planned
 
     def __call__(self, line: dict[str, float]) -> bool:
         """Whether the run ends after this line."""
@@ -96,7 +96,6 @@ class Stopper:
         say(f"stopped after {line['env_steps']} steps: two evaluations in a row reached {self._success:.0%}.")
         return True
 
-
     def _good_before(self, env_steps: float) -> int:
         """Good evaluations in a row at the end of what an earlier start has logged: a resumed run ends alike."""
         path, good = self._out / "metrics.jsonl", 0
@@ -105,8 +104,3 @@ class Stopper:
             if "eval/success" in line and line["env_steps"] < env_steps:
                 good = good + 1 if line["eval/success"] >= self._success else 0
         return good
-
-
-def say(text: str) -> None:
-    """Tell the user how far the run is."""
-    print(text, file=sys.stderr, flush=True)

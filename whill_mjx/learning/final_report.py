@@ -12,21 +12,27 @@ from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.rollouts import CHANNELS
 from whill_mjx.folders import whole_file
+from whill_mjx.video import find_ffmpeg
 
 
-def evaluate_drivers(course: Course, drivers: dict[str, Driver], seed: int, episodes: int) -> dict[str, Episodes]:
-    """The same episodes with each driver."""
-    keys = episode_keys(seed, episodes)
-    return {name: course.drive(driver, keys) for name, driver in drivers.items()}
+def evaluate_drivers(
+    course: Course, drivers: dict[str, Driver], seed: int, episodes: int, stage: Callable[[str], None]
+) -> dict[str, Episodes]:
+    """The same episodes with each driver; `stage` gets a line before each."""
+    keys, driven = episode_keys(seed, episodes), {}
+    for name, driver in drivers.items():
+        stage(f"final evaluation: {episodes} unseen episodes, driver: {name}")
+        driven[name] = course.drive(driver, keys)
+    return driven
 
 
 def write_report(
-    out: Path, course: Course, driver: Driver, driven: dict[str, Episodes], videos: int, say: Callable[[str], None]
+    out: Path, course: Course, driven: dict[str, Episodes], videos: int, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Figures of all drivers; pictures, videos and drives.npz of the policy in `out`.
 
     Pictures: drives.png and failures.png from above; camera.mp4 shows the first episodes, failures.mp4 the first that
-    failed, `videos` of each at most. What needs a package that is missing is left out and said.
+    failed, `videos` of each at most. A line says what is left out because a package is missing.
     """
     from whill_mjx.evaluation import pages
 
@@ -36,13 +42,12 @@ def write_report(
     radius, rate = course.env.task.goal_radius, 1.0 / episodes.control_dt
 
     def films() -> None:
-        import imageio_ffmpeg  # noqa: F401  before the episodes are driven again for nothing
-
-        shown = np.concatenate([first, failed[:videos]])
-        again, frames, above = course.film(driver, episodes.keys[shown])
+        find_ffmpeg()  # before the work
+        shown = episodes.some(np.concatenate([first, failed[:videos]]))
+        frames, above = course.film(shown)
         for name, part in (("camera.mp4", slice(0, len(first))), ("failures.mp4", slice(len(first), None))):
-            if len(shown[part]):
-                chosen = again.some(np.arange(len(shown))[part])
+            if len(frames[part]):
+                chosen = shown.some(np.arange(shown.count)[part])
                 pages.episode_video(chosen, frames[part], above[part], out / name, rate)
 
     jobs: dict[str, Callable[[], Any]] = {

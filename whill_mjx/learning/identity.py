@@ -19,7 +19,7 @@ from whill_mjx.vehicle.types import VehicleParams
 KIND = "whill_mjx.train"
 OUTPUTS = ("config.json", "best", "best.json", "policy_best", "policy_last", "drives.npz", "stopped.json",
            "reward_curve.png", "drives.png", "failures.png", "camera.mp4", "failures.mp4", "prediction.gif",
-           "tensorboard")  # fmt: skip
+           "index.html", "tensorboard")  # fmt: skip
 """Names that a training writes besides the results that all commands share."""
 SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries")
 """Fields of a preset that change the result of both learners; evaluations choose the best parameters."""

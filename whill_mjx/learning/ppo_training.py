@@ -13,8 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from dreamer import checkpoint
+from dreamer.progress import Progress
 from whill_mjx.folders import write_whole
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
+
+SHOWN = ("success", "return")
+"""Figures of an evaluation in the progress bar."""
 
 
 def train_ppo(
@@ -30,6 +34,8 @@ def train_ppo(
     eval_ahead: bool = False,
     checkpoint_every_s: float = 60.0,
     last_step: int | None = None,
+    announce: Callable[[str], None] = lambda text: None,
+    progress: bool = False,
 ) -> tuple[Any, int, int, float]:
     """Train until `total_steps` environment steps, summed over instances, are done, or until `stop` says so.
 
@@ -49,6 +55,8 @@ def train_ppo(
             Not with several devices.
         checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
         last_step: environment step at which an earlier start of this run was stopped; none trains them all.
+        announce: gets a line when something begins that takes long.
+        progress: show a bar on stderr.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
@@ -57,6 +65,7 @@ def train_ppo(
     each, updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
     iterations = -(-total_steps // each)
     last = iterations if last_step is None else min(iterations, -(-last_step // each))
+    announce("compiling the training program, usually 1 to 2 minutes")
     state, wall_before = _first_state(env, config, out, iterations, seed)
     done, began = int(state.updates), time.monotonic()
     logged = done * each // eval_every
@@ -85,13 +94,18 @@ def train_ppo(
         say(f"{done * each} steps: " + ", ".join(f"{name} {line[name]:.3g}" for name in line if "eval/" in name))
         return line
 
-    stopped = False
+    stopped, running, bar = False, None, Progress(iterations * each, done * each, progress)
     try:
         while done < last and not stopped:
             state, metrics = run(state)
             done += 1
+            if progress:
+                jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
+                bar.show(done * each, {})
+            running = metrics
             if due(done):
                 line = evaluated(metrics)
+                bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
                 logged = done * each // eval_every
                 stopped = stop is not None and stop(line)
             if done == last or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
@@ -101,6 +115,8 @@ def train_ppo(
         if checkpoint.is_whole(state) and not due(int(state.updates)):
             save()  # an evaluation that is due would be missing from the run that goes on from here
         raise
+    finally:
+        bar.close()
     return state.params, done * each, done * updates_each, wall_s()
 
 

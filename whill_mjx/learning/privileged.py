@@ -1,4 +1,4 @@
-"""What only the simulator knows: targets that a world model may learn to tell from images, and nothing acts on.
+"""Privileged auxiliary targets of a world model, which only the simulator knows; never inputs of the policy.
 
 The vector (D,) is in the body frame, centred on the footprint (x ahead, y to the left): goal, speeds, and the free
 distance in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's symlog resolves the near ones.
@@ -16,7 +16,7 @@ from whill_mjx.vehicle.kinematics import body_twist, reference_pose
 from whill_mjx.world.scene import Boxes, Footprint, footprint
 
 UNIT = 0.1  # m
-RANGE = 5.0  # m, farthest free distance told
+RANGE = 5.0  # m, largest free distance
 RAYS = 48  # 3 m away they lie 0.39 m apart: at least one meets a box as wide as the corridor's
 SIZE = 4 + RAYS
 ANGLES = np.arange(RAYS) * 2 * np.pi / RAYS  # rad, from straight ahead to the left; mirrored, ray k is ray -k

@@ -62,8 +62,8 @@ def find_preset(name: str, task: str) -> Preset:
 
     "paper" is the reference paper's setting: 16 instances, 22,000 control steps on the obstacle course and 200,000 in
     the corridor (at ratios of 384 and 160). Its updates are few, so it learns faster at first and explores more
-    than DreamerV3's defaults; it also learns from the mirrored world and to tell what the simulator knows, a quarter of
-    its instances act without noise, and an average of its parameters drives. On the course it looks 5 s ahead, not 33,
+    than DreamerV3's defaults; it also learns from the mirrored world and predicts what the simulator knows. A quarter
+    of its instances act without noise; an average of its parameters drives. On the course it looks 5 s ahead, not 33,
     trusts its critic less, and begins half of its training episodes anywhere on the way: from the paper's start and
     with noise alone, two seeds in five learned a fixed layout. Its drives are short, so twice as many sequences of half
     the length make a batch, in less time. In the corridor, whose box may look like the floor behind it, what the
@@ -250,8 +250,8 @@ def mirror_of(batch: BatchEnv) -> Mirror:
         image = turned(image, image[..., ::-1, :])
         if not known:
             return image
-        told = jnp.broadcast_to(obs[TRUTH], (worlds, *obs[TRUTH].shape))
-        return {"camera": image, TRUTH: turned(told, privileged.mirrored(told))}
+        vector = jnp.broadcast_to(obs[TRUTH], (worlds, *obs[TRUTH].shape))
+        return {"camera": image, TRUTH: turned(vector, privileged.mirrored(vector))}
 
     def other_action(action: jax.Array, worlds: int) -> jax.Array:
         action = jnp.broadcast_to(action, (worlds, *action.shape))

@@ -1,7 +1,7 @@
 """Manoeuvres as command sequences: the paper's five, and four that separate effects which those five confuse.
 
 The paper publishes neither speeds nor durations; those here are our choice. Every manoeuvre starts with a second of
-standstill, which tells the start pose, and ends with one.
+standstill, which shows the start pose, and ends with one.
 """
 
 from __future__ import annotations

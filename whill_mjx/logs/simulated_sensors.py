@@ -98,7 +98,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 def encoder_table(t: np.ndarray, latency: float, angles: np.ndarray) -> np.ndarray:
     """Rows (M, 4) of encoder.csv: t [s], wheel angles left and right [rad] in steps and wrapped, counter [ms].
 
-    The counter is the vehicle's own clock at the measurement: it tells the time between two states whatever the
+    The counter is the vehicle's own clock at the measurement: it gives the time between two states whatever the
     latency, up to its wrap.
     """
     stepped = ENCODER_STEP * np.round(wrapped(angles) / ENCODER_STEP)

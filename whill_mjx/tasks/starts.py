@@ -1,7 +1,7 @@
 """Episodes that begin anywhere on the way: the exploring starts of Sutton and Barto, for training only.
 
 From the nominal start alone, a learner that is held up half-way never sees what lies behind: neither its model nor its
-critic can tell that going on pays. A simulator can put the vehicle there.
+critic learns that going on pays. A simulator can put the vehicle there.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
     [[effects]]
     name = "pid_drive"          # canonical name; the order is the order in which the effects act
     [effects.parameters.kp]     # value, unit, interval
-    [provenance]                # free: data hash, fit, held-out error
+    [provenance]                # free: data hash, fit, held-out error; interval_confidence is that of all intervals
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def save_vehicle(
         path: file to write.
         spec, params: the vehicle; params of ONE instance.
         intervals: confidence interval of a parameter by its dotted name ("pid_drive.kp").
-        provenance: what is worth knowing of the origin; strings, numbers and tables of them.
+        provenance: what is worth knowing of the origin; strings, numbers and tables of them. Its
+            `interval_confidence`, such as 0.9, belongs to the intervals.
     """
     import tomlkit  # not needed to read a file
 
@@ -70,9 +71,18 @@ def save_vehicle(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(tomlkit.dumps(content))
+    temporary.write_text(_remark(content) + tomlkit.dumps(content))
     os.replace(temporary, path)
     return path
+
+
+def _remark(content: Mapping[str, Any]) -> str:
+    """Comment above a vehicle file that says what its intervals are, where it has any."""
+    confidence = content["provenance"].get("interval_confidence")
+    if confidence is None:
+        return ""
+    return (f"# Each interval [low, high] is the {confidence:.0%} confidence interval of the value above it.\n"
+            "# A parameter without one was not fitted, or the log does not determine it.\n")
 
 
 def load_vehicle(name_or_path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:

@@ -1,6 +1,6 @@
 """The table of effects: what acts, its base size, its unit and its functional form.
 
-The form of each is the first line of its class. `known` tells whether the vehicle model's catalogue has an effect of
+The form of each is the first line of its class. `known` says whether the vehicle model's catalogue has an effect of
 that name; `other_form` whether it is written there with another law than here.
 """
 

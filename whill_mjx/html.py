@@ -28,7 +28,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
-figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img { max-width: 100%; }
+figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img, video { max-width: 100%; }
 code { font-size: .84rem; overflow-wrap: anywhere; }
 svg.chart { max-width: 100%; height: auto; background: #fff; } svg text { fill: #333; font-family: inherit; }
 svg .title { font-size: 11.5px; font-weight: 600; } svg .label { font-size: 11px; } svg .tick { font-size: 10px; }
@@ -136,6 +136,24 @@ def png(path: Path, caption: str = "") -> str:
     data = base64.b64encode(Path(path).read_bytes()).decode()
     note = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">{note}</figure>'
+
+
+def image(source: str, caption: str = "") -> str:
+    """A picture that lies beside the page, at a relative path."""
+    return (f'<figure><a href="{escape(source)}"><img alt="{escape(caption)}" src="{escape(source)}"></a>'
+            f"<figcaption>{escape(caption)}</figcaption></figure>")
+
+
+def video(source: str, caption: str = "") -> str:
+    """A video that lies beside the page, at a relative path."""
+    return (f'<figure><video controls loop muted preload="auto" src="{escape(source)}"></video>'
+            f"<figcaption>{escape(caption)}</figcaption></figure>")
+
+
+def links(entries: Sequence[tuple[str, str]]) -> str:
+    """A list of (relative path, what it is)."""
+    return "<ul>" + "".join(f'<li><a href="{escape(path)}">{escape(path)}</a>: {escape(text)}</li>'
+                            for path, text in entries) + "</ul>"
 
 
 def _anchors(titles: Sequence[str]) -> list[str]:
