@@ -2,7 +2,7 @@
 
     python -m benchmarks.house                                  # what the sources alone show
     python -m benchmarks.house --against CHECKOUT --lowered     # which compiled programs are the same, letter by letter
-    python -m benchmarks.house --against CHECKOUT --times       # paired medians, where programs differ
+    python -m benchmarks.house --against CHECKOUT --times fit loop   # medians of both, where programs differ
 
 A floor is a step of the longest chain of imports inside a package, circles counted as one file. Imports inside
 functions and for type checking count.
@@ -30,6 +30,7 @@ from benchmarks.prose import sentences
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
 CLAIM = "a stranger finds the room in a minute"
+TIMED = ("physics", "environment", "learner", "fit", "loop")
 LONG, MANY = 60, 6  # lines of a function, and arguments, beyond which it counts
 
 
@@ -135,7 +136,8 @@ def _run(tree: Path, *arguments: str) -> dict:
     script = Path(__file__).with_name("house_programs.py")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        environment = {**os.environ, "PYTHONPATH": str(tree)}
+        path = os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path}
         subprocess.run([sys.executable, str(script), "--out", str(out), *arguments], check=True, cwd=tree,
                        env=environment)
         found: dict = json.loads(out.read_text())
@@ -151,11 +153,11 @@ def compare_programs(other: Path) -> dict[str, dict]:
             for name in mine}
 
 
-def compare_times(other: Path, rounds: int) -> dict[str, dict]:
+def compare_times(other: Path, programs: list[str], rounds: int) -> dict[str, dict]:
     """Medians of this tree's seconds over the other's, each tree in a process of its own, one after the other."""
     ratios: dict[str, list[float]] = {}
     for number in range(rounds):
-        mine, theirs = (_run(tree, "--times") for tree in (ROOT, other))
+        mine, theirs = (_run(tree, "--times", *programs) for tree in (ROOT, other))
         for name, taken in mine.items():
             ratios.setdefault(name, []).append(median(taken) / median(theirs[name]))
         print(f"round {number + 1} of {rounds}: "
@@ -170,7 +172,7 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, help="another checkout of the project")
     parser.add_argument("--lowered", action="store_true", help="compare lowered programs with it")
-    parser.add_argument("--times", action="store_true", help="compare seconds with it")
+    parser.add_argument("--times", nargs="*", choices=TIMED, default=[], help="programs whose seconds are compared with it")
     parser.add_argument("--rounds", type=int, default=1, help="of timing both trees, five calls a program each")
     options = parser.parse_args()
     if (options.lowered or options.times) and options.against is None:
@@ -179,7 +181,7 @@ def main() -> None:
     if options.lowered:
         figures |= compare_programs(options.against.resolve())
     if options.times:
-        figures |= compare_times(options.against.resolve(), options.rounds)
+        figures |= compare_times(options.against.resolve(), options.times, options.rounds)
     for name, one in figures.items():
         print(f"{name}: {one['value']:g} {one['unit']}")
     record("house", CLAIM, figures)

@@ -100,16 +100,17 @@ def seconds(function: Any, arguments: tuple, calls: int) -> list[float]:
     return taken
 
 
-def timed() -> dict[str, list[float]]:
-    """Seconds of all programs, at sizes that fill the device."""
+def timed(names: list[str]) -> dict[str, list[float]]:
+    """Seconds of programs, at sizes that fill the device."""
     large = jax.default_backend() != "cpu"
-    return {
-        "physics": seconds(*physics(32768 if large else 256), 50),
-        "environment": seconds(*environment(8192 if large else 64), 20 if large else 5),
-        "learner": seconds(*learner("size12m" if large else "size1m"), 5 if large else 1),
-        "fit": [fit() for _ in range(1 + REPEATS)][1:],
-        "loop": [loop() for _ in range(1 + REPEATS)][1:],
+    jobs: dict[str, Callable[[], list[float]]] = {
+        "physics": lambda: seconds(*physics(32768 if large else 256), 50),
+        "environment": lambda: seconds(*environment(8192 if large else 64), 20 if large else 5),
+        "learner": lambda: seconds(*learner("size12m" if large else "size1m"), 5 if large else 1),
+        "fit": lambda: [fit() for _ in range(1 + REPEATS)][1:],
+        "loop": lambda: [loop() for _ in range(1 + REPEATS)][1:],
     }
+    return {name: jobs[name]() for name in names}
 
 
 def fit() -> float:
@@ -149,15 +150,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.house_programs", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file to write")
     parser.add_argument("--lowered", action="store_true", help="digests of programs")
-    parser.add_argument("--times", action="store_true", help="seconds of each")
+    parser.add_argument("--times", nargs="*", default=[], help="programs whose seconds are wanted")
     options = parser.parse_args()
     written: dict[str, Any] = {}
     if options.lowered:
         for one in (physics, environment, learner, replay):
             function, arguments = one()
             written[one.__name__] = digest(function.lower(*arguments))
-    if options.times:
-        written |= timed()
+    written |= timed(options.times)
     options.out.write_text(json.dumps(written))
 
 
