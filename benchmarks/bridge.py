@@ -5,25 +5,31 @@
 The policy is a stand-in of 10 million random parameters with the shape of a trained one (recurrent, 64x64 RGB), unless
 --policy names another. A trained policy cannot be made to fail on purpose, so `stop_action_ms` always uses the
 stand-in. All times are of the system's one steady clock. Figures named `_realtime` are taken with both nodes under
-SCHED_FIFO, where that is permitted.
+SCHED_FIFO, where that is permitted. Faults are injected by a plain ROS node (benchmarks.bridge_robot); a reaction is
+the time from the injection to the first zero that this node hears.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib.metadata
 import json
 import os
+import re
 import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.bridge_robot import Robot, Switch, message_type
 from bridge.simulate import Frame
 
 CLAIM = "Frame to command, delivery, pacing and every stop of the bridge, measured between processes"
@@ -101,13 +107,12 @@ def export_stand_in(folder: Path) -> Path:
 class Run:
     """One simulator and one policy node, and what they report."""
 
-    def __init__(self, folder: Path, policy: Path, robot: str, domain: int, *options: str, guard: bool = False,
-                 realtime: bool = False) -> None:
+    def __init__(self, folder: Path, policy: Path, robot: str, domain: int, *options: str, realtime: bool = False
+                 ) -> None:
         self.results, self.drive_results = folder / "simulate.json", folder / "drive.json"
         for path in (self.results, self.drive_results):
             path.unlink(missing_ok=True)
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        self.guard = self._start("bridge.guard") if guard else None
         scheduling = ("--realtime", "20") if realtime else ()
         self.drive = self._start("bridge.drive", str(policy), "--results", str(self.drive_results), *scheduling)
         self.simulate = self._start("bridge.simulate", "--simulator", f"benchmarks.bridge:{robot}", "--results",
@@ -119,11 +124,10 @@ class Run:
 
     def finish(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """End the processes, the policy node first, and return the results of simulator and policy node."""
-        for process in (self.drive, self.simulate, self.guard):
-            if process is not None:
-                if process.poll() is None:
-                    process.send_signal(signal.SIGTERM)
-                process.wait(60)
+        for process in (self.drive, self.simulate):
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+            process.wait(60)
         drive = json.loads(self.drive_results.read_text()) if self.drive_results.exists() else {}
         return json.loads(self.results.read_text()), drive
 
@@ -141,6 +145,123 @@ def settled(results: dict[str, Any], after: float = 3.0) -> tuple[np.ndarray, np
 def first_zero(results: dict[str, Any], after: float) -> float:
     """Return the seconds from `after` to the first zero command."""
     return min(t for t, v, omega in results["commands"] if t >= after and v == 0 and omega == 0) - after
+
+
+def stops(drive: dict[str, Any]) -> int:
+    """Return how often a bridge stopped."""
+    return sum(count for name, count in drive["counts"].items() if name.startswith("stop: "))
+
+
+def memory_mb(pid: int) -> float:
+    """Return the resident memory of a process [MB]."""
+    with open(f"/proc/{pid}/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+class Bridge:
+    """A policy node that drives a robot of plain ROS."""
+
+    def __init__(self, policy: Path, domain: int, *options: str) -> None:
+        self.robot = Robot(domain)
+        self.e_stop = self.robot.whole(shade=120)  # at white the stand-in fails
+        self.enable = Switch(self.robot, "enable", True)
+        self.collision = self.robot.publisher("std_msgs/Bool", "collision_sensor")
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        self.process = subprocess.Popen([sys.executable, "-m", "bridge.drive", str(policy), *options], env=environment,
+                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def collide(self, value: bool) -> None:
+        """Publish one value of the collision sensor."""
+        self.collision.publish(message_type("std_msgs/Bool")(data=value))
+
+    def guard(self) -> int:
+        """Return the process of its guard."""
+        with open(f"/proc/{self.process.pid}/task/{self.process.pid}/children") as file:
+            return int(file.read().split()[0])
+
+    def close(self) -> None:
+        """End it, and the robot."""
+        self.process.send_signal(signal.SIGCONT)
+        self.process.terminate()
+        self.process.wait(60)
+        self.robot.close()
+
+
+FAULTS: dict[str, tuple[tuple[str, ...], Any, Any]] = {
+    "e_stop": ((), lambda bridge: bridge.e_stop.turn(True), lambda bridge: bridge.e_stop.turn(False)),
+    "e_stop_silent": ((), lambda bridge: bridge.e_stop.timer.cancel(), lambda bridge: bridge.e_stop.timer.reset()),
+    "collision": ((), lambda bridge: bridge.collide(True), lambda bridge: bridge.collide(False)),
+    "enable": (("--enable", "require"), lambda bridge: bridge.enable.turn(False),
+               lambda bridge: bridge.enable.turn(True)),
+    "frozen_camera": ((), lambda bridge: setattr(bridge.robot, "frozen", True),
+                      lambda bridge: setattr(bridge.robot, "frozen", False)),
+    "late_stamps": ((), lambda bridge: setattr(bridge.robot, "clock_offset", -5.0),
+                    lambda bridge: setattr(bridge.robot, "clock_offset", 0.0)),
+    "wrong_encoding": ((), lambda bridge: setattr(bridge.robot, "encoding", "bayer_rggb8"),
+                       lambda bridge: setattr(bridge.robot, "encoding", "rgb8")),
+    "guard_killed": ((), lambda bridge: os.kill(bridge.guard(), signal.SIGKILL), lambda bridge: None),
+    "node_stopped": (("--signal-age", "5"), lambda bridge: bridge.process.send_signal(signal.SIGSTOP),
+                    lambda bridge: bridge.process.send_signal(signal.SIGCONT)),
+    "node_ends": ((), lambda bridge: bridge.process.terminate(), None),
+    "killed": ((), lambda bridge: bridge.process.kill(), None),
+    "killed_first": ((), lambda bridge: bridge.process.kill(), None),
+}
+"""Options, injection and its end by the name of a fault; without an end each repeat takes a new node."""
+
+
+def measure_faults(policy: Path, domain: int, repeats: int) -> Figures:
+    """Return the reaction times to every fault."""
+    found: Figures = {}
+    for number, (name, (options, inject, end)) in enumerate(FAULTS.items()):
+        reactions: list[float] = []
+        while len(reactions) < repeats:
+            bridge = Bridge(policy, domain + number, *options)
+            try:
+                reactions.extend(reaction_times(bridge, name, inject, end, repeats if end else 1, len(reactions)))
+            finally:
+                bridge.close()
+        title = "e_stop_ms" if name == "e_stop" else f"stop_{name}_ms"
+        found[title] = (reactions, "ms from the fault to the first zero")
+    return found
+
+
+def reaction_times(bridge: Bridge, name: str, inject: Any, end: Any, repeats: int, phase: int) -> list[float]:
+    """Return the times [ms] from a fault to the first zero, each at another phase of the control period."""
+    robot, found = bridge.robot, []
+    for i in range(repeats):
+        robot.wait_until(moving_after(time.monotonic()))
+        if name != "killed_first":
+            time.sleep(0.7 + 0.037 * (i + phase))
+        at = time.monotonic()
+        inject(bridge)
+        found.append(1e3 * robot.first_zero(at))
+        if end is None:
+            break
+        end(bridge)
+        with contextlib.suppress(AssertionError):  # resumed by itself
+            robot.wait_for_status(2.0, state="disarmed", holds="[]")
+            robot.arm()
+    return found
+
+
+def moving_after(since: float) -> Callable[[Robot], Any]:
+    """Return the condition that a motion is commanded after a time."""
+    return lambda robot: robot.moving(since)
+
+
+def fuzz(count: int) -> int:
+    """Return how many commands of a supervisor left the limits, of so many outputs of any bits."""
+    from bridge.safety import SafetyConfig, Supervisor
+
+    config = SafetyConfig((-0.5, -1.0), (1.0, 1.0))
+    supervisor, rng, now, wrong = Supervisor(config), np.random.default_rng(0), 0.0, 0
+    for number, bits in enumerate(rng.integers(0, 2**64, (count, 2), np.uint64)):
+        now += 0.1
+        supervisor.frame(now, now, number)
+        command = supervisor.action(now, bits.view(np.float64))
+        wrong += not (-0.5 <= command.v <= 1.0 and -1.0 <= command.omega <= 1.0)
+        supervisor.arm()
+    return wrong
 
 
 def policy_times(policy_path: Path, steps: int) -> list[float]:
@@ -167,71 +288,115 @@ def cold_start(policy_path: Path) -> float:
     return time.perf_counter() - start
 
 
-def measure(seconds: float, resets: int, kills: int, policy_path: Path | None) -> dict[str, tuple[list[float], str]]:
-    """Return every figure as its repeats and unit."""
-    figures: dict[str, tuple[list[float], str]] = {}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        stand_in = export_stand_in(folder / "stand_in")
-        policy = policy_path or stand_in
-        domain = 1 + os.getpid() % 80
+Figures = dict[str, tuple[list[float], str]]
+"""Repeats and unit of each figure by its name."""
 
-        for suffix in ("", "_realtime"):
-            run = Run(folder, policy, "EndlessRobot", domain, realtime=bool(suffix))
-            domain += 1
-            time.sleep(seconds + 5)
-            delays, intervals = settled(run.finish()[0])
-            figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
-            figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
-            figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
-            figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(np.abs(intervals - 100), 99))], "ms")
-            run = Run(folder, policy, "EndlessRobot", domain, "--image-size", "720", "1280", realtime=bool(suffix))
-            domain += 1
-            time.sleep(seconds + 5)
-            results, drive = run.finish()
-            figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
-            end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
-            shown = sum(t < end - 0.01 for t in results["image_times"])
-            figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
-        figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
 
-        run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
-        run.simulate.wait(30 + 4 * resets)
-        results, _ = run.finish()
-        episodes = results["episodes"]
-        figures["stop_input_ms"] = ([1e3 * first_zero(results, episode["ended"]) for episode in episodes], "ms")
-        stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
-                    for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
-        figures["stale_after_reset"] = ([float(stale)], f"commands before the third frame, {resets - 1} resets")
-
-        run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
-        run.simulate.wait(90)
-        results, _ = run.finish()
-        whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in results["episodes"]]
-        figures["stop_action_ms"] = ([1e3 * first_zero(results, white - 0.03) - 30 for white in whites], "ms")
-
-        killed = []
-        for i in range(kills):
-            run = Run(folder, policy, "EndlessRobot", domain + 2 + i, guard=True)
-            time.sleep(7 + 0.037 * i)  # any phase of the control period
-            at = time.monotonic()
-            run.drive.kill()
-            time.sleep(1)
-            killed.append(1e3 * first_zero(run.finish()[0], at))
-        figures["stop_killed_ms"] = (killed, "ms")
-        figures["policy_p99_ms"] = ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms")
-        figures["cold_start_s"] = ([cold_start(policy) for _ in range(3)], "s")
+def measure_steady(policy: Path, folder: Path, domain: int, seconds: float) -> Figures:
+    """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives."""
+    figures: Figures = {}
+    healthy_stops, growth = 0, []
+    for number, suffix in enumerate(("", "_realtime")):
+        run = Run(folder, policy, "EndlessRobot", domain + 2 * number, realtime=bool(suffix))
+        time.sleep(5)
+        before = memory_mb(run.drive.pid)
+        time.sleep(seconds)
+        growth.append(memory_mb(run.drive.pid) - before)
+        results, drive = run.finish()
+        healthy_stops += stops(drive)
+        delays, intervals = settled(results)
+        figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
+        figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
+        figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
+        figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(np.abs(intervals - 100), 99))], "ms")
+        run = Run(folder, policy, "EndlessRobot", domain + 2 * number + 1, "--image-size", "720", "1280",
+                  realtime=bool(suffix))
+        time.sleep(seconds + 5)
+        results, drive = run.finish()
+        healthy_stops += stops(drive)
+        figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
+        end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
+        shown = sum(t < end - 0.01 for t in results["image_times"])
+        figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
+    figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
+    figures["healthy_stops"] = ([float(healthy_stops)], f"stops in {4 * (seconds + 5):.0f} healthy seconds")
+    figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first 5 s")
     return figures
 
 
+def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, resets: int) -> Figures:
+    """Return the reactions to a camera that falls silent, at resets, and to an action that is not a number."""
+    run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
+    run.simulate.wait(30 + 4 * resets)
+    results, _ = run.finish()
+    episodes = results["episodes"]
+    stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
+                for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
+    run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
+    run.simulate.wait(90)
+    white_results, _ = run.finish()
+    whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in white_results["episodes"]]
+    return {
+        "stop_input_ms": ([1e3 * first_zero(results, episode["ended"]) for episode in episodes], "ms"),
+        "stale_after_reset": ([float(stale)], f"commands before the third frame, {resets - 1} resets"),
+        "stop_action_ms": ([1e3 * first_zero(white_results, white - 0.03) - 30 for white in whites], "ms"),
+    }
+
+
+def measure_policy(policy: Path, seconds: float) -> Figures:
+    """Return duration and cold start of the policy, and the size of what it needs."""
+    return {
+        "policy_p99_ms": ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms"),
+        "cold_start_s": ([cold_start(policy) for _ in range(3)], "s"),
+        "installed_mb": ([installed_mb("numpy", "onnxruntime")], "MB of numpy, onnxruntime and what they require"),
+    }
+
+
+def installed_mb(*names: str) -> float:
+    """Return the size [MB] of installed distributions and all that they require."""
+    found: dict[str, float] = {}
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        files = [Path(str(distribution.locate_file(file))) for file in distribution.files or ()]
+        found[name] = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
+        required = [line for line in distribution.requires or () if "extra ==" not in line]
+        waiting.extend(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in required)
+    return sum(found.values())
+
+
 def main() -> None:
+    parts = ("steady", "episodes", "faults", "fuzz", "policy")
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge", description="Measure the bridge.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each steady run")
     parser.add_argument("--resets", type=int, default=20)
-    parser.add_argument("--kills", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=5, help="of each fault")
     parser.add_argument("--policy", type=Path, help="policy file to measure; default: a stand-in of 10 M parameters")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     options = parser.parse_args()
-    figures = measure(options.seconds, options.resets, options.kills, options.policy)
+    figures: Figures = {}
+    domain = 1 + os.getpid() % 60
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        stand_in = export_stand_in(folder / "stand_in")
+        policy = options.policy or stand_in
+        if "steady" in options.parts:
+            figures |= measure_steady(policy, folder, domain, options.seconds)
+        if "episodes" in options.parts:
+            figures |= measure_episodes(policy, stand_in, folder, domain + 4, options.resets)
+        if "faults" in options.parts:
+            figures |= measure_faults(policy, domain + 6, options.repeats)
+            figures["faults_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the faults")
+        if "fuzz" in options.parts:
+            figures["fuzz_outside_limits"] = ([float(fuzz(1_000_000))], "of 1,000,000 outputs of any 64 bits")
+        if "policy" in options.parts:
+            figures |= measure_policy(policy, options.seconds)
 
     from benchmarks.harness import figure, record
 

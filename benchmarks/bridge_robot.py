@@ -26,11 +26,18 @@ def message_type(name: str) -> Any:
 
 
 class Switch:
-    """A truth value that is published again and again."""
+    """A truth value that is published again and again, and at once when it is set by `turn`."""
 
-    def __init__(self, value: bool) -> None:
+    def __init__(self, robot: Robot, topic: str, value: bool, profile: Any = 1) -> None:
         self.value = value
-        self.timer: Any = None
+        self._make = message_type("std_msgs/Bool")
+        self._publisher = robot.publisher("std_msgs/Bool", topic, profile)
+        self.timer = robot.repeat(self._publisher, 0.02, lambda: self._make(data=self.value))
+
+    def turn(self, value: bool) -> None:
+        """Set and publish the value."""
+        self.value = value
+        self._publisher.publish(self._make(data=value))
 
 
 class Robot:
@@ -99,19 +106,16 @@ class Robot:
 
     def e_stop(self, topic: str = "e_stop") -> Switch:
         """Beat as an emergency stop, not pulled."""
-        switch = Switch(False)
-        boolean = message_type("std_msgs/Bool")
-        switch.timer = self.repeat(self.publisher("std_msgs/Bool", topic), 0.02, lambda: boolean(data=switch.value))
-        return switch
+        return Switch(self, topic, False)
 
     def camera(self, topic: str = "sensing/camera/front/image_raw", rate: float = 10,
-               size: tuple[int, int] = (64, 64)) -> Any:
-        """Publish white images, each different from the last unless `frozen`; return the timer."""
+               size: tuple[int, int] = (64, 64), shade: int = 255) -> Any:
+        """Publish images of one shade of grey, each different from the last unless `frozen`; return the timer."""
         from bridge import ros
 
         image = message_type("sensor_msgs/Image")
         publisher = self.node.create_publisher(image, topic, ros.best_effort())
-        pixels = bytearray(b"\xff" * (size[0] * size[1] * 3))
+        pixels = bytearray([shade]) * (size[0] * size[1] * 3)
 
         def make() -> Any:
             self.frames += 1
@@ -124,11 +128,11 @@ class Robot:
 
         return self.repeat(publisher, 1 / rate, make)
 
-    def whole(self) -> Switch:
+    def whole(self, shade: int = 255) -> Switch:
         """Be a whole vehicle with base, camera and status; return its emergency stop."""
         self.base()
         self.watch()
-        self.camera()
+        self.camera(shade=shade)
         return self.e_stop()
 
     def commander(self, v: float, topic: str = "whill/controller/cmd_vel", kind: str = "geometry_msgs/Twist"

@@ -1,13 +1,13 @@
 """The page of the effects, docs/effects.md, and the figure of their signatures, docs/images/effects.png.
 
-    python -m benchmarks.effects page     # from the docstrings and parameters; a test keeps it up to date
+    python -m benchmarks.effects page     # from docstrings, parameters and cards; a test keeps it up to date
     python -m benchmarks.effects figure   # drives the chair once with each effect
 """
 
 from __future__ import annotations
 
 import argparse
-import inspect
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -16,20 +16,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.effects import EFFECTS, equation, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of
+from whill_mjx.effects.card import Alike, Axis, Scale
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import body_twist
 from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.types import VehicleParams, parameters_of
 
 DOCS = Path(__file__).parent.parent / "docs"
 INTRODUCTION = """# Effects
 
-This page is the reference of all physical effects. `python -m benchmarks.effects page` makes it from the docstrings in
-`whill_mjx/effects/`, which say more. [How to find which effect a vehicle has](close_loop.md).
+This page is the reference of all physical effects. `python -m benchmarks.effects page` makes it from the classes in
+`whill_mjx/effects/`, whose docstrings say more. [How to find which effect a vehicle has](close_loop.md).
 
 A vehicle is a spec, a mass distribution and a tuple of effects. Each effect acts at one place. At its neutral values it
 vanishes to the last bit (the two drives, `pid_drive` and `torque_drive`, then give no force).
@@ -53,32 +55,37 @@ HEADINGS = {
     "sensing": "Sensing: what is reported",
     "outside": "Outside: how a pose is measured from outside",
 }
-CLOSING = """## Which look alike
-Odometry and outside pose of ordinary drives cannot separate these effects, or only barely. A fit frees one of each row,
-or needs what the last column says.
+CARDS = """## What the closed loop looks for
+`sysid.close_loop` looks for these effects in a log, in this order. Each line of the second column is one way in which
+the effect may be missing: the parameters that it frees, at a size that is small but noticeable. Forces and masses grow
+with the vehicle; the table is for the chair (`turn_efficiency`: for the Husky). "either way" marks sizes of both signs,
+"form" a parameter that only changes what the others do. The loop does not name an effect if the drives contradict one
+of its predictions. The next column says what measures the effect by itself, where no drive separates it from another.
+The last one says whether an outside pose shows it without odometry.
+
+| effect | frees, at size 1 | its law predicts that the effect | measured by | pose alone |
+|---|---|---|---|---|
+"""
+ALIKE = """## Which look alike
+Odometry and outside pose of ordinary drives cannot separate these effects, or only barely. Free one of each row in a
+fit, or add what the last column says.
 
 | alike | why | what separates them |
 |---|---|---|
-| `slope`, `incline` | the same motion in other coordinates | height and attitude |
-| `slope`, `wind` | both a force fixed in the room | a known load on board: only the slope's pull grows |
-| `track_width`, `turn_efficiency` | the same on a skid drive | nothing |
-| `command_delay`, `sensor_delay`, `clock_offset`, `state_rate` | shifts in time | outside pose sees the first alone |
-| `command_delay`, `pose_delay` | shifts in time | odometry sees the first alone |
-| `odometry_scale`, `command_scale`, `wheel_radius_difference` (common) | scales of distance | outside pose |
-| `air_drag`, `quadratic_drag` | one law | wind |
-| `rolling_resistance_speed`, `rolling_resistance` | hidden behind the speed control | coasting |
-| `yaw_scrub`, `omni_roller_friction` | dry resistance to turning | outside pose, turning about other centres |
-| `supply_sag`, `payload_shift` | slower response | weighing |
-| `torque_saturation`, `traction_limit` | a cap on each side's force | another floor |
-
-## Left out
-- What the chair does when a command lapses (brake, ramp) is not documented; `command_expiry` takes a command of zero.
+"""
+LEFT_OUT = """## Left out
 - A wheel touches the ground at one point. Surfaces are smooth and longer than a wheel; no kerb or step can be climbed.
-- The cap of `traction_limit` ignores cornering, and its wheels never break away. `slip_traction` of the physical base
-  model has both.
-- `payload_shift` leaves out products of inertia. A real load that is both ahead of and above the centre of mass couples
-  roll and yaw.
-- Fits read no gyro. `gyro_bias` and `gyro_range` show only in the simulated gyro, and in `imu.csv` of a drive.
+"""
+ADDING = """## Add an effect
+Write one file with a class like those in `whill_mjx/effects/`: parameters with their ranges, one method named after its
+place, and a `card` (`whill_mjx/effects/card.py`) that says what the loop may free, how large, and what the law forbids.
+
+- A file in this package is found by itself. Give the card an `order` after all others, and write this page again.
+- In another package, declare the class as an entry point of the group `whill_mjx.effects`. Every command then knows it.
+- In a program or notebook, call `whill_mjx.effects.register(MyEffect)`. Only this process then knows it.
+
+Simulator, vehicle files, fits and the closed loop know the effect by its name from then on.
+`tests/sysid/outside_effect.py` is a complete example.
 """
 CHANNELS = {
     "body v": ("m/s", 0.01), "body omega": ("rad/s", 0.02), "odometry v": ("m/s", 0.01),
@@ -97,22 +104,56 @@ DRIVE = (
 """Seconds, v and omega: straight, turn, curve, reverse, and a slow part that a dead zone swallows."""
 BASE = ("pid_drive", "forward_slip", "rolling_contact", "lateral_damping", "air_drag", "rolling_resistance",
         "torque_drive", "slip_traction", "odometry_lag")  # fmt: skip
+"""Effects without which the base models do not drive; the figure leaves them out."""
 
 
 def page() -> str:
     """docs/effects.md as text."""
     parts = [INTRODUCTION]
     for where in PLACES:
-        names = sorted(name for name, kind in EFFECTS.items() if place_of(make_effect(name)) == where)
-        rows = "\n".join(row(EFFECTS[name]) for name in names)
+        rows = "\n".join(row(kind) for kind in own_effects() if place_of(kind) == where)
         parts.append(f"## {HEADINGS[where]}\n| effect | equation | parameters | source |\n|---|---|---|---|\n{rows}\n")
-    return "\n".join([*parts, CLOSING])
+    looked_for = sorted((kind for kind in own_effects() if kind.card.variants), key=lambda kind: kind.card.order)
+    parts.append(CARDS + "".join(card_row(kind) for kind in looked_for))
+    parts.append(ALIKE + "".join(alike_row(kind.name, one) for kind in own_effects() for one in kind.card.alike))
+    limits = [f"- `{kind.name}`: {kind.card.limits}\n" for kind in own_effects() if kind.card.limits]
+    parts.append(LEFT_OUT + "".join(limits))
+    return "\n".join([*parts, ADDING])
+
+
+def own_effects() -> list[type[Effect]]:
+    """The effects of this package by name, without those of other installed packages."""
+    return [kind for kind in EFFECTS.values() if kind.__module__.startswith("whill_mjx.")]
+
+
+def card_row(kind: type[Effect]) -> str:
+    """One line of the table of what the closed loop looks for."""
+    scales = [Scale(spec, frozenset(describe(params))) for spec, params in map(preset, ("whill_cr_physical", "husky"))]
+    variants = next(found for scale in scales if (found := kind.card.variants_of(scale)))
+    frees = "<br>".join(", ".join(axis_in_words(kind.name, axis) for axis in one.axes) for one in variants)
+    laws = "; ".join(dict.fromkeys(one.says for one in kind.card.forbids))
+    sensor, alone = kind.card.sensor or "motor currents", "yes" if kind.card.shown_by_pose else "no"
+    return f"| `{kind.name}` | {frees} | {laws} | {sensor} | {alone} |\n"
+
+
+def axis_in_words(effect: str, axis: Axis) -> str:
+    """What an axis of a hypothesis does to its parameter at size 1."""
+    holder, _, field = axis.parameter.rpartition(".")
+    unit = parameters_of(EFFECTS[holder or effect])[field].unit.replace("-", "")
+    change = {"add": f"{axis.unit:+.3g} {unit}", "inverse": f"{axis.unit:.3g} {unit}",
+              "factor": f"times {math.exp(axis.unit):.3g}", "moment": f"{axis.unit:.3g} kg m over the mass",
+              "along": f"{axis.unit:+.3g} {unit}".strip() + " per size of the first"}[axis.form].strip()
+    notes = [text for text, holds in (("either way", axis.signed), ("form", axis.dependent)) if holds]
+    return f"`{axis.parameter}` {change}" + (f" ({', '.join(notes)})" if notes else "")
+
+
+def alike_row(name: str, one: Alike) -> str:
+    """One line of the table of effects that look alike."""
+    return f"| {', '.join(f'`{each}`' for each in (name, *one.names))} | {one.why} | {one.separated_by} |\n"
 
 
 def row(kind: type[Effect]) -> str:
     """One line of a table: name, first paragraph of the docstring, parameters and source."""
-    equation = " ".join(inspect.getdoc(kind).split("\n\n")[0].split())  # type: ignore[union-attr]
-    equation = equation.partition(" Source:")[0].partition(" Typical ")[0]
     texts = []
     for name, about in parameters_of(kind).items():
         low, high = kind.typical.get(name, (about.neutral, about.neutral))
@@ -121,12 +162,12 @@ def row(kind: type[Effect]) -> str:
             f"`{name}` [{about.unit}] {about.description}: {usual}; search {about.low:g} to {about.high:g}; "
             f"neutral {about.neutral:g}"
         )
-    cells = [f"`{kind.name}`", equation, "<br>".join(texts), kind.source]
+    cells = [f"`{kind.name}`", equation(kind), "<br>".join(texts), kind.source]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def shown_values(name: str) -> dict[str, float]:
-    """The end of each parameter's usual values that is further from neutral, or what SHOWN says."""
+    """The values of `SHOWN`, or the end of each parameter's usual values that is further from neutral."""
     if name in SHOWN:
         return SHOWN[name]
     about, values = parameters_of(EFFECTS[name]), {}
@@ -144,7 +185,8 @@ def signatures() -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
     """
     spec, params = preset("whill_cr_physical")
     model = build_model(spec)
-    names = [name for where in COLOURS for name in EFFECTS if name not in BASE and place_of(make_effect(name)) == where]
+    shown = [kind for kind in own_effects() if kind.name not in BASE]
+    names = [kind.name for where in COLOURS for kind in shown if place_of(kind) == where]
     have = {effect.name for effect in params.effects}
     params = replace(params, effects=(*params.effects, *(make_effect(name) for name in names if name not in have)))
 
@@ -190,7 +232,7 @@ def draw(path: Path) -> None:
     panels[0].set_title("the drive: commands", fontsize=9, loc="left")
     panels[0].legend(fontsize=7, loc="lower left", frameon=False)
     for panel, name, change in zip(panels[1:], names, difference, strict=False):
-        where = place_of(make_effect(name))
+        where = place_of(EFFECTS[name])
         strength = np.abs(change).max(0) / scales
         # A body channel unless the effect is in the sensors alone.
         channel = int(strength.argmax()) if where == "sensing" else int(strength[:2].argmax())

@@ -10,30 +10,35 @@ from bridge import ros
 
 TYPES = {"geometry_msgs/msg/Twist": "Twist", "geometry_msgs/msg/TwistStamped": "TwistStamped"}
 """Message types of commands, and the words for them on the command line."""
+UNKNOWN = "_UNKNOWN_"
+"""Part of the name that ROS gives to a node which it has not identified yet."""
 HEARD_DEPTH = 50
 """Commands that may wait to be heard, so that none of another node is overwritten by ours."""
-GUARD_DELAY = 0.15
-"""A zero that the guard has not reported after this time [s] came from somebody else; it reports each 50 ms."""
+GUARD_REPORTS = 3
+"""A zero that this many later reports of the guard do not count came from somebody else; it reports each 50 ms."""
+FORGET_REPORTS = 20
+"""Reports after which a zero of the guard that we never heard is taken for lost."""
 
 
 class Ear:
-    """Separates our own commands, the guard's zeros and the commands of other nodes; pure, with injected time.
+    """Separates our own commands, the guard's zeros and the commands of other nodes; pure.
 
-    ROS does not name the sender of a message. So we compare each command heard with those we sent, exactly; the guard
-    reports how many zeros it has sent.
+    ROS does not name the sender of a message. So we compare each command heard with those we sent, exactly. The guard
+    reports how many zeros it has sent. We count its reports instead of seconds, so a pause does no harm.
     """
 
     def __init__(self) -> None:
         self._own: deque[tuple[float, float]] = deque(maxlen=64)
-        self._unknown_zeros: deque[float] = deque()  # times of zeros that neither we nor the guard are known to send
+        self._reports = 0
         self._guard_zeros: int | None = None
-        self._reported: deque[float] = deque()  # times at which the guard reported a zero that we have not heard yet
+        self._unknown: deque[int] = deque()  # report number at each zero that neither we nor the guard is known to send
+        self._unheard: deque[int] = deque()  # report number at each zero of the guard that we have not heard yet
 
     def sent(self, v: float, omega: float) -> None:
         """Remember a command of ours."""
         self._own.append((v, omega))
 
-    def heard(self, now: float, v: float, omega: float) -> bool:
+    def heard(self, v: float, omega: float) -> bool:
         """Take a command from the topic; return whether another node surely sent it."""
         if (v, omega) in self._own:
             while self._own.popleft() != (v, omega):
@@ -41,25 +46,26 @@ class Ear:
             return False
         if v != 0 or omega != 0:
             return True
-        self._unknown_zeros.append(now)
+        self._unknown.append(self._reports)
         return False
 
-    def guard_reports(self, now: float, zeros: int) -> None:
+    def guard_reports(self, zeros: int) -> None:
         """Take the number of zeros that the guard has sent so far; a smaller number comes from a restarted guard."""
+        self._reports += 1
         before = zeros if self._guard_zeros is None else self._guard_zeros
-        self._reported.extend([now] * (zeros - before if zeros >= before else zeros))
+        self._unheard.extend([self._reports] * (zeros - before if zeros >= before else zeros))
         self._guard_zeros = zeros
 
-    def foreign_zero(self, now: float) -> bool:
+    def foreign_zero(self) -> bool:
         """Return whether a zero was heard that neither we nor the guard can have sent."""
-        while self._reported and self._unknown_zeros:
-            self._reported.popleft()
-            self._unknown_zeros.popleft()
-        while self._reported and now - self._reported[0] > 1.0:
-            self._reported.popleft()  # this one was lost on its way to us
-        if not self._unknown_zeros or now - self._unknown_zeros[0] < GUARD_DELAY:
+        while self._unheard and self._unknown:
+            self._unheard.popleft()
+            self._unknown.popleft()
+        while self._unheard and self._reports - self._unheard[0] > FORGET_REPORTS:
+            self._unheard.popleft()
+        if not self._unknown or self._reports - self._unknown[0] < GUARD_REPORTS:
             return False
-        self._unknown_zeros.clear()
+        self._unknown.clear()
         return True
 
 
@@ -123,8 +129,9 @@ class CommandListener:
             self._open(kind)
 
     def listeners(self) -> list[Endpoint]:
-        """Return who listens to commands, without the bridge's own nodes."""
-        return without(endpoints(self.node.get_subscriptions_info_by_topic(self.name)), *self._known)
+        """Return who listens to commands, without the bridge's own nodes and those whose name is not known yet."""
+        found = endpoints(self.node.get_subscriptions_info_by_topic(self.name))
+        return [endpoint for endpoint in without(found, *self._known) if UNKNOWN not in endpoint.node]
 
     def commanders(self) -> list[str]:
         """Return the names of all other nodes that publish commands; one guard beside us is not among them."""
@@ -151,7 +158,7 @@ class CommandListener:
             planar = message.twist if kind == "TwistStamped" else message
             self._on_command(planar.linear.x, planar.angular.z)
 
-        self.node.create_subscription(self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
+        ros.subscribe_own(self.node, self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
 
 
 class CommandTopic(CommandListener):

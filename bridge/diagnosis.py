@@ -27,10 +27,13 @@ class FrameLog:
 
     def __init__(self) -> None:
         self._frames: deque[tuple[float, float, float, int]] = deque()
+        self._began = math.inf
         self._lost: deque[tuple[float, int]] = deque()
 
     def frame(self, now: float, stamp: float, stamp_age: float, digest: int) -> None:
         """Add a message: time of receipt, its stamp, their difference on the camera's clock, a hash of its bytes."""
+        if not self._frames:
+            self._began = now
         self._frames.append((now, stamp, stamp_age, digest))
 
     def lost(self, now: float, count: int) -> None:
@@ -55,6 +58,10 @@ class FrameLog:
         times = [now for now, *_ in self._frames]
         gaps = sorted(after - before for before, after in zip(times, times[1:], strict=False))
         return 1 / max(gaps[3 * len(gaps) // 4], 1e-6) if len(gaps) >= 3 else len(times) / WINDOW
+
+    def is_full(self, now: float) -> bool:
+        """Return whether messages have come for as long as the window, so that their rate means something."""
+        return now - self._began >= WINDOW
 
     def silence(self, now: float) -> float:
         """Seconds since the last message of the window; infinite without one."""
@@ -106,6 +113,8 @@ class Evidence:
     """What is wrong with the guard."""
     silence: float = 0.0
     """Seconds since the last frame."""
+    settled: bool = True
+    """True where the camera has been there, and its frames have come, for long enough to judge their rate."""
     image_bytes: int = 0
     incompatible: bool = False
     """True where the image publisher's quality of service does not fit."""
@@ -138,7 +147,7 @@ def _camera_causes(evidence: Evidence) -> list[str]:
     if len(fitting) > 1:
         names = ", ".join(sorted(camera.node for camera in fitting))
         found.append(f"{topic} has {len(fitting)} publishers ({names}): their images mix; stop or remap all but one")
-    if not fitting or evidence.frames.count or evidence.starting:
+    if not fitting or evidence.frames.count or not evidence.settled:
         return found
     if evidence.incompatible:
         found.append(f"{topic}: the publisher's quality of service does not fit a best-effort, volatile reader: "
@@ -158,10 +167,11 @@ def _frame_causes(evidence: Evidence) -> list[str]:
         return [f"{topic}: the camera fell silent {evidence.silence:.1f} s ago"]
     if evidence.unusable:
         found.append(f"{topic}: {evidence.unusable}")
-    if frames.losses or (frames.rate < LOW_RATE * evidence.rate_hz and evidence.image_bytes > SHARED_MEMORY_LIMIT):
+    slow = evidence.settled and frames.rate < LOW_RATE * evidence.rate_hz
+    if frames.losses or (slow and evidence.image_bytes > SHARED_MEMORY_LIMIT):
         found.append(f"{topic}: {frames.rate:.1f} frames/s arrive and {frames.losses} were reported lost on the way in "
                      f"{WINDOW:.0f} s. {profile_remedy()}")
-    elif not evidence.starting and not evidence.pace_by_stamp and frames.rate < LOW_RATE * evidence.rate_hz:
+    elif slow and not evidence.pace_by_stamp:
         found.append(f"{topic}: {frames.rate:.1f} frames/s arrive, the policy needs {evidence.rate_hz:g}: raise the "
                      "camera's rate")
     if abs(frames.stamp_age) > evidence.stamp_limit:

@@ -30,11 +30,16 @@ WATCH_PERIOD = 0.01
 LOOK_PERIOD = 0.2
 """Seconds between two looks at the graph."""
 STATUS_PERIOD = 1.0
+PAUSE = (0.01, 0.06)
+"""Seconds after a frame between which there is time for housekeeping: the last command is out, the next frame far."""
+SILENCE = 0.3
+"""Seconds without a frame after which there is always time."""
 STARTING = 2.0
 """Seconds that the discovery of other nodes may take."""
 CLOCK_STEP = 0.1
 """Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
 NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
+NOT_ACTIVE = "not activated"
 GUARD_STOPPED = "the guard stopped the vehicle"
 
 
@@ -75,6 +80,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="drive although another node could send commands; when it does, it drives")
     parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on bridge/rearm")
+    parser.add_argument("--lifecycle", action="store_true",
+                        help="be a lifecycle node, which stands until it is configured and activated")
     parser.add_argument("--results", type=Path, help="JSON file for the counts of the drive, written at its end")
     inputs.add_options(parser)
     options = parser.parse_intermixed_args(arguments)
@@ -116,6 +123,8 @@ class DriveNode:
         self._heartbeat = node.create_publisher(String, ros.HEARTBEAT_TOPIC, ros.reliable())
         self._incompatible = self._said_driving = False
         self._started = time.monotonic()
+        self._camera_since = self._started
+        self._last_frame = self._looked = self._said = -math.inf
         self._clock_offset = time.time() - self._started
         self._reported: tuple[str, ...] = ()
         self._commanders: list[str] = []
@@ -125,19 +134,20 @@ class DriveNode:
         ros.subscribe_images(node, self._image_type, self._image_topic, self._on_image, self._on_incompatible,
                              self._on_lost)
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
-        node.create_subscription(String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
+        ros.subscribe_own(node, String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
         self._inputs.subscribe(node, self._on_input)
         self._chair = ChairGate(self.supervisor) if options.whill_state else None
         if self._chair is not None:
             node.create_subscription(ros.chair_state_type(), options.whill_state, self._on_chair, ros.best_effort(10))
         self._jump = self._watch_clock()
+        self._diagnose = ros.diagnostics(node)
+        if options.lifecycle:
+            self.supervisor.block(NOT_ACTIVE, True)
+            node.on_active_change = self._on_active_change
         self.supervisor.block(NO_BASE, True)
         self._on_watch()
-        self._on_look()
         ros.steady_timer(node, WATCH_PERIOD, self._on_watch)
         ros.steady_timer(node, BEAT_PERIOD, self._on_beat)
-        ros.steady_timer(node, LOOK_PERIOD, self._on_look)
-        ros.steady_timer(node, STATUS_PERIOD, self._on_status)
 
     def close(self) -> None:
         """Leave the vehicle standing, the base to its rider, and no guard behind."""
@@ -146,6 +156,10 @@ class DriveNode:
         if stop:
             self.commands.publish_stops()
         self.guard.close()
+
+    def _on_active_change(self, active: bool) -> None:
+        self.supervisor.block(NOT_ACTIVE, not active)
+        self._publish(self.controller.on_tick(time.monotonic()))
 
     def _watch_clock(self) -> Any:
         """Report jumps of the node's clock to the supervisor."""
@@ -161,7 +175,8 @@ class DriveNode:
         arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
                      "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
         return subprocess.Popen([sys.executable, "-m", "bridge.guard", *arguments, "--ros-args", "-r",
-                                 f"__ns:={self.node.get_namespace()}"], start_new_session=True)
+                                 f"__ns:={self.node.get_namespace()}"], start_new_session=True,
+                                cwd=Path(__file__).resolve().parents[1])  # so that -m finds this very package
 
     def _on_image(self, message: Any) -> None:
         now = time.monotonic()
@@ -173,6 +188,7 @@ class DriveNode:
             command = self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
                                                message.step, message.data)
         self._publish(command)
+        self._last_frame, self._incompatible = now, False
         digest = -self.supervisor.counts["unusable"] if self.controller.unusable else self.controller.digest
         self._frames.frame(now, stamp, age, digest)
 
@@ -186,19 +202,29 @@ class DriveNode:
         if self._chair is not None:
             self._chair.watch(now)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
-        if self._ear.foreign_zero(now):
+        if self._ear.foreign_zero():
             self.supervisor.foreign_command(now)
         self._publish(self.controller.on_tick(now))
+        since = now - self._last_frame
+        if PAUSE[0] <= since <= PAUSE[1] or since > SILENCE:
+            self._keep_house(now)
+
+    def _keep_house(self, now: float) -> None:
+        """Look at the graph and report, where it is time."""
+        if now - self._looked >= LOOK_PERIOD:
+            self._looked = now
+            self._on_look()
+        elif now - self._said >= STATUS_PERIOD:
+            self._on_status()
 
     def _on_command(self, v: float, omega: float) -> None:
-        now = time.monotonic()
-        if self._ear.heard(now, v, omega):
-            self.supervisor.foreign_command(now)
+        if self._ear.heard(v, omega):
+            self.supervisor.foreign_command(time.monotonic())
 
     def _on_guard(self, message: Any) -> None:
         now = time.monotonic()
         self.guard.heard(now, message.data)
-        self._ear.guard_reports(now, self.guard.zeros)
+        self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
             self.supervisor.fault(GUARD_STOPPED)
         self._guard_stops = self.guard.stops
@@ -246,14 +272,16 @@ class DriveNode:
             self._on_status()
 
     def _on_status(self) -> None:
+        self._said = time.monotonic()
         supervisor = self.supervisor
         state, reason, found = supervisor.state, supervisor.reason, causes(self._evidence())
-        status = {"state": state.value, "driving": state is State.DRIVING, "reason": reason, "holds": supervisor.holds,
-                  "causes": found, "counts": dict(supervisor.counts)}
+        status: dict[str, Any] = {"state": state.value, "driving": state is State.DRIVING, "reason": reason,
+                                  "holds": supervisor.holds, "causes": found, "counts": dict(supervisor.counts)}
         self._status.publish(self._string(data=json.dumps(status)))
+        text = ". ".join([f"{state.value}: {reason}" if reason else state.value, *found])
+        self._diagnose(state is State.DRIVING and not found, text, status["counts"])
         report = (state.value, reason, *found)
         if report != self._reported:
-            text = ". ".join([f"{state.value}: {reason}" if reason else state.value, *found])
             log = self.node.get_logger()
             log.warning(text) if reason or found else log.info(text)
         self._reported = report
@@ -262,12 +290,16 @@ class DriveNode:
         now = time.monotonic()
         self._frames.trim(now)
         cameras = endpoints(self.node.get_publishers_info_by_topic(self._image_topic))
+        if not cameras:
+            self._camera_since = now
+        settled = self._frames.is_full(now) if self._frames.count else now - self._camera_since > STARTING
         return Evidence(
             image_topic=self._image_topic, image_type=f"sensor_msgs/msg/{self._image_type.__name__}", cameras=cameras,
             frames=self._frames, rate_hz=self.controller.policy.contract.rate_hz, stamp_limit=self.options.stamp_age,
             command_topic=self.commands.name, command_type=self.commands.kind, listeners=self._listeners,
-            guard=self.guard.problem(now), silence=self._frames.silence(now), image_bytes=self.controller.image_bytes,
-            incompatible=self._incompatible, unusable=self.controller.unusable, blind=self.controller.is_blind,
+            guard=self.guard.problem(now), settled=settled, silence=self._frames.silence(now),
+            image_bytes=self.controller.image_bytes, incompatible=self._incompatible,
+            unusable=self.controller.unusable, blind=self.controller.is_blind,
             pace_by_stamp=self.options.pace == "stamp", commanders=self._commanders,
             starting=now - self._started < STARTING)
 
@@ -289,7 +321,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (PolicyFileError, ValueError) as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return 2
-    with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime) as node:
+    with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
         controller = Controller(policy, safety, on_blind=options.blind, pace_by_stamp=options.pace == "stamp",
                                 crop=options.crop and tuple(options.crop))
         drive = DriveNode(node, controller, options)

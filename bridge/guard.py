@@ -90,7 +90,7 @@ class GuardNode:
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
         self._beat = node.create_publisher(String, ros.GUARD_TOPIC, ros.reliable())
-        node.create_subscription(String, ros.HEARTBEAT_TOPIC, self._on_heartbeat, ros.reliable(10))
+        ros.subscribe_own(node, String, ros.HEARTBEAT_TOPIC, self._on_heartbeat, ros.reliable(10))
         ros.steady_timer(node, WATCH_PERIOD, self._on_watch)
         ros.steady_timer(node, BEAT_PERIOD, self._on_beat)
         ros.steady_timer(node, 0.1, self._on_look)
@@ -161,6 +161,7 @@ class GuardLink:
         self._start, self._process = start, None
         self._started = -self.RESTART
         self._heard: float | None = None
+        self._trusted = -self.STALE  # time of the last beat of a guard that hears us
         self._beat: dict[str, Any] = {}
 
     def keep(self, now: float) -> None:
@@ -172,8 +173,13 @@ class GuardLink:
     def heard(self, now: float, text: str) -> None:
         """Take a heartbeat of a guard."""
         beat = read_beat(text, topic=str, type=str, ready=bool, zeros=int, stops=int, hears=list)
-        if not beat or (beat["topic"] != self.topic and self._beat.get("topic") == self.topic):
-            return  # damaged, or of a second guard of another topic
+        if not beat:
+            return
+        ours = beat["topic"] == self.topic and self.session in beat["hears"]
+        if not ours and now - self._trusted < self.STALE:
+            return  # a second guard, such as that of an earlier node that was killed
+        if ours:
+            self._trusted = now
         self._heard, self._beat = now, beat
         self.zeros, self.stops = beat["zeros"], beat["stops"]
 

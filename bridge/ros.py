@@ -88,6 +88,12 @@ def subscription_events(**callbacks: Any) -> Any:
     return SubscriptionEventCallbacks(**callbacks)
 
 
+def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
+    """Subscribe to a topic between the bridge's own nodes, without the events that warn of unfit publishers."""
+    node.create_subscription(kind, topic, callback, profile,
+                             event_callbacks=subscription_events(use_default_callbacks=False))
+
+
 def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
                      incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
     """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
@@ -115,14 +121,62 @@ def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], 
                              event_callbacks=subscription_events(incompatible_qos=lambda _: None))
 
 
+def diagnostics(node: Any) -> Callable[[bool, str, dict[str, Any]], None]:
+    """Return a function that reports to /diagnostics; it does nothing where diagnostic_msgs is not installed."""
+    try:
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    except ImportError:
+        return lambda well, text, values: None
+    publisher = node.create_publisher(DiagnosticArray, "/diagnostics", reliable(10))
+
+    def report(well: bool, text: str, values: dict[str, Any]) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = node.get_clock().now().to_msg()
+        pairs = [KeyValue(key=name, value=str(value)) for name, value in values.items()]
+        level = b"\x00" if well else b"\x02"  # OK, ERROR
+        message.status = [DiagnosticStatus(level=level, name=full_name(node), message=text, values=pairs)]
+        publisher.publish(message)
+
+    return report
+
+
+def managed_node(name: str) -> Any:
+    """Return a lifecycle node; set its `on_active_change` to learn of activation and deactivation.
+
+    It begins unconfigured. What it needs is loaded before it exists, so configuring cannot fail.
+    """
+    from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+    class ManagedNode(LifecycleNode):
+        on_active_change: Callable[[bool], None] = staticmethod(lambda active: None)
+
+        def on_configure(self, state: Any) -> Any:
+            return TransitionCallbackReturn.SUCCESS
+
+        def on_activate(self, state: Any) -> Any:
+            self.on_active_change(True)
+            return super().on_activate(state)
+
+        def on_deactivate(self, state: Any) -> Any:
+            self.on_active_change(False)
+            return super().on_deactivate(state)
+
+        def on_shutdown(self, state: Any) -> Any:
+            self.on_active_change(False)
+            return TransitionCallbackReturn.SUCCESS
+
+    return ManagedNode(name, start_parameter_services=False)
+
+
 @contextmanager
-def node_session(name: str, arguments: list[str], realtime: int = 0) -> Iterator[Any]:
+def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bool = False) -> Iterator[Any]:
     """A ROS node whose process ends in order: SIGTERM and Ctrl-C leave `spin`, then the caller says goodbye.
 
     Args:
         name: node name.
         arguments: `--ros-args ...` of the command line, or empty.
         realtime: SCHED_FIFO priority of this process and its DDS threads; 0 leaves the normal scheduling.
+        managed: make it a lifecycle node.
     """
     if realtime:
         set_realtime(name, realtime)
@@ -134,7 +188,8 @@ def node_session(name: str, arguments: list[str], realtime: int = 0) -> Iterator
         raise SystemExit(f"{name}: {error}. The nodes need ROS 2 (Humble or newer) for Python. "
                          "Source your ROS installation, or run `pip install -e '.[ros]'` on x86-64.") from error
     rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node(name)
+    # no services to read and write parameters: each thing that the executor waits for makes every wait longer
+    node = managed_node(name) if managed else rclpy.create_node(name, start_parameter_services=False)
     try:
         yield node
     finally:

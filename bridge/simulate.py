@@ -30,8 +30,6 @@ LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
-E_STOP_PERIOD = 0.1
-"""Seconds between two heartbeats of the emergency stop, which is never pulled here."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,6 @@ class SimulateNode:
         self._e_stop = node.create_publisher(Bool, ros.E_STOP_TOPIC, ros.latched())
         kind = getattr(commands, options.command_type)
         node.create_subscription(kind, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
-        ros.steady_timer(node, E_STOP_PERIOD, lambda: self._e_stop.publish(Bool(data=False)))
         self.episodes: list[Episode] = []
         self.command_log: deque[tuple[float, float, float]] = deque(maxlen=LOG_LENGTH)
         """Steady time of receipt [s], v, omega."""
@@ -201,6 +198,8 @@ class SimulateNode:
 
     def _on_half_period(self) -> None:
         self._half += 1
+        if self._half % 2:
+            self._e_stop.publish(self._types[2](data=False))  # never pulled; between two images, not to delay one
         if self.finished_at is not None:
             return
         if self._frame is None:

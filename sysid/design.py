@@ -20,6 +20,7 @@ from sysid import command_line
 from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import DEFAULT, Criterion, propose
 from sysid.logs.manoeuvre_library import Limits
+from whill_mjx.fields import Field, check_table
 from whill_mjx.vehicle.specs import VehicleSpec
 
 
@@ -71,7 +72,7 @@ def main(config: DesignConfig) -> list[Path]:
     for number, plan in enumerate(chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
         command = plan.candidate.command
-        write_csv(path, COMMAND_HEADER, np.column_stack([command.t, command.v, command.omega]))
+        write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
     print(text(chosen, plans, space, before, config.criterion))
     paths.append(write_page(config.out.with_suffix(".html"), chosen, plans, space, before, limits, config))
@@ -82,20 +83,22 @@ def main(config: DesignConfig) -> list[Path]:
 
 def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, float]], Noise]:
     """Spec, parameters, known intervals and noise of a built-in vehicle, a vehicle file, or the folder of a fit."""
-    from whill_mjx.drive import find_vehicle
-    from whill_mjx.vehicle.vehicle_file import load_intervals
+    from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
     if not Path(name).is_dir():
-        spec, params = find_vehicle(name)
+        spec, params, _ = load_vehicle(name)
         return spec, params, load_intervals(name) if name.endswith(".toml") else {}, DEFAULT
     from sysid.pages.report import read_report
 
     report = read_report(Path(name))
     file = str(Path(name) / "vehicle.toml")
-    spec, params = find_vehicle(file)
-    scale = report["noise"]["scale"]
-    noise = Noise(np.array([scale[f"ground_truth.{key}"] for key in ("x", "y", "yaw")]),
-                  np.array([scale[f"odometry.{key}"] for key in ("x", "y", "yaw", "v", "omega")]), "fit")
+    spec, params, _ = load_vehicle(file)
+    outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
+        ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))
+    fields = [Field(key, "SI", 1e-12, 1e6, remedy="Fit the log again.") for key in (*outside, *own)]
+    found = report["noise"].get("scale")
+    scale = check_table(str(Path(name) / "report.json"), fields, found, "noise.scale", others=True)
+    noise = Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
     return spec, params, load_intervals(file), noise
 
 

@@ -28,6 +28,7 @@ from sysid.search.fitting import make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
 from whill_mjx.html import Section, html_page, paragraph, png, table
+from whill_mjx.logs.dataset import write_text
 
 KIND = "sysid-searches"
 
@@ -96,9 +97,7 @@ def write(out: Path, log: Log, traces: Sequence[Trace], names: Sequence[str]) ->
             "Medians over runs. Times are without compilation; a derivative counts one evaluation per parameter.",
             "dim"))],
         f"{device.device_kind}, {len(names)} parameters")
-    temporary = out / "searches.html.tmp"
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(out / "searches.html")
+    write_text(out / "searches.html", page)
 
 
 def cli() -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from whill_mjx.batch import make_batch as make_batch
     from whill_mjx.effects import EFFECTS as EFFECTS
     from whill_mjx.effects import make_effect as make_effect
+    from whill_mjx.effects import register as register
     from whill_mjx.env import make_env as make_env
     from whill_mjx.env import reset as reset
     from whill_mjx.env import step as step
@@ -52,6 +53,7 @@ _HOMES = {
     "set_values": "whill_mjx.vehicle.parameters",
     "EFFECTS": "whill_mjx.effects",
     "make_effect": "whill_mjx.effects",
+    "register": "whill_mjx.effects",
     "load_policy": "whill_mjx.evaluation.policy_file",
 }
 __all__ = list(_HOMES)

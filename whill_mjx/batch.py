@@ -22,6 +22,7 @@ from whill_mjx.env import (
     step_state,
     time_step,
 )
+from whill_mjx.fields import BATCH, check_fields
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
 from whill_mjx.world.randomize import randomize_params
 
@@ -54,6 +55,7 @@ class BatchEnv:
     start; for training. What fails is met more often so (cf. prioritised level replay, Jiang et al. 2021)."""
 
     def __post_init__(self) -> None:
+        check_fields("batch", BATCH, self)
         if not 0.0 <= self.second_tries < 1.0:
             raise ValueError(f"second_tries is {self.second_tries}: it is a share of episodes; use 0 to below 1.")
         if self.devices and self.count % len(self.devices):

@@ -44,7 +44,6 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.model import build_model
-from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams, VehicleState, parameters_of
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -90,7 +89,7 @@ def main(options: DriveOptions) -> Path:
     with refusing():
         commands = [command_table(name, options.scenario) for name in names]
         _check(options, names)
-        spec, params = find_vehicle(options.vehicle)
+        spec, params, _ = load_vehicle(options.vehicle)
         params = with_effects(params, options.effects)
     random = np.random.default_rng(options.seed)
     trials = [
@@ -114,14 +113,6 @@ def main(options: DriveOptions) -> Path:
         truth = {"vehicle": options.vehicle, "effects": " ".join(options.effects), "seed": options.seed}
         save_vehicle(partial / "vehicle.toml", spec, params, provenance=truth)
     return options.out
-
-
-def find_vehicle(name: str) -> tuple[VehicleSpec, VehicleParams]:
-    """Spec and parameters of a vehicle file (by its ending) or of a built-in vehicle."""
-    if name.endswith(".toml"):
-        spec, params, _ = load_vehicle(name)
-        return spec, params
-    return preset(name)
 
 
 def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:
@@ -262,7 +253,7 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     check_place("--out", options.out)
 
 
-def drive(options: DriveOptions) -> None:
+def drive_and_say(options: DriveOptions) -> None:
     """Drive, and say what to do with the dataset."""
     folder = main(options)
     count = len(list((folder / "trials").iterdir()))
@@ -271,7 +262,7 @@ def drive(options: DriveOptions) -> None:
 
 def cli() -> None:
     """Command line."""
-    run(DriveOptions, drive, __doc__, positional=False)
+    run(DriveOptions, drive_and_say, __doc__, positional=False)
 
 
 if __name__ == "__main__":

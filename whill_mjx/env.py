@@ -10,15 +10,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from whill_mjx.fields import ENV, check_fields
 from whill_mjx.tasks.starts import draw_start
 from whill_mjx.tasks.tasks import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
-from whill_mjx.vehicle.presets import preset
-from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
-from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle_file
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import pinhole, render
@@ -26,6 +25,9 @@ from whill_mjx.world.scene import Scene, clearance, collides, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode."""
+
+DEFAULT_VEHICLE = "whill_cr_ramp"
+"""The paper's identified WHILL with its ramp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +49,7 @@ class Env:
     (`whill_mjx.tasks.starts`)."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.exploring_starts <= 1.0:
-            raise ValueError(f"exploring_starts is {self.exploring_starts}: it is a share of episodes; use 0 to 1.")
+        check_fields("environment", ENV, self)
 
 
 @struct.dataclass
@@ -102,7 +103,7 @@ def make_env(
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
-    spec, params = load_vehicle(vehicle)
+    spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
     default = task.randomised and getattr(task, "name", "") == "corridor"
     env = Env(
         build_model(spec),
@@ -114,16 +115,6 @@ def make_env(
         exploring_starts,
     )
     return env, params
-
-
-def load_vehicle(vehicle: str | Path | None) -> tuple[VehicleSpec, VehicleParams]:
-    """Spec and parameters of a vehicle file or a preset; None: the paper's identified WHILL with its ramp."""
-    if vehicle is None:
-        return preset("whill_cr_ramp")
-    if Path(vehicle).suffix == ".toml":
-        spec, params, _ = load_vehicle_file(vehicle)
-        return spec, params
-    return preset(str(vehicle))
 
 
 def reset(env: Env, params: VehicleParams, key: jax.Array) -> tuple[State, TimeStep]:
@@ -148,7 +139,8 @@ def step(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tu
         env: static model and task.
         params: physical parameters of this instance.
         state: from `reset` or the previous `step`. After the end of an episode nothing moves any more.
-        action: (2,) normalised speed and yaw rate, each in [-1, 1].
+        action: (2,) normalised speed and yaw rate, each in [-1, 1]. One that is no number is standstill, and ends the
+            episode as `diverged`.
 
     Returns:
         Next state, and its time step with obs (H, W, 3) uint8 and reward ().
@@ -200,13 +192,13 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
 
 def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, Outcome]:
     """State and outcome after one environment step, without the image."""
-    command = scale_action(env.task, action)
+    command, unreadable = scale_action(env.task, action), jnp.isnan(action).any()
     if env.task.action_repeat == 1:
-        return _control_period(env, params, state, command)
+        return _control_period(env, params, state, command, unreadable)
 
     def repeat(carry, _):
         before, so_far = carry
-        after, outcome = _control_period(env, params, before, command)
+        after, outcome = _control_period(env, params, before, command, unreadable)
         outcome = dataclasses.replace(outcome, reward=so_far.reward + outcome.reward)
         return jax.tree.map(lambda old, new: jnp.where(before.done, old, new), carry, (after, outcome)), None
 
@@ -214,10 +206,13 @@ def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array)
     return jax.lax.scan(repeat, carry, None, length=env.task.action_repeat)[0]
 
 
-def _control_period(env: Env, params: VehicleParams, state: State, command: jax.Array) -> tuple[State, Outcome]:
-    """One control period, its reward and whether it ended the episode."""
+def _control_period(
+    env: Env, params: VehicleParams, state: State, command: jax.Array, unreadable: jax.Array
+) -> tuple[State, Outcome]:
+    """One control period, its reward and whether it ended the episode; an `unreadable` action () ends it."""
     task = env.task
     vehicle = drive(env.model, params, state.vehicle, command)
+    vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
     x, y, yaw = reference_pose(env.model, vehicle.qpos)
     distance = jnp.linalg.norm(goal_position(state.scene) - jnp.stack([x, y]))
     collided = collides(footprint(env.model.spec, x, y, yaw), state.scene.boxes) & ~vehicle.diverged

@@ -297,11 +297,9 @@ class Options:
 def main(options: Options) -> None:
     """Export, check and say what was written."""
     from whill_mjx.logs.manoeuvres import Scenario, command_table
-    from whill_mjx.vehicle.presets import preset
 
     with refusing():
-        named = options.vehicle.endswith(".toml")
-        spec, params = load_vehicle(options.vehicle)[:2] if named else preset(options.vehicle)
+        spec, params, _ = load_vehicle(options.vehicle)
     folder = export(spec, params, options.out, options.physics_dt)
     print(f"wrote {', '.join(str(folder / name) for name in FILES)}")
     if options.check:

@@ -70,7 +70,6 @@ from whill_mjx.learning.setup import (
 from whill_mjx.learning.shaping import SAFETY, Step, find_safety
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
-from whill_mjx.vehicle.presets import preset as vehicle_preset
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -302,11 +301,7 @@ def choose_preset(options: TrainOptions) -> Preset:
 
 def given_vehicle(options: TrainOptions) -> Vehicle | None:
     """The vehicle that the options name; None if they name none. A bad file is refused before anything is written."""
-    if options.vehicle is None:
-        return None
-    if options.vehicle.suffix == ".toml":
-        return load_vehicle(options.vehicle)
-    return *vehicle_preset(str(options.vehicle)), {"preset": str(options.vehicle)}
+    return None if options.vehicle is None else load_vehicle(options.vehicle)
 
 
 def prepare_vehicle(

@@ -43,7 +43,7 @@ class Trial:
         try:
             self._folder = tempfile.TemporaryDirectory()  # empty: a network that names files beside itself finds none
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", PROGRAM], cwd=self._folder.name, env={**os.environ, "PYTHONPATH": path},
+                [sys.executable, "-c", PROGRAM], cwd=self._folder.name, env={**os.environ, "PYTHONPATH": path},
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         except OSError as error:
             raise PolicyFileError(f"the trial step of a policy cannot be run: {error}. It needs a process of its own "

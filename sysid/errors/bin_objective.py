@@ -24,6 +24,7 @@ from sysid.errors.space import STEP, Space
 from sysid.logs.log import Trial
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import on_processor
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 from sysid.search import least_squares
 
@@ -112,13 +113,12 @@ class FeatureObjective:
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K C) and their derivatives by u (N, B, K C, P): differences over a share of each range."""
         count, size = u.shape
-        ends = [np.clip(u[:, None, :] + sign * STEP * np.eye(size), 0.0, 1.0) for sign in (1, -1)]  # (N, P, P)
-        at = self.simulate(np.concatenate([u, *(end.reshape(-1, size) for end in ends)]))
+        pairs = Quotients.central(u, STEP)
+        at = self.simulate(np.concatenate([u, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)]))
         white = self._white(at)
         high, low = white[count:].reshape(2, count, size, *white.shape[1:])
         lost = _bad(at[:count])[:, None] | _bad(at[count:]).reshape(2, count, size, -1, 1).any(0)
-        slope = (high - low) / np.einsum("npp->np", ends[0] - ends[1])[..., None, None]
-        slope = np.moveaxis(np.where(lost, 0.0, slope), 1, -1)
+        slope = np.where(np.moveaxis(lost, 1, -1), 0.0, pairs.slopes(high, low))
         if self.prior is None:
             return white[:count], slope
         known = np.tile(np.diag(self.prior.slope), (count, 1, 1))

@@ -18,6 +18,7 @@ import numpy as np
 from sysid.errors.robust import huber_weight, robust_cost
 from sysid.errors.space import STEP, Space
 from sysid.replay.cores import on_processor
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 
 DRIVES = 32768
@@ -70,16 +71,15 @@ class Sums:
 
         def quadratic(u: jax.Array, arrays: Any, robust: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             size = u.shape[0]
-            up, down = (jnp.clip(u + sign * STEP * jnp.eye(size), 0.0, 1.0) for sign in (1, -1))
-            white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], up, down]), arrays)
-            width = jnp.diagonal(up - down)
-            slope = (white[1 : 1 + size] - white[1 + size :]) / width[:, None, None]  # (P, B, K)
+            pairs = Quotients.central(u, STEP)
+            white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], pairs.points]), arrays)
+            slope = pairs.slopes(white[1 : 1 + size], white[1 + size :])  # (B, K, P)
             lost = bad[:1] | bad[1 : 1 + size] | bad[1 + size :]
-            slope = jnp.where(lost[..., None] | ~jnp.isfinite(slope), 0.0, slope)
+            slope = jnp.where(lost.T[:, None] | ~jnp.isfinite(slope), 0.0, slope)
             weight = jnp.where(robust, huber_weight(white[0]), 1.0)
             with jax.default_matmul_precision("highest"):
-                gradient = jnp.einsum("pbk,bk->p", slope, white[0] * weight)
-                hessian = jnp.einsum("pbk,qbk->pq", slope, slope * weight)
+                gradient = jnp.einsum("bkp,bk->p", slope, white[0] * weight)
+                hessian = jnp.einsum("bkp,bkq->pq", slope, slope * weight[..., None])
             return robust_cost(white[0], robust), gradient, hessian
 
         self._functions = {"cost": jax.jit(jax.vmap(cost, in_axes=(0, None, None))),

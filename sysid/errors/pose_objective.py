@@ -20,7 +20,7 @@ import numpy as np
 from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.errors.prior import Prior
 from sysid.errors.robust import huber_weight
-from sysid.errors.space import Space
+from sysid.errors.space import Residuals, Space
 from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
 from sysid.replay.arrays import added, namespace
@@ -61,24 +61,14 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates")
 
 
-class Told(Protocol):
+class Told(Residuals, Protocol):
     """`Objective`, or `sysid.errors.bin_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
-
-    @property
-    def space(self) -> Space: ...
 
     @property
     def trials(self) -> tuple[Trial, ...]: ...
 
     @property
     def prior(self) -> Prior | None: ...
-
-    @property
-    def counted(self) -> int: ...
-
-    def residuals(self, u: np.ndarray) -> np.ndarray: ...
-
-    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
     def renewed(self, u: np.ndarray) -> Any: ...
 
@@ -226,17 +216,6 @@ class Objective:
         odometry = np.where(np.isfinite(scales[1]), np.maximum(scales[1], MIN_NOISE), self.noise.odometry)
         pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))
         return Noise(pose, odometry, "residuals")
-
-    def channel_residuals(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Whitened residual (B, M) of each channel at one point u (P,), nan where not measured."""
-        residual = self.residuals(u[None])[0]
-        pose_size = self.measured.pose[0].size
-        pose = residual[:, :pose_size].reshape(self.measured.pose.shape)
-        odometry_size = self.measured.odometry[0].size
-        odometry = residual[:, pose_size : pose_size + odometry_size].reshape(self.measured.odometry.shape)
-        columns = [*np.where(self._masks[0] > 0, pose, np.nan).transpose(2, 0, 1),
-                   *np.where(self._masks[1] > 0, odometry, np.nan).transpose(2, 0, 1)]
-        return dict(zip(self.noise.as_dict(), columns, strict=True))
 
     def bad(self, simulated: Simulated) -> Any:
         """(N, B) replays that diverged."""

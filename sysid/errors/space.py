@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -219,3 +219,20 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
 def is_delay(name: str) -> bool:
     """Whether a parameter shifts time: its error landscape has steps, so it is profiled on a grid as well."""
     return "delay" in name or "latency" in name
+
+
+class Residuals(Protocol):
+    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
+
+    One whose `equations` are not None has them summed up there.
+    """
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def counted(self) -> int: ...
+
+    def residuals(self, u: np.ndarray) -> np.ndarray: ...
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...

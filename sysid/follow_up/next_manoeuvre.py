@@ -26,12 +26,13 @@ from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit
 from sysid.missing.joint_fit import Start as FitStart
-from sysid.missing.refit import STEP_Q, Refitter
+from sysid.missing.refit import Refitter, own_sizes
 from sysid.missing.signatures import base_columns
 from sysid.pages.loop_page import command_of
+from sysid.replay.quotients import Quotients
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
-from whill_mjx.effects import EFFECTS
+from whill_mjx.effects import EFFECTS, card_of
 from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
 
@@ -48,28 +49,6 @@ HEADINGS = (0.0, 90.0, 180.0, 270.0)
 FRACTIONS = (1.0, 0.75, 0.5, 0.35, 0.2)  # of the time in motion, where the room is too small
 REFINED = 24  # drives for which the absorbed part is computed as well
 POLISH = 3  # iterations of the refit of a rival that the search has not refitted
-SENSORS = {
-    "command_delay": "a log of the commands as the vehicle receives them",
-    "command_dead_zone": "a log of the commands as the vehicle receives them",
-    "command_scale": "a log of the commands as the vehicle receives them",
-    "acceleration_limit": "a log of the wheel-speed targets inside the vehicle",
-    "jerk_limit": "a log of the wheel-speed targets inside the vehicle",
-    "actuator_lag": "motor currents",
-    "torque_saturation": "motor currents",
-    "supply_sag": "supply voltage and motor currents",
-    "drive_gain_difference": "motor currents of both sides",
-    "backlash": "encoders on the motors beside those on the wheels",
-    "wheel_radius_difference": "an outside pose",
-    "track_width": "an outside pose",
-    "odometry_scale": "an outside pose",
-    "sensor_delay": "an outside pose on the clock of the commands",
-    "clock_offset": "an outside pose on the clock of the commands",
-    "slope": "an inclinometer on the floor",
-    "wind": "an anemometer, or the same drive out of the wind",
-    "payload_shift": "scales under the wheels",
-    "traction_limit": "wheel encoders beside an outside pose",
-}
-"""What measures an effect by itself, where no drive separates it from another; motor currents for all other forces."""
 
 
 @dataclass(frozen=True)
@@ -286,10 +265,9 @@ def _white(result: Result, drives: Drives, series: np.ndarray) -> np.ndarray:
 
 def _own_columns(result: Result, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
     """(D, n, k) derivative of the white features by a rival's own coordinates, by differences."""
-    steps = STEP_Q * np.maximum(np.abs(fit.q), 1.0)
-    sets = [_values(result, fit.hypotheses, fit.u, fit.q + row) for row in np.diag(steps)]
-    seen = drives.simulate(np.stack(sets))
-    return np.stack([(_white(result, drives, one) - at) / steps[i] for i, one in enumerate(seen)], axis=-1)
+    own = Quotients.forward(fit.q, own_sizes(fit.q))
+    seen = drives.simulate(np.stack([_values(result, fit.hypotheses, fit.u, q) for q in own.above]))
+    return np.asarray(own.slopes(np.stack([_white(result, drives, one) for one in seen]), at))
 
 
 def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -346,9 +324,8 @@ def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, libr
 
 
 def sensor_for(a: str, b: str) -> str:
-    """What would separate two effects that no drive separates."""
-    known = [SENSORS[name] for name in (a, b) if name in SENSORS]
-    return known[0] if known else "motor currents, which show how much force the drives need"
+    """What separates two effects that no drive separates: a sensor that measures one of them by itself."""
+    return card_of(a).sensor or card_of(b).sensor or "motor currents, which show how much force the drives need"
 
 
 def write_next_command(out: Path, proposal: dict[str, Any] | None) -> Path | None:

@@ -30,8 +30,11 @@ from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.logs.log import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.models import with_effects
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import fitted_before, refit_poses
 from whill_mjx.effects import make_effect
@@ -51,7 +54,7 @@ LEAST_GAIN = 25.0
 """Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
 COMPACT = 0.75
 """Share of the table's held-back gain that few terms must reach to stand for it."""
-STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried
+CHOICES = tuple(Try(1.0, share) for share in (1.0, 0.5, 0.2))
 ROUNDS = 3  # Gauss-Newton steps
 
 
@@ -140,11 +143,11 @@ class Bench:
     def columns(self, table: Table, trials: Sequence[int]) -> np.ndarray:
         """(b, n, 2 KNOTS) change of the white features by each knot, per N and N m."""
         drives = self.part(trials)
-        sets = [self.values(self.u, table, row) for row in np.diag(self.sizes)]
+        own = Quotients.forward(np.zeros(2 * KNOTS), self.sizes)
+        sets = [self.values(self.u, table, row) for row in own.above]
         seen = drives.simulate(np.stack([self.values(self.u), *sets]))
         full = np.zeros((len(trials), *self.drives.mask.shape[1:], 2 * KNOTS))
-        for k in range(2 * KNOTS):
-            full[:, : seen.shape[2], :, k] = (seen[k + 1] - seen[0]) / self.sizes[k]
+        full[:, : seen.shape[2]] = own.slopes(seen[1:], seen[0])
         whole = replace(self.drives, weight=self.drives.mask[list(trials)])
         return self.white(whole, full)
 
@@ -267,20 +270,23 @@ def _replayed(
         penalty = np.zeros((size + basis.shape[1], size + basis.shape[1]))
         penalty[:size, :size] = precision
     columns = best.columns @ basis
-    u, wrench, now = bench.u.copy(), np.zeros(basis.shape[1]), result.search.base.residual
-    cost = before = float(np.square(now).sum())
+    design, now = np.concatenate([result.search.base.jacobian, columns], axis=-1), result.search.base.residual
+    start, free = np.concatenate([bench.u, np.zeros(basis.shape[1])]), np.full(basis.shape[1], np.inf)
+    low, high = np.concatenate([np.zeros(size), -free]), np.concatenate([np.ones(size), free])
+    solver = GaussNewton(BoxStep(-np.inf, np.inf, np.inf, ridge=1e-9), CHOICES, Patience(1e-3), (start, penalty),
+                         damping=0.0, least=0.0, most=0.0)
+    state = solver.init(start[None])._replace(cost=np.square(now).sum()[None])
+    before = float(state.cost[0])
     for _ in range(ROUNDS):
-        here = multiplied(now, result.search.base.jacobian, columns, groups)
-        at = np.concatenate([u - bench.u, wrench])
-        pulled = replace(here, moments=here.moments - penalty @ at / len(here.moments))
-        step = pulled.solve(penalty)
-        tries = [(np.clip(u + share * step[:size], 0.0, 1.0), wrench + share * step[size:]) for share in STEPS]
-        left = bench.residual([(one, basis @ each) for one, each in tries], table, best.phases)
+        steps = solver.tries(state, *solver.normal(-now, design[None], state.u))
+        steps = steps._replace(points=np.clip(steps.points, low, high))
+        left = bench.residual([(one[:size], basis @ one[size:]) for one in steps.points[0]], table, best.phases)
         costs = np.square(left).sum((1, 2))
-        index = int(np.nanargmin(costs))
-        if not costs[index] < cost * (1 - 1e-3):
+        after = solver.step(state, steps, costs[None])
+        if solver.done(after).all():
             break
-        (u, wrench), now, cost = tries[index], left[index], float(costs[index])
+        state, now = after, left[np.nanargmin(costs)]
+    u, wrench, cost = state.u[0, :size], state.u[0, size:], float(state.cost[0])
     coefficients = tuple(wrench[part] for part in parts) if chosen else ()
     more = 0.0
     if table.quantity in WHEELS:
@@ -320,9 +326,11 @@ def as_report(found: Unnamed) -> dict[str, Any]:
 
 
 def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
-    """The base model with the effect `unnamed`, at these values."""
+    """The base model with the effect `unnamed`, and with what a refit to poses added, at these values."""
     params = result.reference.params
     full = VehicleParams(params.body, (*params.effects, make_effect("unnamed")))
+    more = dict.fromkeys(name.partition(".")[0] for name in parameters if name not in describe(full))
+    full = with_effects(full, tuple(more))
     return set_values(full, list(parameters), jnp.asarray(list(parameters.values()), jnp.result_type(float)))
 
 

@@ -62,18 +62,17 @@ class Recorded(Replay):
 
 def candidate_objective(
     plant: Plant, apply: Callable[[Any], Any], space: Space, candidates: Sequence[Candidate], noise: Noise = DEFAULT,
-    channels: str = "both", at: np.ndarray | None = None,
+    channels: str = "both",
 ) -> Objective:
-    """Objective over candidates yet to be driven, at values `at` (P,), whose "measurements" are the replay there.
+    """Objective over candidates yet to be driven, whose "measurements" are the replay at the space's initial values.
 
     Args:
         apply: values (P,) -> the plant's parameters.
-        at: by default the space's initial values.
     """
     sigma = float(noise.pose[0]), float(noise.pose[2])
     trials = tuple(as_trial(candidate, channels=channels, sigma=sigma) for candidate in candidates)
     batch, blank = make_batch(trials, plant.dt)
-    replay = Recorded(Replay(plant, batch, apply), np.asarray(space.initial if at is None else at))
+    replay = Recorded(Replay(plant, batch, apply), np.asarray(space.initial))
     seen = replay.seen
     measured = Measured(np.asarray(seen.pose[0], float) * blank.pose_mask, blank.pose_mask,
                         np.asarray(seen.odometry[0], float) * blank.odometry_mask, blank.odometry_mask)

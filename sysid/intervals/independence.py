@@ -94,12 +94,8 @@ class Kind:
         return (self.sandwich.informed > 0.5) & (self.sandwich.freedom >= ENOUGH)
 
 
-def errors_of(evidence: Evidence, confidence: float = CONFIDENCE, seed: int = 0) -> Errors:
-    """The errors of estimates.
-
-    Args:
-        seed: of the signs of blocks.
-    """
+def errors_of(evidence: Evidence, confidence: float = CONFIDENCE) -> Errors:
+    """The errors of estimates."""
     hessian, inverse = evidence.blocks.sum((0, 1)), evidence.inverse
     independent = np.sqrt(np.diag(inverse @ hessian @ inverse) * evidence.variance)
     kinds = _kinds(evidence, inverse)
@@ -107,7 +103,7 @@ def errors_of(evidence: Evidence, confidence: float = CONFIDENCE, seed: int = 0)
     needed = np.zeros(len(inverse))
     for name, kind in kinds.items():
         found = []
-        for moved, scores in _flipped(evidence, kind, inverse, np.random.default_rng(seed)):
+        for moved, scores in _flipped(evidence, kind, inverse, np.random.default_rng(0)):
             reach = np.multiply(*_widest(kinds, scores, independent, confidence))
             found.append(np.abs(moved) / np.maximum(reach, 1e-300))
         if name != "manoeuvres":

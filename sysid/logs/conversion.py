@@ -12,7 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.logs.log import Log, Trial, load_log
+from sysid.logs.log import Log, PoseStream, Start, Trial, load_log
+from sysid.logs.metrics import relative_pose
 from sysid.logs.rosbag import Bag, find_bags, read_bag, stream_times
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
@@ -161,12 +162,13 @@ def cut(
         found[stream] = inside
     if "odometry" in found:
         found["odometry"][:, 3] = np.unwrap(found["odometry"][:, 3])
-        found["odometry"][:, 1:4] = _from_start(found["odometry"][:, 1:4])
+        pose = PoseStream(*found["odometry"][:, :4].T)
+        found["odometry"][:, 1:4] = relative_pose(pose, Start(*found["odometry"][0, 1:4]))
     if "ground_truth" in found:
-        pose = found["ground_truth"]
-        pose[:, 1] -= truth_ahead * np.cos(pose[:, 3])
-        pose[:, 2] -= truth_ahead * np.sin(pose[:, 3])
-        pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
+        truth = found["ground_truth"]
+        truth[:, 1] -= truth_ahead * np.cos(truth[:, 3])
+        truth[:, 2] -= truth_ahead * np.sin(truth[:, 3])
+        truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
     return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"))
 
 
@@ -210,7 +212,6 @@ def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def trial_drive(trial: Trial) -> Drive:
     """A trial in memory as tables; a window that starts in motion keeps its start pose as its first pose."""
-    command = np.column_stack([trial.command.t, trial.command.v, trial.command.omega])
     odometry = pose = None
     if trial.odometry is not None:
         source = trial.odometry
@@ -224,7 +225,7 @@ def trial_drive(trial: Trial) -> Drive:
         if pose[0, 0] > 1e-6:
             pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
         pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
-    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), command, odometry, pose)
+    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
 
 
 def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = ()) -> None:
@@ -280,14 +281,6 @@ def _increasing(t: np.ndarray) -> tuple[np.ndarray, int]:
             keep.append(i)
             latest = value
     return np.array(keep, int), len(t) - len(keep)
-
-
-def _from_start(pose: np.ndarray) -> np.ndarray:
-    """Poses (T, 3) seen from the first."""
-    x0, y0, yaw0 = pose[0]
-    dx, dy = pose[:, 0] - x0, pose[:, 1] - y0
-    cos, sin = np.cos(yaw0), np.sin(yaw0)
-    return np.column_stack([cos * dx + sin * dy, -sin * dx + cos * dy, pose[:, 2] - yaw0])
 
 
 def _integrate(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

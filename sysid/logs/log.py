@@ -6,10 +6,8 @@ reference point: the centre of the driven axle (the vehicle's centre for skid dr
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import re
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,24 +15,19 @@ from typing import Any
 
 import numpy as np
 
+from whill_mjx import fields as tables
+from whill_mjx.reading import read_csv as read_table
+from whill_mjx.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
 SCHEMA = 1
 STANDSTILL = 1.0
 """Longest part of a trial's start that is used to find its start pose [s]."""
 START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
-MAX_SPEED = 20.0  # m/s; more is km/h or mm/s
-MAX_YAW_RATE = 20.0  # rad/s; more is deg/s
-MAX_TIME = 1e7  # s; more is a Unix time stamp or milliseconds
 
 COMMAND_COLUMNS = ("t", "v", "omega")
 ODOMETRY_COLUMNS = ("t", "x", "y", "yaw", "v", "omega")
 POSE_COLUMNS = ("t", "x", "y", "yaw")
-FIELDS = {
-    "schema", "vehicle", "drive", "driven_axle", "wheel_radius", "track", "wheelbase", "mass", "command_limits",
-    "reference_point", "odometry", "ground_truth", "held_out",
-}
-REFERENCE_POINTS = ("drive axle centre", "vehicle centre")
 
 
 @dataclass(frozen=True)
@@ -44,6 +37,11 @@ class Command:
     t: np.ndarray  # (T,) s
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
+
+    @property
+    def table(self) -> np.ndarray:
+        """(T, 3) of t, v and omega."""
+        return np.column_stack([self.t, self.v, self.omega])
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,13 @@ class OdometryStream:
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 5) of x, y, yaw, v and omega; nan where not logged."""
+        absent = np.full(len(self.t), np.nan)
+        pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
+        return np.stack([*pose, self.v, self.omega], axis=-1)
+
 
 @dataclass(frozen=True)
 class PoseStream:
@@ -66,6 +71,11 @@ class PoseStream:
     x: np.ndarray  # (T,) m
     y: np.ndarray
     yaw: np.ndarray  # (T,) rad, unwrapped
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 3) of x, y and yaw."""
+        return np.stack([self.x, self.y, self.yaw], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -186,7 +196,7 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
 
 def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
-    held_out: bool = False, group: str = "",
+    held_out: bool = False,
 ) -> Trial:
     """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
     the odometry is counted from there.
@@ -211,7 +221,7 @@ def make_trial(
         yaw0 = odometry.yaw[rest].mean()
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
-    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out, group)
+    return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
 
 
 def manoeuvre_of(trial_name: str) -> str:
@@ -228,57 +238,25 @@ def standstill_end(command: Command) -> float:
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Columns of a CSV file as float arrays, checked for presence, numbers, time order and range."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: missing. A trial needs it with the columns {', '.join(columns)}.")
-    with open(path, newline="") as file:
-        rows = list(csv.reader(file))
-    header = [name.strip() for name in rows[0]] if rows else []
-    for name in columns:
-        if name not in header:
-            raise ValueError(f"{path}: no column {name!r} (found {header}). It needs {', '.join(columns)} in SI units; "
-                             "see docs/log_format.md.")
-    if len(rows) < 3:
-        raise ValueError(f"{path}: {max(len(rows) - 1, 0)} rows of data; at least 2 are needed. "
-                         "Delete the empty trial or record it again.")
-    table = np.empty((len(rows) - 1, len(columns)))
-    for i, row in enumerate(rows[1:]):
-        for j, name in enumerate(columns):
-            k = header.index(name)
-            try:
-                table[i, j] = float(row[k])
-            except (ValueError, IndexError):
-                value = row[k] if k < len(row) else ""
-                raise ValueError(f"{path}, line {i + 2}: {name} is {value!r}; it must be a number. "
-                                 "Leave a missing sample's row out.") from None
-            if not np.isfinite(table[i, j]):
-                raise ValueError(f"{path}, line {i + 2}: {name} is {row[k]}; it must be finite. "
-                                 "Leave a missing sample's row out.")
-    data = {name: table[:, j] for j, name in enumerate(columns)}
-    _check_time(path, data["t"])
-    for name, limit, hint in (("v", MAX_SPEED, "m/s: is it in km/h or mm/s?"),
-                              ("omega", MAX_YAW_RATE, "rad/s: is it in deg/s?")):
-        if name in data and np.abs(data[name]).max() > limit:
-            worst = int(np.abs(data[name]).argmax())
-            raise ValueError(f"{path}, line {worst + 2}: {name} is {data[name][worst]:g}; at most {limit:g} is "
-                             f"plausible. Convert it to {hint}")
+    data = read_table(path, [tables.COLUMNS[name] for name in columns],
+                      f"missing. A trial needs it with the columns {', '.join(columns)}.", "See docs/log_format.md.")
+    line = data.pop("line")
+    back = np.flatnonzero(np.diff(data["t"]) <= 0)
+    if len(back):
+        row = int(back[0])
+        before, after = data["t"][row], data["t"][row + 1]
+        raise ValueError(f"{path}, line {line[row + 1]}: t goes from {before:g} to {after:g}; it must increase. "
+                         "Sort the rows, drop duplicates, and split the trial where its clock was set back.")
     return data
 
 
 def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, list[str]]:
     """Vehicle spec from the fields of dataset.toml, and notes on what had to be assumed."""
     name = fields["vehicle"]
-    sizes: dict[str, Any] = {}  # m, kg
-    for key, limit in (("wheel_radius", 2.0), ("track", 5.0), ("wheelbase", 10.0), ("mass", 1e4)):
-        if key not in fields:
-            if key in ("wheel_radius", "track") and name not in SPECS:
-                raise ValueError(f"{path}: no {key}. Add {key} = VALUE in metres, measured on the vehicle.")
-            continue
-        value = fields[key]
-        if not isinstance(value, int | float) or not value > 0:
-            raise ValueError(f"{path}: {key} is {value!r}; it must be a positive number (m, kg).")
-        if value > limit:
-            raise ValueError(f"{path}: {key} is {value:g}; at most {limit:g} is plausible. Use m and kg.")
-        sizes[key] = float(value)
+    sizes: dict[str, Any] = {field.name: fields[field.name] for field in tables.SIZES if field.name in fields}  # m, kg
+    for key in ("wheel_radius", "track"):
+        if key not in sizes and name not in SPECS:
+            raise ValueError(f"{path}: no {key}. Add {key} = VALUE in metres, measured on the vehicle.")
     changes: dict[str, Any] = {key: fields[key] for key in ("drive", "driven_axle") if key in fields}
     if name in SPECS:
         base, source = replace(SPECS[name], **sizes), f"that of {name}"
@@ -288,11 +266,8 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
     notes = [f"{key} is not in dataset.toml: {getattr(base, key):.3g} is assumed, {source}"
              for key in ("wheel_radius", "track", "wheelbase", "mass") if key not in sizes]
     if "command_limits" in fields:
-        limits = fields["command_limits"]
-        if not (isinstance(limits, list) and len(limits) == 2 and all(value > 0 for value in limits)):
-            raise ValueError(f"{path}: command_limits is {limits!r}; it must be [v, omega], both positive, "
-                             "in m/s and rad/s.")
-        changes.update(v_min=-float(limits[0]), v_max=float(limits[0]), omega_max=float(limits[1]))
+        v, omega = fields["command_limits"]
+        changes.update(v_min=-v, v_max=v, omega_max=omega)
     try:
         return replace(base, **changes), notes
     except ValueError as error:
@@ -303,44 +278,20 @@ def hash_files(folder: Path) -> str:
     """SHA-256 over names and contents of all data files of a dataset."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
-        if path.suffix in (".toml", ".csv", ".npz", ".gz"):
-            digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+        if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
+            digest.update(str(path.relative_to(folder)).encode() + b"\0")
+            with path.open("rb") as file:
+                while part := file.read(1 << 20):
+                    digest.update(part)
     return digest.hexdigest()
 
 
 def _read_fields(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: missing. A dataset needs it to name the vehicle, its geometry and the "
-                                "held-out trials; see docs/log_format.md.")
-    try:
-        fields = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not valid TOML ({error}). Strings need quotes, decimals a point.") from None
-    unknown = sorted(set(fields) - FIELDS)
-    if unknown:
-        raise ValueError(f"{path}: unknown field {unknown[0]!r} (known: {', '.join(sorted(FIELDS))}). "
-                         "Correct its spelling or remove it.")
-    if fields.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: schema is {fields.get('schema')!r}; this program reads schema {SCHEMA}. "
-                         "Write schema = 1 and follow docs/log_format.md.")
-    if not isinstance(fields.get("vehicle"), str) or not fields["vehicle"]:
-        raise ValueError(f"{path}: vehicle is {fields.get('vehicle')!r}; it must be a name or short description.")
-    point = fields.get("reference_point", REFERENCE_POINTS[0])
-    if point not in REFERENCE_POINTS:
-        raise ValueError(f"{path}: reference_point is {point!r} (known: {', '.join(REFERENCE_POINTS)}). "
-                         "Move the measured poses to one of them before writing the log.")
-    return fields
-
-
-def _check_time(path: Path, t: np.ndarray) -> None:
-    if np.abs(t).max() > MAX_TIME:
-        raise ValueError(f"{path}: t reaches {np.abs(t).max():g}; it must be in seconds from the trial's start. "
-                         "Subtract the first time stamp, and divide milli- or nanoseconds.")
-    steps = np.diff(t)
-    if (steps <= 0).any():
-        line = int(np.flatnonzero(steps <= 0)[0])
-        raise ValueError(f"{path}, line {line + 3}: t goes from {t[line]:g} to {t[line + 1]:g}; it must increase. "
-                         "Sort the rows, drop duplicates, and split the trial where its clock was set back.")
+    content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
+                              "see docs/log_format.md.", "Strings need quotes, decimals a point.")
+    schema = next(field for field in tables.DATASET if field.name == "schema")
+    tables.check(str(path), schema, content.get("schema"))  # before the fields, which follow from it
+    return tables.check_table(str(path), tables.DATASET, content)
 
 
 def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Command) -> None:

@@ -167,19 +167,16 @@ def make_command(name: str, v: float, omega: float, seconds: float, dt: float = 
     return Command(t, table[:, 0], table[:, 1])
 
 
-def as_trial(candidate: Candidate, heading: float = 0.0, channels: str = "both", sigma: tuple[float, float] = (0, 0)
-             ) -> Trial:
+def as_trial(candidate: Candidate, channels: str = "both", sigma: tuple[float, float] = (0, 0)) -> Trial:
     """A trial that is yet to be measured.
 
     Args:
-        heading: start heading in the room [rad].
         channels: "both", "odometry" or "ground_truth": what will be measured.
         sigma: noise of the outside pose [m], [rad], which the start pose is known by after a second of standstill.
     """
     t = np.arange(0.0, candidate.command.t[-1] + 1e-9, SAMPLE_DT)
     blank = np.zeros_like(t)
-    start = Start(yaw=heading, position_sigma=sigma[0] / math.sqrt(REST_SAMPLES),
-                  yaw_sigma=sigma[1] / math.sqrt(REST_SAMPLES))
+    start = Start(position_sigma=sigma[0] / math.sqrt(REST_SAMPLES), yaw_sigma=sigma[1] / math.sqrt(REST_SAMPLES))
     trial = Trial(candidate.name, candidate.name, candidate.command,
                   OdometryStream(t, blank, blank, blank, blank, blank), PoseStream(t, blank, blank, blank), start)
     if channels == "odometry":

@@ -10,8 +10,9 @@ both systems repeat the last value between updates.
 
 from __future__ import annotations
 
-import csv
-import gzip
+import io
+import warnings
+from array import array
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,20 @@ import numpy as np
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.streams import without_held
+from whill_mjx.fields import shown
+from whill_mjx.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
 DRIVE_ROWS = 40  # samples of one window (2 s)
+DRIVE_COLUMNS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
+MAX_NANOSECONDS = 86_400 * 10**9
+CONTINUOUS_COLUMNS = (
+    *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
+    "cmd_vel_omega")
+LARGEST = 1e6  # m, rad or rad/s that a measured value stays below
+CONVERT = "Convert the original again"
+ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
 MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
 # The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
@@ -101,13 +112,13 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
                 "pose_stamps": "receipt"})
 
 
-def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5), window: float = MRCLAM_WINDOW) -> Log:
+def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -> Log:
     """Load MRCLAM robots as consecutive windows in which the robot was commanded to move."""
     folder = Path(folder)
     trials: list[Trial] = []
     notes = []
     for robot in robots:
-        robot_trials, note = _mrclam_robot(folder, robot, window)
+        robot_trials, note = _mrclam_robot(folder, robot, MRCLAM_WINDOW)
         trials += robot_trials
         notes.append(note)
     return Log("mrclam", CREATE, tuple(trials), hash_files(folder), tuple(notes))
@@ -127,11 +138,14 @@ def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) ->
 
 def _drive_windows(path: Path, run: str, chained: bool
                    ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    with np.load(path, allow_pickle=False) as file:
-        missing = {"data", "columns"} - set(file.files)
-        if missing:
-            raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
-        data, columns = file["data"], [str(name) for name in file["columns"]]
+    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
+    missing = {"data", "columns"} - set(arrays)
+    if missing:
+        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
+    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
+    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
+        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
+                         f"of the {len(columns)} names in `columns`. {CONVERT}")
     index = {name: i for i, name in enumerate(columns)}
 
     def block(name: str) -> np.ndarray:
@@ -145,8 +159,10 @@ def _drive_windows(path: Path, run: str, chained: bool
     wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
     x, y, yaw = block("icp_x"), block("icp_y"), np.unwrap(block("icp_yaw"), axis=1)
     gyro = GYRO_SIGN.get(run, 1.0) * block("imu_yaw")
-    if not np.isfinite(data[:, [index[f"icp_x_{i}"] for i in range(DRIVE_ROWS)]]).all():
-        raise ValueError(f"{path}: icp_x is not finite. Convert the original again and leave out incomplete windows.")
+    for name in DRIVE_COLUMNS:
+        if not (np.abs(block(name)) < LARGEST).all():
+            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
+                             "incomplete windows.")
     length = DRIVE_STEP_ROWS if chained else 1
     t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
     trials, missed = [], []
@@ -208,28 +224,27 @@ def _chain(
 
 def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
     """Windows of the continuous log during its calibration phases (elsewhere a joystick drove and was not logged)."""
-    with gzip.open(path, "rt") as file:
-        rows = list(csv.DictReader(file))[1:]  # the first row is filler
+    columns, times, states = _read_rows(path)
 
     def column(name: str) -> np.ndarray:
-        if name not in rows[0]:
-            raise ValueError(f"{path}: no column {name!r} (found {sorted(rows[0])}). Convert the original again.")
-        return np.array([float(row[name] or "nan") for row in rows])
+        values = np.array(columns[name])
+        if (np.abs(values) >= LARGEST).any():
+            raise ValueError(f"{path}: {name} is {LARGEST:g} or more. {CONVERT}.")
+        return values
 
     spec = drive_spec(run)
-    time = np.array([int(float(row["ros_time"])) if "e" in row["ros_time"] else int(row["ros_time"].split(".")[0])
-                     for row in rows])
-    t = (time - time[0]) * 1e-9
-    calibrating = np.array([row["calib_state"] == "calib" for row in rows])
+    t = _nanoseconds(path, times)
+    calibrating = np.array(states)
     qx, qy, qz, qw = (column(f"icp_quat_{axis}") for axis in "xyzw")
     yaw = np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
     x, y = column("icp_pos_x"), column("icp_pos_y")
     wheel_v, wheel_omega = twist_from_wheels(spec, column("meas_left_vel"), column("meas_right_vel"))
     command_v, command_omega = column("cmd_vel_x"), column("cmd_vel_omega")
+    finite = np.isfinite([x, y, yaw, wheel_v, wheel_omega, command_v, command_omega]).all(axis=0)
     trials = []
     for number, begin in enumerate(np.arange(0.0, t[-1] - window, window)):
         inside = np.flatnonzero((t >= begin) & (t < begin + window))
-        if len(inside) < 10 or not calibrating[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
+        if len(inside) < 10 or not (calibrating & finite)[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
             continue
         first = inside[0]
         now = t[inside] - t[first]
@@ -243,6 +258,51 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
         start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
         trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run)))
     return trials, f"{run}: {len(trials)} windows of {window:g} s during calibration phases"
+
+
+def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
+    """Numbers by column (nan where there is none), times and whether calibrating, of a continuous log.
+
+    Its first row is filler and left out.
+    """
+    rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
+    header = next(rows, (0, []))[1]
+    for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):
+        if name not in header:
+            raise ValueError(f"{path}: no column {name!r} (found {shown(sorted(header))}). {CONVERT}.")
+    index = {name: header.index(name) for name in header}
+    columns: dict[str, array] = {name: array("d") for name in CONTINUOUS_COLUMNS}
+    times, states = [], []
+    for number, (line, row) in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"{path}, line {line}: has {len(row)} cells, the header {len(header)}. {CONVERT}.")
+        if number == 0:
+            continue
+        for name, values in columns.items():
+            try:
+                values.append(float(row[index[name]] or "nan"))
+            except ValueError:
+                raise ValueError(f"{path}, line {line}: {name} is {shown(row[index[name]])}; it must be a number. "
+                                 f"{CONVERT}.") from None
+        times.append(row[index["ros_time"]])
+        states.append(row[index["calib_state"]] == "calib")
+    if len(times) < 2:
+        raise ValueError(f"{path}: {len(times)} rows of data; at least 2 are needed. {CONVERT}.")
+    return columns, times, states
+
+
+def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
+    """Seconds (T,) from the first of the clock's times in nanoseconds, which do not run back."""
+    try:
+        time = [int(float(text)) if "e" in text else int(text.split(".")[0]) for text in texts]
+    except (ValueError, OverflowError):
+        raise ValueError(f"{path}: ros_time is not a number of nanoseconds in every row. {CONVERT}.") from None
+    if max(time) - min(time) > MAX_NANOSECONDS:
+        raise ValueError(f"{path}: ros_time spans more than a day. {CONVERT}.")
+    t = np.array([one - time[0] for one in time], float) * 1e-9
+    if (np.diff(t) < 0).any():
+        raise ValueError(f"{path}: ros_time runs backwards. {CONVERT}.")
+    return t
 
 
 def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
@@ -286,14 +346,20 @@ def thin(pose: PoseStream, spacing: float) -> PoseStream:
 
 def _read_gz(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
     path = folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz"
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: missing. Robots are 1 to 5; get the files from "
-                                "asrl.utias.utoronto.ca/datasets/mrclam and compress them with gzip.")
-    table = np.loadtxt(path)
-    if table.ndim != 2 or table.shape[1] != columns:
-        raise ValueError(f"{path}: {table.shape} values; {columns} columns are needed. Use the original file.")
+    text = read_gzip(path, "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam and "
+                           "compress them with gzip.", ORIGINAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused below
+            table = np.loadtxt(io.StringIO(text), ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path}: {str(error)[:LONGEST_REASON]}. {ORIGINAL}") from None
+    if table.shape[1] != columns or not len(table):
+        raise ValueError(f"{path}: {table.shape} values; {columns} columns are needed. {ORIGINAL}")
+    if not np.isfinite(table).all() or (np.abs(table[:, 1:]) >= LARGEST).any() or np.ptp(table[:, 0]) > LARGEST:
+        raise ValueError(f"{path}: values must be finite and below {LARGEST:g}. {ORIGINAL}")
     if (np.diff(table[:, 0]) < 0).any():
-        raise ValueError(f"{path}: time runs backwards. Use the original file.")
+        raise ValueError(f"{path}: time runs backwards. {ORIGINAL}")
     return table
 
 

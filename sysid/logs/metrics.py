@@ -38,11 +38,6 @@ def rmse(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Angle in (-pi, pi]: a difference of headings, whatever full turns either side counted."""
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-
 def score(trial: Trial, prediction: Prediction) -> dict[str, Errors]:
     """Errors per channel ("ground_truth", "odometry") of those that were measured."""
     scores = {}
@@ -182,12 +177,7 @@ def _relative(trial: Trial, channel: str) -> tuple[np.ndarray, np.ndarray] | Non
         if trial.ground_truth is None:
             return None
         return trial.ground_truth.t, relative_pose(trial.ground_truth, trial.start)
-    odometry = trial.odometry
-    if odometry is None:
-        return None
-    absent = np.full(len(odometry.t), np.nan)
-    columns = [absent if values is None else values for values in (odometry.x, odometry.y, odometry.yaw)]
-    return odometry.t, np.stack([*columns, odometry.v, odometry.omega], axis=-1)
+    return None if trial.odometry is None else (trial.odometry.t, trial.odometry.values)
 
 
 def _arc(v: np.ndarray, omega: np.ndarray, yaw: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from whill_mjx.reading import LONGEST_REASON
+
 TOPICS = {
     "command": ("/whill/controller/cmd_vel", "/cmd_vel", "/whill/cmd_vel"),
     "odometry": ("/whill/odom", "/odom", "/whill/odometry"),
@@ -75,7 +77,7 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
         ValueError: naming the file, the topic, the rule and the remedy.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ValueError(f"{path}: reading ROS bags needs the package rosbags ({error}). "
@@ -93,12 +95,15 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
                 stream = names[connection.topic]
                 rows[stream].append((received * 1e-9, header_time(message), read_message(
                     path, connection.topic, stream, short_type(connection.msgtype), message)))
-    except (AnyReaderError, OSError, KeyError, AssertionError) as error:
-        raise ValueError(f"{path}: cannot be read as a ROS bag ({error}). Give the folder with metadata.yaml, or a "
-                         ".db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` repairs one.") from None
+    except Exception as error:  # the library lets out whatever a damaged recording leads to
+        if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
+            raise
+        raise ValueError(f"{path}: cannot be read as a ROS bag ({str(error)[:LONGEST_REASON]}). Give the folder with "
+                         "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` "
+                         "repairs one.") from None
     streams = {}
     for stream, topic in chosen.items():
-        table = np.array([values for _, _, values in rows[stream]], float).reshape(len(rows[stream]), -1)
+        table = np.array([values for _, _, values in rows[stream]], float).reshape(-1, len(COLUMNS[stream]))
         finite = np.isfinite(table).all(axis=1)
         if not finite.all():
             notes.append(f"{topic}: {(~finite).sum()} messages with numbers that are not finite are left out")

@@ -10,19 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
-from sysid.logs.scenarios import SCENARIOS, Scenario, command_sequence
 from sysid.replay.records import Plant
 from sysid.replay.rollout import make_batch, simulate, vehicle_plant
-from whill_mjx.logs.dataset import SensorNoise, write_csv, write_fields, write_text, write_trial
+from whill_mjx.logs.dataset import SensorNoise, write_fields, write_trial
+from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
 from whill_mjx.vehicle.specs import VehicleSpec
-
-__all__ = ["SensorNoise", "write_csv", "write_dataset", "write_text"]
 
 MEASUREMENT_DT = 0.05  # s
 
 
 def write_dataset(
-    folder: str | Path, spec: VehicleSpec, params: Any, *, manoeuvres: tuple[str, ...] = tuple(SCENARIOS),
+    folder: str | Path, spec: VehicleSpec, params: Any, *, manoeuvres: tuple[str, ...] = tuple(PAPER_MANOEUVRES),
     held_out: tuple[str, ...] = ("figure_eight",), replicates: int = 3, scenario: Scenario | None = None,
     noise: SensorNoise | None = None, seed: int = 0, plant: Plant | None = None,
 ) -> Path:
@@ -40,7 +38,7 @@ def write_dataset(
     plant = plant or vehicle_plant(spec)
     trials = []
     for manoeuvre in manoeuvres:
-        command = command_sequence(manoeuvre, scenario)
+        command = Command(*command_table(manoeuvre, scenario).T)
         t = np.arange(0.0, command.t[-1], MEASUREMENT_DT)
         for replicate in range(1, replicates + 1):
             x, y = random.uniform(-1.0, 1.0, 2)
@@ -55,11 +53,7 @@ def write_dataset(
     for i, trial in enumerate(trials):
         assert trial.ground_truth is not None
         count = len(trial.ground_truth.t)
-        write_trial(folder / "trials" / trial.name, trial.ground_truth.t, _columns(trial.command),
+        write_trial(folder / "trials" / trial.name, trial.ground_truth.t, trial.command.table,
                     simulated.pose[i, :count], simulated.odometry[i, :count], noise, random)
     write_fields(folder, spec, [trial.name for trial in trials if trial.manoeuvre in held_out])
     return folder
-
-
-def _columns(command: Command) -> np.ndarray:
-    return np.column_stack([command.t, command.v, command.omega])

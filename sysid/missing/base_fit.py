@@ -9,75 +9,51 @@ import numpy as np
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
 from sysid.missing.drives import Drives
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.search.result import Progress
 
-DAMPINGS = (0.1, 1.0, 10.0, 100.0)
-MAX_STEP = 0.3  # of the range, in one iteration
+CHOICES = tuple(Try(factor) for factor in (0.1, 1.0, 10.0, 100.0))
+PATIENCE = Patience(tolerance=1e-3, first=3)
 
 
 @dataclass(frozen=True)
 class BaseFit:
-    """The base model at its best."""
+    """Fits of the base model to drives: they minimise |W (f(u) - y)|^2 over the unit box."""
 
-    u: np.ndarray  # (P,) unit coordinates
-    cost: float
-    """Sum of squared white residuals and of the prior."""
+    drives: Drives
+    """Replays over exactly the parameters of `space`."""
+    space: Space
+    whitener: Whitener
+    sizes: np.ndarray
+    """(P,) over which derivatives are taken, in unit coordinates. Differences over what a day changes smooth out the
+    roughness of skids, and need no compilation of their own."""
 
+    def run(
+        self, start: np.ndarray, iterations: int, prior: tuple[np.ndarray, np.ndarray] | None = None,
+        progress: Progress | None = None,
+    ) -> np.ndarray:
+        """The best unit coordinates (P,), from a start (P,).
 
-def fit_base(
-    drives: Drives, space: Space, whitener: Whitener, start: np.ndarray, sizes: np.ndarray, iterations: int = 15,
-    tolerance: float = 1e-3, prior: tuple[np.ndarray, np.ndarray] | None = None,
-    progress: Progress | None = None,
-) -> BaseFit:
-    """Minimise |W (y - f(u))|^2 over the unit box.
-
-    Args:
-        drives: replays over exactly the parameters of `space`.
-        start: (P,) unit coordinates.
-        prior: mean (P,) and precision (P, P) of the unit coordinates.
-        sizes: (P,) over which derivatives are taken, in unit coordinates. Differences over what a day changes smooth
-            out the roughness of skids, and need no compilation of their own.
-    """
-    target, mask = drives.target, drives.mask
-    middle, precision = prior if prior is not None else (start, np.zeros((len(start), len(start))))
-
-    def penalty(u: np.ndarray) -> float:
-        return float((u - middle) @ precision @ (u - middle))
-
-    u, damping, cost = start.copy(), 1e-2, np.inf
-    for iteration in range(iterations):
-        value, slope = drives.linearised(space.to_values, u, sizes)
-        residual = whitener.apply(target - value, mask).reshape(-1)
-        jacobian = whitener.apply(slope, mask).reshape(len(residual), -1)
-        cost = float(residual @ residual) + penalty(u)
-        gradient, hessian = jacobian.T @ residual - precision @ (u - middle), jacobian.T @ jacobian + precision
-        tried = np.stack([_step(u, gradient, hessian, damping * factor) for factor in DAMPINGS])
-        values = drives.simulate(space.to_values(tried))
-        costs = [float(np.square(whitener.apply(target - one, mask)).sum()) + penalty(tried[i])
-                 for i, one in enumerate(values)]
-        best = int(np.argmin(costs))
-        if progress is not None:
-            progress(1, f"base fit, cost {min(cost, costs[best]) / (mask > 0).sum():.3f}")
-        if costs[best] < cost:
-            calm = cost - costs[best] < tolerance * cost
-            u, cost = tried[best], costs[best]
-            damping = float(np.clip(damping * DAMPINGS[best], 1e-7, 1e4))
-            if calm and iteration > 2:
+        Args:
+            prior: mean (P,) and precision (P, P) of the unit coordinates.
+        """
+        solver = GaussNewton(BoxStep(passes=1), CHOICES, PATIENCE, prior)
+        state, measured = solver.init(start[None]), float((self.drives.mask > 0).sum())
+        for _ in range(iterations):
+            at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)
+            residual = self._white(at[None])
+            jacobian = self.whitener.apply(slopes, self.drives.mask).reshape(1, -1, len(start))
+            state = state._replace(cost=solver.cost(residual, state.u))
+            tried = solver.tries(state, *solver.normal(residual, jacobian, state.u))
+            points = tried.points[0]
+            white = self._white(self.drives.simulate(self.space.to_values(points)))
+            state = solver.step(state, tried, solver.cost(white, points)[None])
+            if progress is not None:
+                progress(1, f"base fit, cost {state.cost[0] / measured:.3f}")
+            if solver.done(state).all():
                 break
-        elif damping >= 1e4:
-            break
-        else:
-            damping = min(damping * 100.0, 1e4)
-    return BaseFit(u, cost)
+        return np.asarray(state.u[0])
 
-
-def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float) -> np.ndarray:
-    """Damped Gauss-Newton point; parameters at a wall that would leave the box are held."""
-    free = ~((u <= 0.0) & (gradient < 0)) & ~((u >= 1.0) & (gradient > 0))
-    new = u.copy()
-    index = np.flatnonzero(free)
-    block = hessian[np.ix_(index, index)]
-    scale = np.diag(block) + 1e-6 * max(float(np.diag(hessian).max()), 1e-12)
-    step = np.linalg.solve(block + damping * np.diag(scale), gradient[index])
-    new[index] = np.clip(u[index] + np.clip(step, -MAX_STEP, MAX_STEP), 0.0, 1.0)
-    return new
+    def _white(self, features: np.ndarray) -> np.ndarray:
+        """White residuals (N, n) of features (N, B, K, C)."""
+        return np.stack([self.whitener.apply(one - self.drives.target, self.drives.mask).ravel() for one in features])

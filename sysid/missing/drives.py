@@ -13,10 +13,11 @@ import numpy as np
 from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import roughness
 from sysid.logs.log import Trial
-from sysid.missing.catalogue import ROUND
 from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
+from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.types import parameters_of
 
@@ -127,20 +128,16 @@ class Drives:
         odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
         return Simulated(pose, odometry, paths[of_trial, -1, 8])  # type: ignore[arg-type]
 
-    def differences(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-        """(B, K, 5, P) derivative by unit coordinates u (P,), by central differences of the given sizes.
-
-        Skidding wheels make the motion rough in its parameters: over the size of a day's change the mean slope counts.
-        `sets` turns unit coordinates (P,) into values of all replayed parameters.
-        """
-        return self.linearised(sets, u, sizes)[1]
-
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Features (B, K, 5) at u (P,), replayed together with their `differences` (B, K, 5, P)."""
-        points, spans = quotients(u, sizes)
-        at, *seen = self.simulate(np.stack([sets(point) for point in (u, *points)]))
-        return at, np.stack([(seen[2 * p] - seen[2 * p + 1]) / spans[p] for p in range(len(u))], axis=-1)
+        """Features (B, K, 5) at unit coordinates u (P,), and their derivatives (B, K, 5, P) by differences of the given
+        sizes: skidding wheels make motion rough, and over the size of a day's change the mean slope counts.
+
+        `sets` turns unit coordinates (P,) into values of all replayed parameters.
+        """
+        pairs = Quotients.central(u[None], sizes)
+        at, slopes = pairs.along(u[None], lambda points: self.simulate(np.stack([sets(point) for point in points])))
+        return at[0], slopes[0]
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
@@ -156,20 +153,6 @@ def began_at(trial: Trial) -> float:
     that its name counts. nan where the name counts none."""
     number = re.fullmatch(r".*_(\d{1,2})", trial.name)
     return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
-
-
-def quotients(u: np.ndarray, sizes: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
-    """Points (2 P of (P,)), above and below u in each of its P coordinates in turn, and how far each pair is apart."""
-    points, spans = [], []
-    for p in range(len(u)):
-        pair = []
-        for sign in (1, -1):
-            point = u.copy()
-            point[p] = np.clip(point[p] + sign * sizes[p], 0.0, 1.0)
-            pair.append(point)
-        points += pair
-        spans.append(float(pair[0][p] - pair[1][p]))
-    return points, spans
 
 
 def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],

@@ -17,7 +17,6 @@ from sysid.missing.catalogue import LEVELS, Hypothesis
 RIDGE = 1e-6
 
 
-
 @dataclass(frozen=True)
 class Columns:
     """Where the columns of one hypothesis at one level are."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, estimate_noise
@@ -16,6 +15,7 @@ from sysid.logs.metrics import replicate_noise
 from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 
@@ -31,30 +31,13 @@ class PoseReplay:
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replays with values (N, P) of the free parameters."""
-        return self.drives.replay(np.stack([self._set(row) for row in values]))
+        return self.drives.replay(np.stack([
+            with_values(self.held, self.drives.names, dict(zip(self.free, row, strict=True)))
+            for row in values.tolist()]))
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replays (N, B, ...) and their derivatives (N, B, ..., P) by central differences."""
-        sets = []
-        for row in values:
-            sets.append(row)
-            for p, step in enumerate(self.steps):
-                for sign in (1, -1):
-                    moved = row.copy()
-                    moved[p] += sign * step
-                    sets.append(moved)
-        each = 1 + 2 * len(self.steps)
-        seen = self.simulate(np.stack(sets))
-
-        def slope(leaf: np.ndarray) -> np.ndarray:
-            pairs = leaf.reshape(len(values), each, *leaf.shape[1:])[:, 1:]
-            spans = 2 * self.steps.reshape(1, -1, *(1,) * (leaf.ndim - 1))
-            return np.moveaxis((pairs[:, ::2] - pairs[:, 1::2]) / spans, 1, -1)
-
-        return jax.tree.map(lambda leaf: leaf[::each], seen), jax.tree.map(slope, seen)
-
-    def _set(self, values: np.ndarray) -> np.ndarray:
-        return with_values(self.held, self.drives.names, dict(zip(self.free, values.tolist(), strict=True)))
+        return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
 
 
 POOLED = 1.0

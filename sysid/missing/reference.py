@@ -18,7 +18,7 @@ from sysid.errors.noise import (
 )
 from sysid.errors.space import Space, make_space
 from sysid.logs.log import Log, Trial
-from sysid.missing.base_fit import fit_base
+from sysid.missing.base_fit import BaseFit
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
 from sysid.missing.drives import make_drives
 from sysid.replay.records import Plant
@@ -55,13 +55,13 @@ def make_reference(
     u = space.to_unit(space.initial)
     sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
     if not fitted:
-        u = fit_base(drives, space, whitener, u, sizes, iterations, progress=progress).u
+        u = BaseFit(drives, space, whitener, sizes).run(u, iterations, progress=progress)
     at = drives.simulate(space.to_values(u)[None])[0]
     factors = fit_roughness(drives.target - at, drives.mask, roughness(at, drives.features.width, spec.track))
     drives = drives.weighted(at, factors, spec.track)
     if not fitted:
         whitener = fit_whitener(drives.target - at, drives.mask)
-        u = fit_base(drives, space, whitener, u, sizes, max(iterations // 2, 3), progress=progress).u
+        u = BaseFit(drives, space, whitener, sizes).run(u, max(iterations // 2, 3), progress=progress)
     left = drives.target - drives.simulate(space.to_values(u)[None])[0]
     whitener = fit_whitener(left, drives.mask)
     days = np.zeros((len(logs), space.size))
@@ -71,10 +71,10 @@ def make_reference(
             index = np.flatnonzero(day == number)
             one = drives.of(log.training, plant.dt)
             one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
-            fit = fit_base(one, space, whitener, u, sizes, 6, prior=prior, progress=progress)
-            days[number] = fit.u - u
+            own = BaseFit(one, space, whitener, sizes).run(u, 6, prior, progress)
+            days[number] = own - u
             bins = one.target.shape[1]
-            left[index, :bins] = one.target - one.simulate(space.to_values(fit.u)[None])[0]
+            left[index, :bins] = one.target - one.simulate(space.to_values(own)[None])[0]
         shift = days.mean(0)  # the pooled fit weighs drives, not days
         u, days = np.clip(u + shift, 0.0, 1.0), days - shift
         factors = fit_roughness(left, drives.features.mask, roughness(at, drives.features.width, spec.track))

@@ -9,15 +9,20 @@ import numpy as np
 
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, difference_sizes
-from sysid.missing.drives import Drives, quotients
+from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit, Start
 from sysid.replay.cores import on_all_cores
+from sysid.replay.quotients import Quotients
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 
-TRIES = ((1.0, 1.0), (1.0, 0.3), (30.0, 1.0))
-"""Factors on the damping and shares of the step that are tried in one iteration."""
+CHOICES = (Try(1.0, easing=0.2), Try(1.0, 0.3, easing=0.2), Try(30.0, easing=6.0))
 TOLERANCE = 2e-3
 """Share of what is left above the noise that a step must bring to go on."""
+PROMISE = 0.6
+"""Share of the foretold fall of the cost that a step must bring, so that the base parameters' columns are kept."""
+STIFFEST = 1e4
+"""Damping beyond which one small gain ends a fit."""
 REACH = 4.0
 """Standard deviations of the day-to-day spread that a base parameter may be off. What lies further is an effect."""
 STIFF = 0.25
@@ -28,6 +33,11 @@ WHITENED = 16
 """Parameter sets whose features are made white in one call."""
 STEP_Q = 0.08
 """Difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small."""
+
+
+def own_sizes(q: np.ndarray) -> np.ndarray:
+    """(k,) steps of difference quotients of coordinates q (k,)."""
+    return np.asarray(STEP_Q * np.maximum(np.abs(q), 1.0))
 
 
 class Refitter:
@@ -81,62 +91,78 @@ class Refitter:
         The coordinates' columns are renewed in every iteration, those of the base parameters only where a step did not
         bring what they promised: a day moves them by percents, and they are the dearer ones.
         """
-        found, u = start.hypotheses, start.u.copy()
-        q = self._within(found, np.array(start.q, float))
-        slopes = self.white_slopes if start.slopes is None else start.slopes
-        fresh = start.slopes is not None or bool(np.allclose(u, self.reference.u))
-        damping, calm, stale = 1e-3, 0, False
-        white = yield self.values_at(found, u, q)[None]
-        residual, cost = self._left(white[0], u)
+        found, size = start.hypotheses, len(start.u)
+        solver = self._solver(found)
+        low, high = solver.box.low[size:], solver.box.high[size:]
+        state = solver.init(np.concatenate([start.u, np.clip(start.q, low, high)])[None])
+        jacobian = self.white_slopes if start.slopes is None else start.slopes
+        fresh, stale = start.slopes is not None or bool(np.allclose(start.u, self.reference.u)), False
+        residual = self.target - (yield self._sets(found, state.u))[0]
+        state = state._replace(cost=solver.cost(residual, state.u))
         for iteration in range(iterations + 1):
-            sets, steps = self._differences(found, u, q)
-            points, spans = quotients(u, difference_sizes(self.reference.spread)) if stale else ([], [])
-            sets += [self.values_at(found, point, q) for point in points]
-            columns = np.zeros((*residual.shape, 0))
-            if sets:
-                white = yield np.stack(sets)
-                at = self.target - residual
-                columns = np.stack([(white[i] - at) / steps[i] for i in range(len(q))], axis=-1) if len(q) else columns
-                if stale:
-                    pairs = white[len(q) :]
-                    slopes = np.stack([(pairs[2 * p] - pairs[2 * p + 1]) / span for p, span in enumerate(spans)], -1)
-                    fresh, stale = True, False
-            jacobian = np.concatenate([slopes, columns], axis=-1)
+            slopes = None if stale else jacobian[..., :size]
+            jacobian = yield from self._derivatives(found, state.u[0], residual, slopes)
+            fresh, stale = fresh or stale, False
             if iteration == iterations:
                 break
-            tried, promised = [], []
-            for factor, share in TRIES:
-                step, promise = self._step(found, u, q, residual, jacobian, damping * factor)
-                tried.append((np.clip(u + share * step[: len(u)], self.low, self.high),
-                              self._within(found, q + share * step[len(u) :])))
-                promised.append(promise * share * (2 - share))
-            white = yield np.stack([self.values_at(found, *each) for each in tried])
-            left = [self._left(one, tried[i][0]) for i, one in enumerate(white)]
-            best = int(np.nanargmin([each[1] for each in left]))
-            gained = cost - left[best][1]
-            kept = gained > 0.6 * promised[best]
-            if gained > 0:
-                (u, q), (residual, cost) = tried[best], left[best]
-                damping = max(damping * (0.2 if TRIES[best][0] == 1.0 else 6.0), 1e-6)
-            elif fresh:
-                damping *= 1e3
-            small = gained < TOLERANCE * max(cost - self._floor(), 1.0)
-            calm = calm + 1 if small and fresh else 0
-            if calm == 2 or (calm and damping > 1e4):
+            tried = solver.tries(state, *solver.normal(-residual, jacobian[None], state.u))
+            left = self.target - (yield self._sets(found, tried.points[0]))
+            costs = solver.cost(left, tried.points[0])
+            best = int(np.nanargmin(costs))
+            gained, small = float(state.cost[0] - costs[best]), solver.patience.scale(state.cost)[0]
+            state, residual = solver.step(state, tried, costs[None], fresh), left[best] if gained > 0 else residual
+            if not fresh:  # a small gain by old derivatives says nothing
+                state = state._replace(calm=np.zeros(1, int))
+            if solver.done(state).all() or (state.calm[0] and state.damping[0] > STIFFEST):
                 break
-            if kept and not small:
+            if gained > PROMISE * tried.promised[0, best] and gained >= small:
                 fresh = False
-            elif iteration < iterations - 1:
-                stale = True
-        return Refit(found, u, q, cost, residual, jacobian, self.values_at(found, u, q))
+            else:
+                stale = iteration < iterations - 1
+        u, q = state.u[0, :size], state.u[0, size:]
+        return Refit(found, u, q, float(state.cost[0]), residual, jacobian, self.values_at(found, u, q))
 
-    def _left(self, white: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
-        """White residual (B, n) and cost."""
-        residual = self.target - white
-        return residual, float(np.square(residual).sum() + self._prior(u))
+    def _solver(self, hypotheses: Sequence[Hypothesis]) -> GaussNewton:
+        """Of base parameters, then the coordinates of hypotheses."""
+        axes = [axis for one in hypotheses for axis in one.axes]
+        size, count = len(self.reference.u), len(self.reference.u) + len(axes)
+        low = np.concatenate([self.low, [-axis.limit if axis.signed else 0.0 for axis in axes]])
+        high = np.concatenate([self.high, [axis.limit for axis in axes]])
+        precision = np.zeros((count, count))
+        precision[:size, :size] = self.precision
 
-    def _floor(self) -> float:
-        return 0.5 * float((self.drives.mask > 0).sum())
+        def reach(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([np.full((len(x), size), 0.2), 0.7 * np.maximum(np.abs(x[:, size:]), 1.5)], axis=1)
+
+        noise = 0.5 * float((self.drives.mask > 0).sum())
+        return GaussNewton(
+            BoxStep(low, high, reach, passes=4, adapt=True, floor=0.0, ridge=1e-9), CHOICES,
+            Patience(TOLERANCE, times=2, noise=noise, least=1.0, failures=True),
+            (np.concatenate([self.reference.u, np.zeros(len(axes))]), precision),
+            damping=1e-3, least=1e-6, most=np.inf, stiffer=1e3)
+
+    def _sets(self, hypotheses: Sequence[Hypothesis], points: np.ndarray) -> np.ndarray:
+        """(N, all) parameter sets at points (N, P + k)."""
+        size = len(self.reference.u)
+        return np.stack([self.values_at(hypotheses, one[:size], one[size:]) for one in points])
+
+    def _derivatives(
+        self, hypotheses: Sequence[Hypothesis], x: np.ndarray, residual: np.ndarray, slopes: np.ndarray | None
+    ) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
+        """(B, n, P + k) derivatives of the white features at x (P + k,), those by base parameters anew where `slopes`
+        (B, n, P) is None."""
+        size = len(self.reference.u)
+        u, q = x[:size], x[size:]
+        own, base = Quotients.forward(q, own_sizes(q)), Quotients.central(u, difference_sizes(self.reference.spread))
+        sets = [self.values_at(hypotheses, u, point) for point in own.above]
+        if slopes is None:
+            sets += [self.values_at(hypotheses, point, q) for point in base.points]
+        elif not sets:
+            return slopes
+        white = yield np.stack(sets)
+        if slopes is None:
+            slopes = np.asarray(base.slopes(*np.split(white[len(q) :], 2)))
+        return np.concatenate([slopes, own.slopes(white[: len(q)], self.target - residual)], axis=-1)
 
     def white(self, series: np.ndarray) -> np.ndarray:
         """White and flat: (B, K, C, ...) -> (B, n, ...); or (N, B, K, C) -> (N, B, n)."""
@@ -149,10 +175,6 @@ class Refitter:
                              range(0, len(series), WHITENED))
         return np.moveaxis(np.concatenate(parts, axis=-1).reshape(mask.shape[0], -1, len(series)), -1, 0)
 
-    def _prior(self, u: np.ndarray) -> float:
-        difference = u - self.reference.u
-        return float(difference @ self.precision @ difference)
-
     def values_at(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
         """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
         values = self.values.copy()
@@ -164,54 +186,6 @@ class Refitter:
             values = with_values(values, self.names, one.values(part, base))
             start += len(one.axes)
         return values
-
-    def _differences(self, hypotheses: Sequence[Hypothesis], u: np.ndarray,
-                     q: np.ndarray) -> tuple[list[np.ndarray], list[float]]:
-        sets: list[np.ndarray] = []
-        steps: list[float] = []
-        for i in range(len(q)):
-            step = STEP_Q * max(abs(q[i]), 1.0)
-            moved = q.copy()
-            moved[i] += step
-            sets.append(self.values_at(hypotheses, u, moved))
-            steps.append(step)
-        return sets, steps
-
-    def _within(self, hypotheses: Sequence[Hypothesis], q: np.ndarray) -> np.ndarray:
-        axes = [axis for one in hypotheses for axis in one.axes]
-        low = np.array([-axis.limit if axis.signed else 0.0 for axis in axes])
-        return np.clip(q, low, np.array([axis.limit for axis in axes]))
-
-    def _step(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray, residual: np.ndarray,
-              jacobian: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
-        """Step (P + k,) within reach, and by how much it should lower the cost."""
-        size = len(u)
-        flat = jacobian.reshape(-1, jacobian.shape[-1])
-        matrix, right = flat.T @ flat, flat.T @ residual.reshape(-1)
-        matrix[:size, :size] += self.precision
-        right[:size] -= self.precision @ (u - self.reference.u)
-        diagonal = np.diag(matrix).copy()
-        damped = matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-        axes = [axis for one in hypotheses for axis in one.axes]
-        low = np.concatenate([self.low, [-axis.limit if axis.signed else 0.0 for axis in axes]])
-        high = np.concatenate([self.high, [axis.limit for axis in axes]])
-        at = np.concatenate([u, q])
-        free = ~((at <= low) & (right < 0)) & ~((at >= high) & (right > 0))
-        reach = np.concatenate([np.full(size, 0.2), 0.7 * np.maximum(np.abs(q), 1.5)])
-        step = np.zeros(len(at))
-        for _ in range(4):  # what would leave its range is held at its end, and the others are solved for again
-            index = np.flatnonzero(free)
-            if len(index) == 0:
-                break
-            held = right - damped @ np.where(free, 0.0, step)
-            step[index] = np.linalg.solve(damped[np.ix_(index, index)], held[index])
-            cut = np.clip(step, np.maximum(low - at, -reach), np.minimum(high - at, reach))
-            out = free & (cut != step)
-            step = cut
-            if not out.any():
-                break
-            free &= ~out
-        return step, float(2 * right @ step - step @ matrix @ step)
 
 
 def side_by_side(fits: Sequence[tuple[Refitter, Start]], iterations: int) -> list[Refit]:

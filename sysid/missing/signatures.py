@@ -28,7 +28,7 @@ def base_columns(drives: Drives, reference: Reference, values: np.ndarray, names
         row[[names.index(name) for name in space.names]] = space.to_values(u)
         return row
 
-    return drives.differences(sets, reference.u, difference_sizes(reference.spread))
+    return drives.linearised(sets, reference.u, difference_sizes(reference.spread))[1]
 
 
 def signature_columns(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
+from sysid.pages.html import Cell, Section, charts, html_page, paragraph, table
 from sysid.pages.svg import PALETTE, Line, line_chart
-from whill_mjx.html import Cell, Section, charts, html_page, paragraph, table
+from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed
 
@@ -77,10 +77,7 @@ def write_page(
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
                      f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(page, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, page)
     return path
 
 

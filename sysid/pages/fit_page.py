@@ -181,26 +181,18 @@ def profiles(report: dict[str, Any]) -> str:
 
 def trajectories(drawn: Sequence[TrialSeries]) -> str:
     """Paths of the outside pose, or of the odometry without one."""
-    items = []
-    for trial in drawn:
-        channel = _position_channel(trial)
-        if channel is not None:
-            items.append(line_chart([replay_line(values[:, 0], values[:, 1], name)
-                                     for name, values in channel.values.items()], "x [m]", "y [m]", _label(trial),
-                                    equal=True, smallest=SMALLEST))
+    items = [line_chart([replay_line(values[:, 0], values[:, 1], name) for name, values in channel.values.items()],
+                        "x [m]", "y [m]", _label(trial), equal=True, smallest=SMALLEST)
+             for trial in drawn if (channel := _position_channel(trial)) is not None]
     return _replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
                                             "pose. Held-out trials first.")
 
 
 def yaws(drawn: Sequence[TrialSeries]) -> str:
     """Yaw over time of the same trials."""
-    items = []
-    for trial in drawn:
-        channel = _position_channel(trial)
-        if channel is not None:
-            items.append(line_chart([replay_line(channel.t, values[:, 2], name)
-                                     for name, values in channel.values.items()], "t [s]", "yaw [rad]", _label(trial),
-                                    smallest=0.05))
+    items = [line_chart([replay_line(channel.t, values[:, 2], name) for name, values in channel.values.items()],
+                        "t [s]", "yaw [rad]", _label(trial), smallest=0.05)
+             for trial in drawn if (channel := _position_channel(trial)) is not None]
     return _replay_legend() + charts(items)
 
 

@@ -18,6 +18,7 @@ from sysid.search import starts
 from sysid.search.fitting import Fit, fit_log, predict
 from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
+from sysid.search.studies import without_secrets
 
 
 def make_report(
@@ -41,7 +42,8 @@ def make_report(
                     "notes": list(log.notes), "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out], **(source or {})},
         "code": code_hashes(),
-        "settings": {**asdict(config), "vehicle": None if config.vehicle is None else str(config.vehicle)},
+        "settings": {**asdict(config), "storage": without_secrets(config.storage),
+                     "vehicle": None if config.vehicle is None else str(config.vehicle)},
         "model": {"preset": config.preset if fit.model is None else fit.model.name,
                   "effects": [effect.name for effect in fit.params.effects]},
         "noise": {"source": fit.noise.source, "scale": fit.noise.as_dict()},

@@ -46,6 +46,12 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     return path
 
 
+def _label(axis: Any, title: str, across: str, up: str) -> None:
+    axis.set(title=title, xlabel=across, ylabel=up)
+    axis.legend(fontsize=8)
+    axis.grid(alpha=0.3)
+
+
 def _intervals(axis: Any, log: Log) -> None:
     """Distribution of the intervals between samples."""
     from matplotlib import ticker
@@ -62,11 +68,7 @@ def _intervals(axis: Any, log: Log) -> None:
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
     axis.xaxis.set_minor_formatter("{x:g}")
-    axis.set_xlabel("interval between samples [ms]")
-    axis.set_ylabel("share of intervals below")
-    axis.set_title("Sampling: an upright line is regular")
-    axis.legend()
-    axis.grid(alpha=0.3)
+    _label(axis, "Sampling: an upright line is regular", "interval between samples [ms]", "share of intervals below")
 
 
 def _velocities(axis: Any, log: Log) -> None:
@@ -83,11 +85,7 @@ def _velocities(axis: Any, log: Log) -> None:
     axis.plot([], [], "x", color="black", label="commanded")
     axis.axhline(0, color="black", linewidth=0.5)
     axis.axvline(0, color="black", linewidth=0.5)
-    axis.set_xlabel("v [m/s]")
-    axis.set_ylabel("omega [rad/s]")
-    axis.set_title("Excitation: empty regions are extrapolated")
-    axis.legend()
-    axis.grid(alpha=0.3)
+    _label(axis, "Excitation: empty regions are extrapolated", "v [m/s]", "omega [rad/s]")
 
 
 def _liveliest(axis: Any, log: Log) -> None:
@@ -107,11 +105,7 @@ def _liveliest(axis: Any, log: Log) -> None:
     held = np.maximum(command_in_force(trial.command, t), 0)
     axis.plot(t, (trial.command.omega if turning else trial.command.v)[held], color="black", linewidth=1.0,
               label="command")
-    axis.set_xlabel("t [s]")
-    axis.set_ylabel(label)
-    axis.set_title(f"Command and motion: {trial.name}")
-    axis.legend(fontsize=8)
-    axis.grid(alpha=0.3)
+    _label(axis, f"Command and motion: {trial.name}", "t [s]", label)
 
 
 def _spread(panels: Sequence[Any], found: dict[str, Any]) -> None:

@@ -56,7 +56,7 @@ from sysid.follow_up.trust import CONFIDENCE, beside_still_base, contradicted, i
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, own_floor
-from sysid.missing.catalogue import Hypothesis, base_values
+from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
 from sysid.missing.days import Reference
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.unexplained import held_back_gains
@@ -64,11 +64,10 @@ from sysid.pages.loop_page import describe_unnamed, sentence
 from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
-from sysid.verdict.falsifiers import FALSIFIERS
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
-from whill_mjx.effects import EFFECTS
+from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.types import parameters_of
 
@@ -117,7 +116,8 @@ def make_report(result: Result) -> dict[str, Any]:
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
                        for each in found.rounds],
-        "detectable": detectable(result, days), "lives_in": lives_in(result) if found.verdict == "unexplained" else [],
+        "detectable": detectable(result, days),
+        "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
@@ -243,8 +243,8 @@ def unit_of(parameter: str) -> str:
 
 
 def equation_of(one: Hypothesis) -> str:
-    """The first line of the effect's description, which is its equation."""
-    return (EFFECTS[one.effect].__doc__ or "").strip().splitlines()[0] if one.effect in EFFECTS else ""
+    """The equation of the effect."""
+    return equation(EFFECTS[one.effect]) if one.effect in EFFECTS else ""
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
@@ -294,12 +294,6 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
                     "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
                     "unit": unit_of(axis.parameter), "power": power})
     return out
-
-
-def lives_in(result: Result) -> list[dict[str, Any]]:
-    """Where the unexplained residual lives (`sysid.missing.unexplained`)."""
-
-    return where_it_lives(result)
 
 
 def base_table(result: Result) -> list[dict[str, Any]]:
@@ -367,7 +361,7 @@ def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Referen
         "catalogue": [{"effect": one.effect, "variant": one.variant, "kind": one.kind,
                        "axes": [asdict(axis) for axis in one.axes], "constants": dict(one.constants)}
                       for one in found],
-        "falsifiers": {name: [asdict(one) for one in each] for name, each in FALSIFIERS.items()},
+        "falsifiers": {name: [asdict(one) for one in each] for name, each in falsifiers().items()},
         "bounds": {name: [float(space.low[i]), float(space.high[i])] for i, name in enumerate(space.names)},
     }
 

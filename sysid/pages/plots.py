@@ -52,11 +52,7 @@ def write_plots(
                 axis.plot(across, up, STYLES[label], color=COLOURS[label], label=label,
                           linewidth=2.2 if label == "measured" else 1.3,
                           marker="." if sparse else None, markersize=3)
-            axis.set_title(trial.name + (" (held out)" if trial.held_out else ""), fontsize=9)
-            axis.set_xlabel("x [m]" if name == "trajectories" else "t [s]", fontsize=8)
-            axis.set_ylabel("y [m]" if name == "trajectories" else "yaw [rad]", fontsize=8)
-            axis.tick_params(labelsize=7)
-            axis.grid(alpha=0.3)
+            _label(axis, name, trial.name, trial.held_out)
             if name == "trajectories":
                 reach = np.array([-0.5, 0.5]) * SMALLEST_PANEL
                 axis.plot(trial.start.x + reach, trial.start.y + reach, alpha=0.0)
@@ -99,11 +95,7 @@ def write_paper_figures(
                 across, up = (table[:, 0], table[:, 1]) if kind == "trajectories" else (channel.t, table[:, 2])
                 axis.plot(across, up, STYLES[name], color=COLOURS[name], label=label,
                           linewidth=2.2 if name == "measured" else 1.3)
-            axis.set_title(manoeuvre.replace("_", " ") + (" (held out)" if trial.held_out else ""), fontsize=9)
-            axis.set_xlabel("x [m]" if kind == "trajectories" else "t [s]", fontsize=8)
-            axis.set_ylabel("y [m]" if kind == "trajectories" else "yaw [rad]", fontsize=8)
-            axis.tick_params(labelsize=7)
-            axis.grid(alpha=0.3)
+            _label(axis, kind, manoeuvre.replace("_", " "), trial.held_out)
             if kind == "trajectories":
                 axis.axis("equal")
         axes.flat[0].legend(fontsize=7)
@@ -111,6 +103,15 @@ def write_paper_figures(
         figure.savefig(paths[-1], dpi=150)
         pyplot.close(figure)
     return paths
+
+
+def _label(axis: Any, kind: str, title: str, held_out: bool) -> None:
+    """Title and axes of a panel of trajectories or of yaw."""
+    axis.set_title(title + (" (held out)" if held_out else ""), fontsize=9)
+    axis.set_xlabel("x [m]" if kind == "trajectories" else "t [s]", fontsize=8)
+    axis.set_ylabel("y [m]" if kind == "trajectories" else "yaw [rad]", fontsize=8)
+    axis.tick_params(labelsize=7)
+    axis.grid(alpha=0.3)
 
 
 def choose(trials: tuple[Trial, ...]) -> list[int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,21 @@ import numpy as np
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.pages.series import TrialSeries
+from whill_mjx.fields import Field, check_table, shown
 from whill_mjx.html import Section
+from whill_mjx.logs.dataset import write_text
+from whill_mjx.reading import read_json
 
 SCHEMA = 1
 KIND = "sysid-report"
+AGAIN = "Fit the log again."
+REPORT = tuple(
+    Field(name, kind=kind, remedy=AGAIN) for kind, names in (
+        ("table", ("dataset", "settings", "model", "noise", "summary", "search")),
+        ("list", ("parameters", "fixed", "errors")),
+    ) for name in names
+)  # fmt: skip
+"""Entries that every report has, as they are read."""
 REPLAYS = ("ideal", "initial", "fitted")
 
 
@@ -68,21 +78,17 @@ def summaries(rows: list[dict[str, Any]], trials: tuple[Trial, ...]) -> dict[str
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    _write(path, json.dumps(plain(report), indent=1) + "\n")
+    write_text(path, json.dumps(plain(report), indent=1) + "\n")
 
 
 def read_report(run: Path) -> dict[str, Any]:
     """Content of RUN/report.json; FileNotFoundError, ValueError where it is missing or none of a fit."""
     path = Path(run) / "report.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.")
-    try:
-        report: dict[str, Any] = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: not valid JSON ({error}). Fit the log again.") from None
+    report = read_json(path, "missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.", AGAIN)
     if report.get("kind") != KIND or report.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: kind {report.get('kind')!r}, schema {report.get('schema')!r}; this program reads "
-                         f"{KIND!r}, schema {SCHEMA}. Fit the log again.")
+        raise ValueError(f"{path}: kind {shown(report.get('kind'))}, schema {shown(report.get('schema'))}; this "
+                         f"program reads {KIND!r}, schema {SCHEMA}. {AGAIN}")
+    check_table(str(path), REPORT, report, others=True)
     return report
 
 
@@ -102,9 +108,14 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
     report = read_report(run)
     if series is None:
         series = load(run) if (run / FILE).is_file() else replay(run, report)
-    page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
-                     [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
-    return _write(run / "report.html", page)
+    try:
+        page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
+                         [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        raise ValueError(f"{run / 'report.json'}: is not whole, or not of this {FILE} ({type(error).__name__}: "
+                         f"{str(error)[:160]}). {AGAIN}") from error
+    write_text(run / "report.html", page)
+    return run / "report.html"
 
 
 def code_hashes() -> dict[str, str]:
@@ -123,13 +134,6 @@ def code_hashes() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
-
-
-def _write(path: Path, text: str) -> Path:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
-    return path
 
 
 def table(report: dict[str, Any]) -> str:

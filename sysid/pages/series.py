@@ -15,11 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import CHANNELS, ideal_replay
+from whill_mjx.reading import read_arrays
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")
 FILE = "series.npz"
+COLUMNS = {"ground_truth": 3, "odometry": 5}
+AGAIN = "Fit again; without the file, the trials are replayed."
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ def collect(
         for channel in CHANNELS:
             stream = getattr(trial, channel)
             if stream is not None:
-                channels[channel] = Channel(stream.t, {name: _table(getattr(source, channel))
+                channels[channel] = Channel(stream.t, {name: getattr(source, channel).values
                                                        for name, source in sources.items()})
         start = trial.start.x, trial.start.y, trial.start.yaw
         found.append(TrialSeries(trial.name, trial.held_out, start, channels))
@@ -91,13 +94,31 @@ def save(folder: Path, series: Sequence[TrialSeries]) -> Path:
 def load(folder: Path) -> list[TrialSeries]:
     """Series of a run folder; FileNotFoundError where it has none."""
     path = Path(folder) / FILE
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: missing. Fit again, or give the dataset, to replay the trials.")
-    with np.load(path, allow_pickle=False) as file:
-        return [TrialSeries(one["name"], one["held_out"], tuple(one["start"]), {
-            name: Channel(file[f"{index}.{name}.t"],
-                          {replay: file[f"{index}.{name}.{replay}"].astype(float) for replay in REPLAYED})
-            for name in one["channels"]}) for index, one in enumerate(json.loads(str(file["about"])))]
+    arrays = read_arrays(path, "missing. Fit again, or give the dataset, to replay the trials.", AGAIN)
+    try:
+        about = json.loads(str(arrays.pop("about")))
+        return [_trial_series(path, arrays, str(index), one) for index, one in enumerate(about)]
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: is not whole ({text[:160]!r}). {AGAIN}"
+                         ) from None
+
+
+def _trial_series(path: Path, arrays: dict[str, np.ndarray], index: str, about: dict[str, Any]) -> TrialSeries:
+    """The series of one trial, of the right shapes."""
+    channels = {}
+    for name in about["channels"]:
+        t = arrays[f"{index}.{name}.t"]
+        shape = (len(t), COLUMNS[name])
+        values = {replay: arrays[f"{index}.{name}.{replay}"] for replay in REPLAYED}
+        for replay, table in (("t", t[:, None]), *values.items()):
+            wanted = (len(t), 1) if replay == "t" else shape
+            if table.shape != wanted or table.dtype.kind != "f":
+                raise ValueError(f"{path}: {index}.{name}.{replay} is {table.dtype} of shape {table.shape}; it must be "
+                                 f"numbers of shape {wanted}. {AGAIN}")
+        channels[name] = Channel(t, {replay: table.astype(float) for replay, table in values.items()})
+    x, y, yaw = (float(value) for value in about["start"])
+    return TrialSeries(str(about["name"]), bool(about["held_out"]), (x, y, yaw), channels)
 
 
 def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
@@ -131,11 +152,3 @@ def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
     before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
                      for k in (0, 1))
     return collect(trials, before, after)
-
-
-def _table(stream: PoseStream | OdometryStream) -> np.ndarray:
-    absent = np.full(len(stream.t), np.nan)
-    columns = [absent if one is None else one for one in (stream.x, stream.y, stream.yaw)]
-    if isinstance(stream, OdometryStream):
-        columns += [stream.v, stream.omega]
-    return np.column_stack(columns)

@@ -36,7 +36,7 @@ def replay_line(x: np.ndarray, y: np.ndarray, replay: str) -> Line:
 
 
 def line_chart(
-    lines: Sequence[Line], x_label: str, y_label: str, title: str = "", *, equal: bool = False, log_y: bool = False,
+    lines: Sequence[Line], x_label: str, y_label: str, title: str = "", *, equal: bool = False,
     width: int = 360, height: int = 270, band: tuple[float, float] | None = None, smallest: float = 0.0,
 ) -> str:
     """SVG of lines over one another.
@@ -53,8 +53,6 @@ def line_chart(
     y = np.concatenate([*ys, list(band or [])])
     if not len(x):
         return f"<p>{escape(title)}: nothing to show.</p>"
-    if log_y:
-        y = np.log10(y[y > 0])
     x_range, y_range = _range(x, smallest), _range(y, smallest)
     inner_width, inner_height = width - LEFT - RIGHT, height - TOP - BOTTOM
     if equal:
@@ -72,21 +70,19 @@ def line_chart(
         top, bottom = float(down(band[1])), float(down(band[0]))
         parts.append(f'<rect class="band" x="{LEFT:.1f}" y="{top:.1f}" width="{inner_width:.1f}" '
                      f'height="{max(bottom - top, 0.5):.1f}"/>')
-    parts += _ticks(x_range, y_range, across, down, width, height, log_y)
+    parts += _ticks(x_range, y_range, across, down, width, height)
     for line in drawn:
-        values = np.where(line.y > 0, np.log10(np.where(line.y > 0, line.y, 1.0)), np.nan) if log_y else line.y
-        parts.append(_polyline(across(line.x), down(values), line))
+        parts.append(_polyline(across(line.x), down(line.y), line))
     parts += _legend([(line.label, line.colour, line.dash) for line in drawn if line.label], width)
     return _svg(width, height, parts)
 
 
 def bar_chart(
     names: Sequence[str], series: dict[str, Sequence[float]], y_label: str, title: str = "", *, log_y: bool = True,
-    width: int = 760, height: int = 300, colours: dict[str, str] | None = None,
+    width: int = 760,
 ) -> str:
     """SVG of grouped bars: one group per name, one bar per series; values that are not finite leave a hole."""
-    colours = colours or {**COLOURS, **{name: PALETTE[k % len(PALETTE)] for k, name in enumerate(series)
-                                        if name not in COLOURS}}
+    height, colours = 300, {**{name: PALETTE[k % len(PALETTE)] for k, name in enumerate(series)}, **COLOURS}
     values = np.array([list(one) for one in series.values()], float)  # (S, N)
     known = values[np.isfinite(values) & ((values > 0) | (not log_y))]
     if not len(known):
@@ -164,7 +160,7 @@ def _frame(width: float, height: float, title: str, x_label: str, y_label: str) 
 
 def _ticks(
     x_range: tuple[float, float], y_range: tuple[float, float], across: Scale, down: Scale, width: float,
-    height: float, log_y: bool,
+    height: float,
 ) -> list[str]:
     parts = []
     for tick in _nice_ticks(*x_range):
@@ -172,11 +168,10 @@ def _ticks(
         parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>'
                      f'<text class="tick" x="{x:.1f}" y="{height - BOTTOM + 12}" text-anchor="middle">'
                      f"{_number(tick)}</text>")
-    for tick in _log_ticks(*y_range) if log_y else _nice_ticks(*y_range):
+    for tick in _nice_ticks(*y_range):
         y = float(down(tick))
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-                     f'<text class="tick" x="{LEFT - 4}" y="{y + 3:.1f}" text-anchor="end">'
-                     f"{_number(10**tick if log_y else tick)}</text>")
+                     f'<text class="tick" x="{LEFT - 4}" y="{y + 3:.1f}" text-anchor="end">{_number(tick)}</text>')
     return parts
 
 

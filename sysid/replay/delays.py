@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from whill_mjx.effects import CommandDelay
+from whill_mjx.effects.command_delay import CommandDelay
 
 
 def without(params: Any, name: str) -> tuple[Any, Any]:

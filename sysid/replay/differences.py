@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,33 +21,16 @@ from sysid.errors.space import STEP, Space
 from sysid.logs.log import Trial
 from sysid.replay.courses import CourseReplay, make_courses
 from sysid.replay.models import Parameters, set_parameters
+from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Plant, Simulated
-
-
-class TracedReplay(Protocol):
-    """A replay that can be traced too: `sysid.replay.courses.CourseReplay`."""
-
-    @property
-    def drives(self) -> int: ...
-
-    @property
-    def states(self) -> int: ...
-
-    @property
-    def in_pieces(self) -> TracedReplay: ...
-
-    def simulate(self, values: np.ndarray) -> Simulated: ...
-
-    def traced(self, values: jax.Array) -> Simulated: ...
 
 
 @dataclass(frozen=True)
 class DifferenceReplay:
     """A replay whose Jacobian is that of central differences, one-sided at a bound: 2 P + 1 drives of each course."""
 
-    replay: TracedReplay
+    replay: CourseReplay
     space: Space
-    step: float = STEP
 
     @cached_property
     def compiled(self) -> dict[Any, Any]:
@@ -80,23 +63,8 @@ class DifferenceReplay:
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """Replay and derivatives (a last axis P) for each of values (N, P)."""
-        u = self.space.to_unit(values)
-        count, size = u.shape
-        ends = [np.clip(u[:, None, :] + sign * self.step * np.eye(size), 0.0, 1.0) for sign in (1, -1)]  # (N, P, P)
-        up, down = (self.space.to_values(end) for end in ends)
-        rows = np.concatenate([values, up.reshape(-1, size), down.reshape(-1, size)])
-        found = self.replay.simulate(rows)
-        width = np.einsum("npp->np", up - down)  # of each difference, in the parameter's unit
-
-        def slope(leaf: np.ndarray) -> np.ndarray:
-            leaf = np.asarray(leaf, float)
-            high, low = (leaf[count + k * count * size :][: count * size].reshape(count, size, *leaf.shape[1:])
-                         for k in (0, 1))
-            difference = (high - low) / width.reshape(count, size, *(1,) * (leaf.ndim - 1))
-            return np.moveaxis(difference, 1, -1)
-
-        at = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
-        return at, jax.tree.map(slope, found)
+        pairs = Quotients.central(self.space.to_unit(values), STEP).mapped(self.space.to_values)
+        return pairs.along(values, self.replay.simulate)
 
 
 def make_replay(

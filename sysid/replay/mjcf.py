@@ -29,6 +29,7 @@ from flax import struct
 
 from sysid.replay.mjcf_file import SERVO_GAIN, Entry, Robot, default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+from sysid.replay.rollout import quaternion_product
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
 @struct.dataclass
@@ -136,7 +137,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
         spin = jnp.stack([jnp.cos(turn / 2), 0 * turn, 0 * turn, jnp.sin(turn / 2)])
         arm = _rotate(spin, qpos[root : root + 3] - where)
         origin = jnp.stack([start[0] + arm[0], start[1] + arm[1], qpos[root + 2]])
-        attitude = _product(spin, qpos[root + 3 : root + 7])
+        attitude = quaternion_product(spin, qpos[root + 3 : root + 7])
         qpos = qpos.at[root : root + 3].set(origin).at[root + 3 : root + 7].set(attitude)
         return qpos, qvel.at[speed : speed + 3].set(_rotate(spin, qvel[speed : speed + 3]))
 
@@ -171,12 +172,6 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
         return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
 
     return place, substep, observe, move
-
-
-def _product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Rotation b, then a, as quaternions (w, x, y, z)."""
-    vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
-    return jnp.concatenate([(a[0] * b[0] - a[1:] @ b[1:])[None], vector])
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:

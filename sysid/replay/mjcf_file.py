@@ -13,6 +13,12 @@ import jax
 import mujoco
 import numpy as np
 
+from whill_mjx.fields import Field, check
+from whill_mjx.logs.dataset import write_text
+from whill_mjx.reading import MB, decoded, read_bytes
+
+MODEL_BYTES = 20 * MB
+TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_GAIN = 1.0  # N m s/rad of the velocity servos that a model without actuators gets
 FIELDS = {  # KIND, FIELD -> array of the model, column, unit
@@ -106,14 +112,14 @@ def load_robot(
     timestep: float | None = None,
 ) -> Robot:
     """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such model. Give an MJCF or URDF file.")
+    decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF or URDF file."))
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         joints = _wheel_joints(path, spec, wheels)
         _complete(path, spec, joints)
         if timestep is not None:
             spec.option.timestep = timestep
+        check(str(path), TIMESTEP, float(spec.option.timestep))
         host = spec.compile()
         data = mujoco.MjData(host)
         mujoco.mj_kinematics(host, data)
@@ -126,9 +132,10 @@ def load_robot(
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
-    except ValueError as error:
+    except (ValueError, KeyError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         text = str(error).strip()
-        raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}") from None
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}. Correct the "
+                         "model.") from None
     left = data.xanchor[ids[0]] - data.xanchor[ids[1]]
     distance = float(np.linalg.norm(left))
     left = left / distance
@@ -201,9 +208,7 @@ def write_mjcf(robot: Robot, values: Mapping[Entry, float], path: Path) -> Path:
         for number in entry.ids:
             _put(spec, entry, number, _Overlaid(host, arrays))
     spec.compile()
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(spec.to_xml())
-    os.replace(temporary, path)
+    write_text(path, spec.to_xml())
     return path
 
 

@@ -7,7 +7,6 @@ that act on commands or on what the odometry reports may be put around either.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +21,9 @@ from flax import struct
 from sysid.errors.space import LOG_SPAN, Space
 from sysid.logs.log import Trial
 from sysid.replay.records import Plant
-from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.effects.base import PLACES, apply_chain, place_of
+from whill_mjx.effects import EFFECTS, make_effects
+from whill_mjx.effects.base import apply_chain
+from whill_mjx.logs.dataset import write_text
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
@@ -105,10 +105,7 @@ def with_effects(params: Any, names: Sequence[str]) -> Any:
     for name in names:
         if name not in EFFECTS:
             raise ValueError(f"no effect {name!r} (known: {', '.join(EFFECTS)}). Correct --effects.")
-    added = [make_effect(name) for name in dict.fromkeys(names) if name not in have]
-    order = list(EFFECTS)
-    added.sort(key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name)))
-    params = VehicleParams(params.body, (*params.effects, *added))
+    params = VehicleParams(params.body, (*params.effects, *make_effects(name for name in names if name not in have)))
     about = {name: one for name, one in describe(params).items() if name.partition(".")[0] not in have | {"body"}}
     endless = [name for name, one in about.items() if not np.isfinite(one.neutral)]
     if not endless:
@@ -284,10 +281,8 @@ def save_model(
                     **({"interval": [float(end) for end in intervals[name]]} if name in intervals else {})}
              for (name, about), value in zip(describe_parameters(params).items(), values, strict=True)}
     path = Path(folder) / "model.toml"
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(tomlkit.dumps({"schema": 1, "kind": "micromobility-model", "model": model.name,
-                                        "parameters": table, "provenance": dict(provenance)}))
-    os.replace(temporary, path)
+    write_text(path, tomlkit.dumps({"schema": 1, "kind": "micromobility-model", "model": model.name,
+                                    "parameters": table, "provenance": dict(provenance)}))
     if model.write is not None:
         model.write(Path(folder), params)
     return path

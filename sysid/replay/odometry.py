@@ -7,7 +7,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.effects import PoseDelay, SensorDelay
+from whill_mjx.effects.pose_delay import PoseDelay
+from whill_mjx.effects.sensor_delay import SensorDelay
 
 
 def framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float) -> jax.Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -24,7 +25,8 @@ from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.delays import delayed, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, YAW_COLUMNS, Batch, Measured, Plant, Simulated
-from whill_mjx.effects import OdometryLag, SensorDelay
+from whill_mjx.effects.odometry_lag import OdometryLag
+from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.processor import as_one_function
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -44,7 +46,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
     from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose
     from whill_mjx.vehicle.model import build_model
 
-    config = config or VehicleConfig()
+    config = replace(config or VehicleConfig(), limited=False)  # a log has commands that the vehicle took
     model = build_model(spec, config)
 
     def observe(state: Any) -> jax.Array:
@@ -61,7 +63,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
             return jnp.stack([cos * a - sin * b, sin * a + cos * b])
 
         origin = start[:2] + rotate(state.qpos[0] - x, state.qpos[1] - y)
-        attitude = _quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
+        attitude = quaternion_product(quaternion_from_angles(0 * turn, 0 * turn, turn), state.qpos[3:7])
         qpos = jnp.concatenate([origin, state.qpos[2:3], attitude, state.qpos[7:]])
         qvel = jnp.concatenate([rotate(state.qvel[0], state.qvel[1]), state.qvel[2:]])
         zero = jnp.zeros_like(turn)
@@ -75,7 +77,7 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
                  lambda params, state, commands: record(model, params, state, commands, observe), arithmetic=True)
 
 
-def _quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
+def quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Rotation b, then a (w, x, y, z)."""
     return jnp.stack([
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -92,8 +94,8 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     stride = max(round(record_dt / dt), 1)
     record = stride * dt
     records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
-    poses = [_pose_table(trial.ground_truth) for trial in trials]
-    odometries = [_odometry_table(trial.odometry) for trial in trials]
+    poses = [_table(trial.ground_truth, 3) for trial in trials]
+    odometries = [_table(trial.odometry, 5) for trial in trials]
     command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
     start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
     pose_t, pose, pose_mask = _pad(poses)
@@ -351,17 +353,7 @@ def _pad(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nd
     return time, values, mask
 
 
-def _pose_table(stream: PoseStream | None) -> tuple[np.ndarray, np.ndarray]:
-    if stream is None:
-        return np.zeros(0), np.zeros((0, 3))
-    return stream.t, np.stack([stream.x, stream.y, stream.yaw], axis=-1)
-
-
-def _odometry_table(stream: OdometryStream | None) -> tuple[np.ndarray, np.ndarray]:
-    if stream is None:
-        return np.zeros(0), np.zeros((0, 5))
-    absent = np.full(len(stream.t), np.nan)
-    pose = [absent if values is None else values for values in (stream.x, stream.y, stream.yaw)]
-    return stream.t, np.stack([*pose, stream.v, stream.omega], axis=-1)
+def _table(stream: PoseStream | OdometryStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    return (np.zeros(0), np.zeros((0, columns))) if stream is None else (stream.t, stream.values)
 
 

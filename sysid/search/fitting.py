@@ -224,9 +224,9 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
     """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
-    from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
+    from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
 
-    spec, params, _ = load_vehicle(path)
+    spec, params, _ = read_vehicle(path)
     for name in ("wheel_radius", "track", "wheelbase", "drive"):
         if getattr(spec, name) != getattr(log.spec, name):
             raise ValueError(f"{path}: {name} is {getattr(spec, name)}, but {getattr(log.spec, name)} in {log.name!r}. "

@@ -3,42 +3,34 @@
 All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
 start, of which the best is taken; starts that have converged wait. A Jacobian takes two replays for each parameter, so
 a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
-steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates; a
-step that leaves the box is cut at its wall and the parameters at a wall whose gradient points outwards are held.
+steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Space, is_delay
+from sysid.errors.space import Residuals, Space, is_delay
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
 MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 """The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
-MAX_DAMPING = 1e4
-MAX_STEP = 0.3  # of the range, in one iteration
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
+DELAYS, NEAR = 16, (0.005, 0.0003)
+"""Points over the range of a delay; six more on both sides are so far apart [s], for each: a step of the controller's
+clock, and what a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it."""
 PLATEAU = 0.02  # share of the cost within which they lie on the same ground
 FOLLOWING = 3  # tries at most without a new Jacobian
 PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
 GOES_ON = 10.0  # tolerances by which a step that is not the last lowers the cost
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Starts that try a step."""
-
-    starts: np.ndarray  # (G,) int
-    residual: np.ndarray  # (G, B, K)
-    jacobian: np.ndarray  # (G, B, K, P)
-    exact: np.ndarray  # (G,) bool: the derivatives are of the very point
 
 
 class Sums(Protocol):
@@ -47,23 +39,6 @@ class Sums(Protocol):
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray: ...
 
     def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
-
-
-class Residuals(Protocol):
-    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
-
-    One whose `equations` are not None has them summed up there.
-    """
-
-    @property
-    def space(self) -> Space: ...
-
-    @property
-    def counted(self) -> int: ...
-
-    def residuals(self, u: np.ndarray) -> np.ndarray: ...
-
-    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def fit(
@@ -80,107 +55,101 @@ def fit(
         robust: Huber instead of squares.
         frozen: names that keep each start's value.
     """
-    u = np.array([space.to_unit(space.initial)] if starts is None else starts, float)
-    free = np.array([name not in frozen for name in space.names])
-    count, damping, calm = len(u), np.full(len(u), 1e-2), np.zeros(len(u), int)
-    cost = np.full(count, np.inf)
+    box = BoxStep(free=np.array([name not in frozen for name in space.names]), move=space.moved)
     equations = getattr(objective, "equations", None)
-    dampings = DAMPINGS if equations is None else MANY_DAMPINGS
+    choices = tuple(Try(factor) for factor in (DAMPINGS if equations is None else MANY_DAMPINGS))
+    solver = GaussNewton(box, choices, Patience(tolerance, times=2, anew=GOES_ON))
+    descent = _Descent(objective, solver, robust, equations)
+    state = solver.init(np.array([space.to_unit(space.initial)] if starts is None else starts, float))
     initial, evaluations = np.inf, 0
     history: list[float] = []
-
-    def settle(n: int, tried: np.ndarray, costs: np.ndarray, exact: bool) -> tuple[float, bool]:
-        """Move a start to the best of the points (D, P), if that costs less: what its cost fell by, and if that is
-        little. `exact`: the derivatives that led there are of the very point."""
-        best = costs.argmin()
-        fallen = float(cost[n] - costs[best])
-        small = fallen < tolerance * cost[n]
-        if fallen > 0:
-            if exact and (small or fallen > GOES_ON * tolerance * cost[n]):
-                calm[n] = calm[n] + 1 if small else 0
-            u[n], cost[n] = tried[best], costs[best]
-            damping[n] = np.clip(damping[n] * dampings[best], 1e-7, MAX_DAMPING)
-        elif exact:
-            # Only when even a short step down the gradient does not help is the start at its minimum.
-            calm[n] = 2 if damping[n] >= MAX_DAMPING else calm[n]
-            damping[n] = min(damping[n] * 100.0, MAX_DAMPING)
-        return fallen, small
-
-    def candidates(starts: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
-        """(G, D, P) points that are tried next."""
-        nonlocal evaluations
-        evaluations += len(starts) * len(dampings)
-        at, slopes, curvatures = (np.repeat(one, len(dampings), axis=0) for one in (u[starts], gradient, hessian))
-        points = damped_steps(at, slopes, curvatures, np.outer(damping[starts], dampings).ravel(), free, space)
-        return points.reshape(len(starts), len(dampings), -1)
-
-    def step(at: _Points) -> _Points:
-        """Move these starts; those of them that can try again without a new Jacobian."""
-        residual, jacobian = at.residual, at.jacobian
-        gradient, hessian = normal_sums(residual, jacobian, robust)
-        points = candidates(at.starts, gradient, hessian)
-        tried = objective.residuals(points.reshape(-1, space.size))
-        tried = tried.reshape(*points.shape[:2], *residual.shape[1:])
-        costs = np.stack([robust_cost(one, robust) for one in tried]) / objective.counted
-        best, rows = costs.argmin(-1), np.arange(len(at.starts))
-        after, moves = tried[rows, best], points[rows, best] - u[at.starts]
-        again = np.zeros(len(rows), bool)
-        for i, n in enumerate(at.starts):
-            exact = bool(at.exact[i])
-            fallen, small = settle(n, points[i], costs[i], exact)
-            if fallen > 0:
-                foretold = -(2 * gradient[i] + hessian[i] @ moves[i]) @ moves[i] / objective.counted
-                again[i] = not small and fallen > PROMISE * foretold
-            elif exact:
-                after[i], moves[i], again[i] = residual[i], 0.0, calm[n] < 2
-        learnt = _learnt(jacobian[again], (after - residual)[again], moves[again])
-        return _Points(at.starts[again], after[again], learnt, (at.exact & ~moves.any(-1))[again])
-
-    def step_there(
-        equations: Sums, going: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
-    ) -> None:
-        """Move these starts with sums that an accelerator makes."""
-        points = candidates(going, gradient, hessian)
-        costs = equations.costs(points.reshape(-1, space.size), robust).reshape(len(going), -1) / objective.counted
-        for i, n in enumerate(going):
-            settle(n, points[i], costs[i], True)
-
     for iteration in range(iterations):
-        going = np.flatnonzero(calm < 2)
-        evaluations += len(going)
-        if equations is not None:
-            values, *slopes = equations.quadratic(u[going], robust)
-            cost[going] = values / objective.counted
-            initial = float(cost[0]) if iteration == 0 else initial
-            step_there(equations, going, *slopes)
-        else:
-            points = _Points(going, *objective.jacobian(u[going]), np.ones(len(going), bool))
-            cost[going] = robust_cost(points.residual, robust) / objective.counted
-            initial = float(cost[0]) if iteration == 0 else initial
-            for _ in range(1 + FOLLOWING):
-                if len(points.starts):
-                    points = step(points)
-        history.append(float(cost.min()))
+        going = np.flatnonzero(~solver.done(state))
+        part, first, spent = descent.advanced(state.of(going))
+        initial = float(first[0]) if iteration == 0 else initial
+        state, evaluations = state.put(going, part), evaluations + spent
+        history.append(float(state.cost.min()))
         if progress is not None:
-            progress(1, f"cost {cost.min():.4g}")
-        if (calm >= 2).all():
+            progress(1, f"cost {state.cost.min():.4g}")
+        if solver.done(state).all():
             break
-    order = np.argsort(cost)
-    return FitResult(u=u[order[0]], cost=float(cost[order[0]]), initial_cost=initial,
-                     evaluations=evaluations, starts=u[order], start_costs=cost[order], order=order,
-                     history=np.array(history))
+    order = np.argsort(state.cost)
+    u, cost = state.u[order], state.cost[order]
+    return FitResult(u=u[0], cost=float(cost[0]), initial_cost=initial, evaluations=evaluations, starts=u,
+                     start_costs=cost, order=order, history=np.array(history))
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Residuals of starts that try a step, and the derivatives by which they do."""
+
+    starts: np.ndarray  # (G,) int
+    residual: np.ndarray  # (G, B, K)
+    jacobian: np.ndarray  # (G, B, K, P)
+    exact: np.ndarray  # (G,) bool: the derivatives are of the very point
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Iterations of a search: derivatives, and steps by them."""
+
+    objective: Residuals
+    solver: GaussNewton
+    robust: bool
+    equations: Sums | None
+
+    def advanced(self, state: State) -> tuple[State, np.ndarray, int]:
+        """The starts after an iteration, their costs (S,) before it, and how many sets were replayed."""
+        size = state.u.shape[1]
+        if self.equations is not None:
+            values, *slopes = self.equations.quadratic(state.u, self.robust)
+            state = state._replace(cost=values / self.objective.counted)
+            tried = self.solver.tries(state, *slopes)
+            costs = self.equations.costs(tried.points.reshape(-1, size), self.robust) / self.objective.counted
+            after = self.solver.step(state, tried, costs.reshape(tried.promised.shape))
+            return after, state.cost, len(state.u) + len(costs)
+        residual, jacobian = self.objective.jacobian(state.u)
+        first = robust_cost(residual, self.robust) / self.objective.counted
+        state, spent = state._replace(cost=first), len(state.u)
+        linear = _Linear(np.arange(spent), residual, jacobian, np.ones(spent, bool))
+        for _ in range(1 + FOLLOWING):
+            if len(linear.starts):
+                spent += len(linear.starts) * len(self.solver.choices)
+                state, linear = self._stepped(state, linear)
+        return state, first, spent
+
+    def _stepped(self, state: State, at: _Linear) -> tuple[State, _Linear]:
+        """All starts after some tried a step; those of them that can try again without a new Jacobian."""
+        before, counted = state.of(at.starts), self.objective.counted
+        weight = huber_weight(at.residual) if self.robust else None
+        tried = self.solver.tries(before, *normal_sums(at.residual, at.jacobian, weight))
+        found = self.objective.residuals(tried.points.reshape(-1, before.u.shape[1]))
+        found = found.reshape(*tried.promised.shape, *at.residual.shape[1:])
+        costs = np.stack([robust_cost(one, self.robust) for one in found]) / counted
+        after = self.solver.step(before, tried, costs, at.exact)
+        rows, best = np.arange(len(costs)), costs.argmin(-1)
+        fallen, moves = before.cost - after.cost, after.u - before.u
+        small = fallen < self.solver.patience.scale(before.cost)
+        promised = ~small & (fallen > PROMISE * tried.promised[rows, best] / counted)
+        again = np.where(fallen > 0, promised, at.exact & ~self.solver.done(after))
+        residual = np.where((fallen > 0)[:, None, None], found[rows, best], at.residual)
+        learnt = _learnt(at.jacobian[again], (residual - at.residual)[again], moves[again])
+        exact = at.exact & ~moves.any(-1)
+        return state.put(at.starts, after), _Linear(at.starts[again], residual[again], learnt, exact[again])
 
 
 def ends_of_ranges(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Costs (E,) and points (E, P) with one parameter of u (P,) at an end of its range, where that is far away."""
-    points = []
-    for index, here in enumerate(u):
-        for end in (0.0, 1.0):
-            if abs(end - here) > APART:
-                points.append(u.copy())
-                points[-1][index] = end
-    starts = np.array(points).reshape(-1, len(u))
-    return costs_of(objective, starts, robust), starts
+    points, _ = _along_ranges(u, (0.0, 1.0))
+    return costs_of(objective, points, robust), points
+
+
+def _along_ranges(u: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (E, P) with one parameter of u (P,) at one of these values, where that is far away, and which (E,)."""
+    places = [(index, value) for index, here in enumerate(u) for value in values if abs(value - here) > APART]
+    points, held = np.tile(u, (len(places), 1)), np.array([index for index, _ in places], int)
+    points[np.arange(len(held)), held] = [value for _, value in places]
+    return points, held
 
 
 def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -191,17 +160,11 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
     What lies behind such level ground comes first, since no derivative shows it: a limit that was never met, say.
     The rest is in the order of its costs.
     """
-    linear = _linearised(objective, u)
-    here = robust_cost(linear[0], robust)[0] / objective.counted
-    points, held, side = [], [], []
-    for index, value in enumerate(u):
-        for other in np.linspace(0.0, 1.0, GRID):
-            if abs(other - value) > APART:
-                points.append(np.where(np.arange(len(u)) == index, other, u))
-                held.append(index)
-                side.append(2 * index + int(other > value))
-    costs, followed = _followed(objective, linear, np.array(points), np.array(held), robust)
-    sides, level = np.array(side), np.abs(costs - here) <= PLATEAU * here
+    tangent = _Tangent.at(objective, u, robust)
+    points, held = _along_ranges(u, np.linspace(0.0, 1.0, GRID).tolist())
+    sides = 2 * held + (points > u).any(1)
+    costs, followed = tangent.followed(objective, points, held, robust)
+    level = np.abs(costs - tangent.cost) <= PLATEAU * tangent.cost
     behind = np.isin(sides, sides[level])
     order = np.lexsort((costs, ~behind))
     order = order[~level[order]]
@@ -209,44 +172,40 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
     return costs[order], followed[order]
 
 
-_Linear = tuple[np.ndarray, np.ndarray, np.ndarray]
+@dataclass(frozen=True)
+class _Tangent:
+    """Derivatives of residuals at one point, by which others follow that are elsewhere."""
 
+    cost: float
+    jacobian: np.ndarray  # (B, K, P)
 
-def _linearised(objective: Residuals, u: np.ndarray) -> _Linear:
-    """Residual (1, B, K) and derivatives (B, K, P) at u (P,), and the Gauss-Newton Hessian (P, P)."""
-    residual, jacobian = objective.jacobian(u[None])
-    return residual, jacobian[0], np.einsum("bkp,bkq->pq", jacobian[0], jacobian[0])
+    @classmethod
+    def at(cls, objective: Residuals, u: np.ndarray, robust: bool) -> _Tangent:
+        """Those at u (P,)."""
+        residual, jacobian = objective.jacobian(u[None])
+        return cls(robust_cost(residual, robust)[0] / objective.counted, jacobian[0])
 
-
-def _followed(
-    objective: Residuals, linear: _Linear, points: np.ndarray, held: np.ndarray, robust: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Costs (E,) and points (E, P) after a damped Gauss-Newton step of all but the `held` (E,) parameter of each, with
-    the derivatives of elsewhere, where that step is better than none.
-    """
-    _, jacobian, hessian = linear
-    index = np.arange(points.shape[1])
-    residual = objective.residuals(points)
-    weight = huber_weight(residual) if robust else np.ones_like(residual)
-    pulls = np.einsum("bkp,nbk->np", jacobian, residual * weight, optimize=True)
-    moved = damped_steps(points, pulls, hessian, 1e-3, index != held[:, None], objective.space)
-    costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))]) / objective.counted
-    return costs.min(0), np.where((costs[1] < costs[0])[:, None], moved, points)
+    def followed(self, objective: Residuals, points: np.ndarray, held: np.ndarray, robust: bool
+                 ) -> tuple[np.ndarray, np.ndarray]:
+        """Costs (E,) and points (E, P) after a damped Gauss-Newton step of all but the `held` (E,) parameter of each,
+        where that step is better than none."""
+        residual = objective.residuals(points)
+        weight = huber_weight(residual) if robust else np.ones_like(residual)
+        pulls = np.einsum("bkp,nbk->np", self.jacobian, residual * weight, optimize=True)
+        hessian = np.einsum("bkp,bkq->pq", self.jacobian, self.jacobian)
+        box = BoxStep(free=np.arange(points.shape[1]) != held[:, None], move=objective.space.moved)
+        moved = box.points(points, pulls, hessian, 1e-3)
+        costs = np.stack([robust_cost(one, robust) for one in (residual, objective.residuals(moved))])
+        return costs.min(0) / objective.counted, np.where((costs[1] < costs[0])[:, None], moved, points)
 
 
 def profile_delays(
-    objective: Residuals, space: Space, u: np.ndarray, points: int = 16, near: tuple[float, ...] = (0.005, 0.0003),
-    robust: bool = False,
+    objective: Residuals, space: Space, u: np.ndarray, robust: bool = False
 ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
     A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
     by one damped Gauss-Newton step, which shows whether another valley is as deep.
-
-    Args:
-        points: of an even grid over the whole range.
-        near: six more on both sides of u are this far apart [s], for each: a step of the controller's clock, and what
-            a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it.
 
     Returns:
         Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
@@ -255,16 +214,16 @@ def profile_delays(
     delays = [index for index, name in enumerate(space.names) if is_delay(name)]
     if not delays:
         return []
-    linear = _linearised(objective, u)
+    tangent = _Tangent.at(objective, u, robust)
     for index in delays:
         values = space.to_values(u)
-        around = np.tile(values, (13 * len(near), 1))
-        around[:, index] += np.outer(near, np.arange(-6, 7)).ravel()
-        grid = np.concatenate([np.linspace(0.0, 1.0, points), space.to_unit(around)[:, index]])
+        around = np.tile(values, (13 * len(NEAR), 1))
+        around[:, index] += np.outer(NEAR, np.arange(-6, 7)).ravel()
+        grid = np.concatenate([np.linspace(0.0, 1.0, DELAYS), space.to_unit(around)[:, index]])
         grid = np.unique(grid.round(9))
         at = np.tile(u, (len(grid), 1))
         at[:, index] = grid
-        costs, followed = _followed(objective, linear, at, np.full(len(at), index), robust)
+        costs, followed = tangent.followed(objective, at, np.full(len(at), index), robust)
         profiles.append((space.names[index], space.to_values(at)[:, index], costs, followed))
     return profiles
 
@@ -288,44 +247,3 @@ def _learnt(jacobian: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.nd
     missed = change - np.einsum("nbkp,np->nbk", jacobian, move)
     direction = move / np.maximum(np.square(move).sum(-1, keepdims=True), 1e-300)
     return jacobian + missed[..., None] * direction[:, None, None, :]
-
-
-def normal_sums(residual: np.ndarray, jacobian: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients (N, P) and Gauss-Newton Hessians (N, P, P), by half, of squares or Huber losses of residuals (N, B, K)
-    with the derivatives (N, B, K, P)."""
-    weight = huber_weight(residual) if robust else np.ones_like(residual)
-    gradient = np.einsum("nbkp,nbk->np", jacobian, residual * weight)
-    return gradient, np.einsum("nbkp,nbkq->npq", jacobian, jacobian * weight[..., None])
-
-
-def damped_steps(
-    u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any, free: np.ndarray, space: Space
-) -> np.ndarray:
-    """The damped Gauss-Newton points (N, P) of u (N, P) within the box, along its valleys (`Space.moved`); what is not
-    `free` (P,) or (N, P) stays.
-
-    Args:
-        gradient, hessian: by half, (N, P) and (N, P, P); without N where they are the same for all.
-        damping: (N,), or one for all.
-    """
-    count, size = u.shape
-    gradient, free = (np.broadcast_to(one, u.shape) for one in (gradient, free))
-    hessian, damping = np.broadcast_to(hessian, (count, size, size)), np.broadcast_to(damping, count)
-    active = free & ~((u <= 0.0) & (gradient > 0)) & ~((u >= 1.0) & (gradient < 0))
-    curvature = np.einsum("npp->np", hessian)
-    scale = (curvature + 1e-6 * np.maximum(curvature.max(-1, keepdims=True), 1e-12)) * damping[:, None]
-    new, left = u.copy(), np.arange(count)
-    for _ in range(3):  # cutting at a wall may let another parameter reach its own
-        moving = active[left]
-        matrix = hessian[left] * (moving[:, :, None] & moving[:, None])
-        matrix[:, np.arange(size), np.arange(size)] += np.where(moving, scale[left], 1.0)
-        step = -np.linalg.solve(matrix, np.where(moving, gradient[left], 0.0)[..., None])[..., 0]
-        moved = np.where(free[left], space.moved(u[left], np.clip(step, -MAX_STEP, MAX_STEP)), u[left])
-        outside = (moved < 0.0) | (moved > 1.0)
-        new[left] = np.clip(moved, 0.0, 1.0)
-        # Hold what hit its wall at once; what merely reached it keeps the cut step.
-        active[left] &= ~(outside & ((u[left] <= 1e-6) | (u[left] >= 1 - 1e-6)))
-        left = left[outside.any(-1)]
-        if not len(left):
-            break
-    return new

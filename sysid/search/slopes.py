@@ -15,8 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.errors.robust import robust_cost
-from sysid.search.least_squares import Residuals, damped_steps, normal_sums
+from sysid.errors.robust import huber_weight, robust_cost
+from sysid.errors.space import Residuals
+from sysid.search.gauss_newton import BoxStep, normal_sums
 from sysid.search.result import FitResult, Progress
 
 ROTATIONS = 3
@@ -96,15 +97,14 @@ def descend(
 ) -> FitResult:
     """The result with where damped Gauss-Newton steps with averaged slopes lead from its u, as long as costs fall."""
     u, cost, spent, misses = result.u, result.cost, 0, 0
-    free, history = np.ones(len(u), bool), []
+    box, history = BoxStep(move=objective.space.moved), []
     slopes = objective.jacobian(u[None])[1][0]
     for number in range(ROUNDS):
         before = cost
         covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
         residual, slopes = average_slopes(objective, u, covariance, seed + number)
-        (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], robust)
-        points = damped_steps(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS), free,
-                              objective.space)
+        (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], huber_weight(residual) if robust else None)
+        points = box.points(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS))
         costs = robust_cost(objective.residuals(points), robust) / objective.counted
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)
         if costs.min() < cost:

@@ -1,7 +1,8 @@
 """Studies of a global search that several processes share, and that outlive any of them.
 
 A study lives in a journal file (`journal:FILE`; on a file system that all processes see) or in a database by its URL
-(`postgresql://user@host/name`, which needs psycopg2). Every process that searches in it asks for candidates in batches,
+(`postgresql://user@host/name`, which needs psycopg2; a password is neither printed nor stored, and is better kept in
+the file ~/.pgpass or in PGPASSWORD). Every process that searches in it asks for candidates in batches,
 simulates a batch in one replay and tells the costs. A process that is killed leaves candidates that were asked for and
 never told: the next one to look puts them back into the queue. Costs that were told are in the storage.
 """
@@ -10,12 +11,14 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import socket
 import time
 import uuid
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+from urllib.parse import unquote, unquote_plus
 
 import numpy as np
 
@@ -28,6 +31,11 @@ LEASE = 600.0
 POLL = 0.2  # s between looks while others finish
 UNNAMED = 10.0
 """Seconds after which a candidate without a process's name on it was made by one that died in between."""
+HIDDEN = "***"
+HOST = re.compile(r"(\[[^\]]*\]|[^:]*)(:\d*)?")
+"""Name or address of a server, and its port."""
+SECRET_OPTION = re.compile(r"([?&;][^=&;]*(?:pass|secret|token|key|auth)[^=&;]*)=([^&;]*)", re.IGNORECASE)
+"""An option of a URL whose value is not shown."""
 SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
 
 
@@ -46,10 +54,18 @@ def open_storage(text: str | Any | None) -> Any:
         os.makedirs(folder, exist_ok=True)
         lock: Any = _Flock(rest)
         return optuna.storages.JournalStorage(JournalFileBackend(rest, lock_obj=lock))
+    public = without_secrets(text)
     if "://" not in text:
-        raise ValueError(f"storage {text!r} is neither journal:FILE nor a URL. Give for example "
+        raise ValueError(f"storage {public!r} is neither journal:FILE nor a URL. Give for example "
                          "journal:runs/study.log or postgresql://user@host/name.")
-    from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+
+    try:
+        make_url(text)
+    except (ArgumentError, ValueError):  # its message may quote the URL, or a part of the password
+        raise ValueError(f"storage {public!r} cannot be opened: it is no database URL. Write it like "
+                         "postgresql://user@host/name, special characters in it as %XX.") from None
 
     try:
         for _ in range(5):
@@ -61,12 +77,39 @@ def open_storage(text: str | Any | None) -> Any:
                 time.sleep(POLL)
         return optuna.storages.RDBStorage(text, engine_kwargs={"pool_pre_ping": True})
     except ImportError as error:
-        raise ValueError(f"storage {text!r} needs {error.name or error}. Install it: "
+        raise ValueError(f"storage {public!r} needs {error.name or _masked(str(error), text)}. Install it: "
                          "pip install psycopg2-binary.") from None
-    except SQLAlchemyError as error:
-        reason = str(error).strip().splitlines()[0]
-        raise ValueError(f"storage {text!r} cannot be opened: {reason}. Check the server, the name and the "
+    except (SQLAlchemyError, TypeError, ValueError) as error:  # the last two of options that the driver does not know
+        reason = _masked(str(error).strip().splitlines()[0], text)
+        raise ValueError(f"storage {public!r} cannot be opened: {reason}. Check the server, the name and the "
                          "rights.") from None
+
+
+def without_secrets(storage: Any) -> str:
+    """The storage's text with *** for a password: what may be printed and stored."""
+    if not isinstance(storage, str):
+        return type(storage).__name__ if storage else ""
+    if storage.startswith("journal:"):
+        return storage
+    scheme, mark, rest = storage.partition("://") if "://" in storage else ("", "", storage)
+    login, at, place = rest.rpartition("@")
+    if at:
+        user, colon, secret = login.partition(":")
+        rest = f"{user}{colon}{HIDDEN if secret else ''}@{place}"
+    elif not HOST.fullmatch(rest.partition("/")[0].partition("?")[0]):  # a login without its host
+        rest = f"{rest.partition(':')[0]}:{HIDDEN}"
+    return scheme + mark + SECRET_OPTION.sub(rf"\1={HIDDEN}", rest)
+
+
+def _masked(message: str, storage: str) -> str:
+    """A message of a library in which neither the storage's URL nor a password of it appears."""
+    message = message.replace(storage, without_secrets(storage))
+    rest = storage.partition("://")[2]
+    found = [rest.rpartition("@")[0].partition(":")[2], *(one[1] for one in SECRET_OPTION.findall(rest))]
+    forms = {form for one in found for form in (one, unquote(one), unquote_plus(one)) if form}
+    for secret in sorted(forms, key=len, reverse=True):
+        message = message.replace(secret, HIDDEN)
+    return message
 
 
 class SharedStudy:

@@ -20,11 +20,8 @@ from sysid.errors.noise import repeated
 from sysid.logs.log import Trial
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.found import Search, Thresholds
+from whill_mjx.effects import card_of
 
-BY_POSE = frozenset({"command_delay", "actuator_lag", "sensor_delay", "clock_offset", "pose_delay", "command_scale",
-                     "track_width", "turn_efficiency", "wheel_radius_difference", "slope", "wind"})
-"""Effects that an outside pose alone shows: when the vehicle moves, how far for what is commanded, and what depends on
-its heading in the room."""
 UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
 
 
@@ -57,9 +54,9 @@ def judged(
 
 
 def of_wheels(found: Search) -> list[str]:
-    """What speaks against each named effect that only wheels show, in words."""
+    """What speaks against each named effect that an outside pose alone does not show, in words."""
     return [f"{one.effect} stands out, but without odometry nothing shows what the wheels did: log their speeds"
-            for one in found.final.hypotheses if one.effect not in BY_POSE]
+            for one in found.final.hypotheses if not card_of(one.effect).shown_by_pose]
 
 
 def simplest(found: Search) -> None:

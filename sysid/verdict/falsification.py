@@ -11,7 +11,9 @@ from sysid.logs.log import Trial, command_in_force
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.missing.refit import Refitter, without_each
 from sysid.verdict.agreement import beside
-from sysid.verdict.falsifiers import FALSIFIERS, QUIET, SPLITS, Course, Falsifier, Tested
+from sysid.verdict.falsifiers import QUIET, SPLITS, Course, Tested
+from whill_mjx.effects import card_of
+from whill_mjx.effects.card import Falsifier
 
 ALPHA = 0.01
 """Of all predictions of one effect together."""
@@ -38,7 +40,7 @@ def put_to_test(
     for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
         change = features[0] - features[1 + number]  # (B, K, C)
         energy = np.square(refitter.white(change)).reshape(seen.shape).sum(-1)
-        tested = FALSIFIERS.get(one.effect, ())
+        tested = card_of(one.effect).forbids
         out.append([])
         for falsifier in tested:
             alpha = ALPHA / len(tested)

@@ -142,6 +142,12 @@ def explained_share(base: Refit, count: float, thresholds: Thresholds, fit: Refi
     return float(np.clip((before - excess_of(fit, count)) / max(before, thresholds.excess), 0.0, 1.0))
 
 
+def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
+    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
+    both = max(search_p, excess_p) < thresholds.alpha
+    return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
+
+
 @dataclass(frozen=True)
 class Scan:
     """Gains of H hypotheses, each at the level of its highest worth."""

@@ -24,7 +24,18 @@ from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import NullRefits, PairScan, Scan, Search, Thresholds, excess_of, explained_share, family, tail
+from sysid.verdict.found import (
+    NullRefits,
+    PairScan,
+    Scan,
+    Search,
+    Thresholds,
+    excess_of,
+    explained_share,
+    family,
+    missing,
+    tail,
+)
 from sysid.verdict.pairs import scan_again
 from sysid.verdict.rounds import pair_round, refitted
 from sysid.verdict.scan import best, drawn_away
@@ -58,8 +69,9 @@ def run(
             candidates = refitted(one, base, around, hypotheses, wander, scan, [looked], thresholds, similar,
                                   lambda _: 0.0, lambda _: None)
             p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
-        excess = excess_of(base, measured)
-        alarm = p[n] < thresholds.alpha or wander.p_excess(excess) < thresholds.alpha
+        p_excess = wander.p_excess(excess_of(base, measured))
+        # An effect that stays significant in a refit may be named; without one, the rule of the verdict holds.
+        alarm = p[n] < thresholds.alpha or missing(p[n], p_excess, thresholds)
         if not alarm and pairs is not None:
             again = scan_again(pairs, around, hypotheses, wander)
             if again.p_family < thresholds.alpha:

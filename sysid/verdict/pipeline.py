@@ -12,7 +12,7 @@ import numpy as np
 from sysid import command_line
 from sysid.errors.space import FIXED
 from sysid.logs.log import Log
-from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.catalogue import base_values, hypotheses, outside_hypotheses, with_catalogue
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call
 from sysid.missing.reference import make_reference
@@ -119,9 +119,7 @@ def prepare(
     plant = _plant(spec, config)
     found = hypotheses(spec, reference.params)
     if config.pose_delay and PARAMETER not in config.held:
-        fitted = PARAMETER in reference.space.names
-        found += (Hypothesis("pose_delay", (Axis(PARAMETER, 0.05, signed=fitted, limit=20.0),),
-                             kind="parameter_shift" if fitted else "effect"),)
+        found += outside_hypotheses(spec, reference.params, reference.space.names)
     full = with_catalogue(reference.params, found)
     base = base_values(full)
     paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())

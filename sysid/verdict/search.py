@@ -17,7 +17,7 @@ from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.forms import other_forms
-from sysid.verdict.found import LARGEST, Candidate, Search, Thresholds, excess_of, explained_share
+from sysid.verdict.found import LARGEST, Candidate, Search, Thresholds, excess_of, explained_share, missing
 from sysid.verdict.pairs import scan_pairs
 from sysid.verdict.rounds import POLISH, _class_of, candidate_of, pair_round, refitted, rescan
 from sysid.verdict.scan import best, run
@@ -79,7 +79,7 @@ def search(
         if wander.p_excess(excess(current)) > thresholds.quiet:
             break
     _drop_stand_ins(found, evidence, hypotheses, refitter, wander, thresholds, explained)
-    calm = bool(found.accepted) and wander.p_excess(excess(current)) > thresholds.quiet
+    calm = bool(found.accepted) and wander.p_excess(excess(found.accepted[-1].refit)) > thresholds.quiet
     if not calm or found.accepted[-1].share < thresholds.share:
         tried = set() if calm else {one.hypothesis.effect for one in found.accepted}
         pair_round(found, evidence, hypotheses, refitter, wander, similar, thresholds, explained, tried)
@@ -213,7 +213,7 @@ def _decide(
             and _of_what_lasts(found, wander, anything) >= thresholds.share):
         found.verdict = "named"
         found.reason = f"explains {found.share:.0%} of what exceeds the noise"
-    elif not _missing(found.p_value, wander.p_excess(before), thresholds):
+    elif not missing(found.p_value, wander.p_excess(before), thresholds):
         found.accepted, found.classes, found.crowd = [], [], []
         found.final, found.share, found.excess = found.base, 0.0, (before, before)
         found.reason = "what stands out has no name, and days with nothing missing differ by as much"
@@ -221,10 +221,4 @@ def _decide(
         found.verdict = "unexplained"
         found.reason = (f"the best of the catalogue explains {max(found.share, 0):.0%} of what exceeds the noise, and "
                         f"{after:.0%} above the noise is left")
-
-
-def _missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
-    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
-    both = max(search_p, excess_p) < thresholds.alpha
-    return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
 

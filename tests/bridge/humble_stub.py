@@ -23,8 +23,8 @@ class Message:
             setattr(self, name, value)
 
 
-def message(name, **fields):
-    return type(name, (Message,), {"fields": fields})
+def message(kind, /, **fields):
+    return type(kind, (Message,), {"fields": fields})
 
 
 Time = message("Time", sec=int, nanosec=int)
@@ -33,6 +33,9 @@ Vector3 = message("Vector3", x=float, y=float, z=float)
 Twist = message("Twist", linear=Vector3, angular=Vector3)
 TwistStamped = message("TwistStamped", header=Header, twist=Twist)
 Bool, Empty, String = message("Bool", data=bool), message("Empty"), message("String", data=str)
+KeyValue = message("KeyValue", key=str, value=str)
+DiagnosticStatus = message("DiagnosticStatus", level=bytes, name=str, message=str, hardware_id=str, values=list)
+DiagnosticArray = message("DiagnosticArray", header=Header, status=list)
 Joy = message("Joy", header=Header, axes=list, buttons=list)
 ModelCr2State = message(
     "ModelCr2State", battery_power=int, battery_current=float, right_motor_angle=float, left_motor_angle=float,
@@ -171,10 +174,14 @@ class Node:
             callback()
 
 
+def create_node(name, *, start_parameter_services=True):
+    return Node(name)
+
+
 def install():
     """Put the stub in place of rclpy and of the message packages."""
     modules = {
-        "rclpy": {"init": lambda **_: None, "create_node": Node, "try_shutdown": lambda: None},
+        "rclpy": {"init": lambda **_: None, "create_node": create_node, "try_shutdown": lambda: None},
         "rclpy.clock": {"Clock": Clock, "ClockType": ClockType, "JumpThreshold": JumpThreshold},
         "rclpy.duration": {"Duration": Duration},
         "rclpy.qos": {"QoSProfile": QoSProfile, "HistoryPolicy": Policy, "ReliabilityPolicy": Policy,
@@ -185,6 +192,8 @@ def install():
         "std_msgs": {}, "std_msgs.msg": {"Bool": Bool, "Empty": Empty, "String": String, "Header": Header},
         "sensor_msgs": {}, "sensor_msgs.msg": {"Image": Image, "CompressedImage": CompressedImage, "Joy": Joy},
         "nav_msgs": {}, "nav_msgs.msg": {"Odometry": Odometry},
+        "diagnostic_msgs": {}, "diagnostic_msgs.msg": {"DiagnosticArray": DiagnosticArray,
+                                                       "DiagnosticStatus": DiagnosticStatus, "KeyValue": KeyValue},
         "whill_msgs": {}, "whill_msgs.msg": {"ModelCr2State": ModelCr2State},
         "geometry_msgs": {}, "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped},
     }

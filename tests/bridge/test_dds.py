@@ -18,7 +18,7 @@ def column(path, name):
 def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph, policy, tmp_path):
     results = tmp_path / "results.json"
     graph.start("record", tmp_path / "logs", "straight_1")
-    graph.start("drive", policy)
+    graph.start("drive", policy, "--signal-age", 10)  # a machine that tests in parallel pauses for long
     graph.wait_for("drive", "standing")
     graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 2, "--linger", 1.5,
                 "--results", results)

@@ -75,6 +75,15 @@ def test_first_seconds_excuse_what_the_graph_may_not_know_yet():
                  starting=True) == []
 
 
+def test_camera_that_has_just_come_is_not_judged_yet():
+    assert found(frames=FrameLog(), settled=False) == []
+    assert found(frames=frames(seconds=0.15), settled=False) == []
+    log = FrameLog()
+    assert not log.is_full(100.0)
+    log.frame(100.0, 0.0, 0.0, 1)
+    assert not log.is_full(101.9) and log.is_full(102.0)
+
+
 def test_simulator_off_real_time_is_no_fault_where_the_stamps_set_the_pace():
     assert found(frames=frames(rate=3, pace=0.3), pace_by_stamp=True) == []
 

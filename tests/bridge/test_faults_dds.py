@@ -110,3 +110,29 @@ def test_rider_of_a_standing_whill_can_drive_with_its_joystick(graph, policy):
     robot.wait_until(lambda _: chair.v == 0 and chair.joystick_works)
     chair.joystick, before = (50, 0), chair.x
     robot.wait_until(lambda _: chair.x > before + 0.05)
+
+
+def test_lifecycle_node_drives_only_while_it_is_active(graph, policy):
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
+
+    robot = graph.peer("robot")
+    robot.whole()
+    client = robot.node.create_client(ChangeState, "bridge_drive/change_state")
+    graph.start("drive", policy, "--lifecycle")
+    robot.wait_for_status(state="standing", holds="['not activated']")
+
+    def change(transition):
+        answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        robot.wait_until(lambda _: answer.done())
+        assert answer.result().success
+
+    change(Transition.TRANSITION_CONFIGURE)
+    assert not robot.moving()
+    change(Transition.TRANSITION_ACTIVATE)
+    robot.wait_for_status(driving=True)
+    change(Transition.TRANSITION_DEACTIVATE)
+    robot.wait_for_status(state="standing", reason="not activated")
+    robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
+    change(Transition.TRANSITION_ACTIVATE)
+    robot.wait_for_status(driving=True)

@@ -87,6 +87,16 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
     assert link.problem(2.0) == "no guard is running"
 
 
+def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
+    link = GuardLink("me", "/cmd_vel", None)
+    for i in range(20):
+        link.heard(1 + i / 20, json.dumps(GOOD))
+        link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
+        assert link.problem(1 + i / 20) == "" and link.stops == 0
+    link.heard(3.0, json.dumps({**GOOD, "hears": ["dead"]}))
+    assert "does not hear" in link.problem(3.0)
+
+
 class Process:
     """A child process that has, or has not, ended."""
 

@@ -12,9 +12,9 @@ import pytest
 
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.space import Space
-from sysid.logs.scenarios import Scenario
 from sysid.replay.records import Plant
 from sysid.replay.rollout import Replay, make_batch
+from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.specs import WHILL_CR
 
 SHORT = Scenario(v=0.5, omega=0.8, length=3.0)

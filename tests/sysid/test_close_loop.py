@@ -26,7 +26,6 @@ from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.falsification import course_of, put_to_test
-from sysid.verdict.falsifiers import Falsifier
 from sysid.verdict.found import NullRefits
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
@@ -34,6 +33,7 @@ from sysid.verdict.pipeline import expected_steps, find_missing
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.vehicles import drives_of, refit_poses, refitter_of, vehicle_after, vehicle_before
 from whill_mjx.effects import make_effect
+from whill_mjx.effects.card import Falsifier
 from whill_mjx.effects.unnamed import KNOTS
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.config import VehicleConfig

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import UNICYCLE_SPACE, unicycle_plant
 
-import sysid.design as design_module
+import sysid.design as design_command
 from sysid.design import DesignConfig, main
 from sysid.errors.space import Space
 from sysid.intervals.design import (
@@ -226,7 +226,7 @@ def test_the_command_file_is_a_log_and_stays_in_the_room(whill):
 def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
     monkeypatch.setattr("sys.argv", ["design", "tricycle"])
     with pytest.raises(SystemExit, match="error: .*tricycle"):
-        design_module.cli()
+        design_command.cli()
 
 
 @quick

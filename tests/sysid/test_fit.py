@@ -10,13 +10,14 @@ import pytest
 
 import sysid.fit as fit_module
 from sysid.logs.log import load_log
-from sysid.logs.scenarios import Scenario
-from sysid.logs.synthetic import SensorNoise, write_dataset
+from sysid.logs.synthetic import write_dataset
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
+from whill_mjx.logs.dataset import SensorNoise
+from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params

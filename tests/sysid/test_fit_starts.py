@@ -10,8 +10,8 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.fit import with_effects
 from sysid.replay.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, sets_together
+from sysid.replay.models import with_effects
 from sysid.replay.rollout import Replay, make_batch
 from sysid.search import least_squares, starts
 from whill_mjx.effects import make_effect

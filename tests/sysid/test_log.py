@@ -10,7 +10,7 @@ import pytest
 from sysid.logs.log import load_log, manoeuvre_of
 from sysid.logs.measured import load_any
 from sysid.logs.streams import trial_quality
-from sysid.logs.synthetic import write_csv, write_text
+from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia
 from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
 
@@ -132,6 +132,17 @@ BAD_TOML = {
     "unknown reference": ("mass = 60.0", 'reference_point = "camera"', "'camera'"),
     "bad limits": ("mass = 60.0", "command_limits = [1.0]", "command_limits"),
     "held out of nothing": ('"straight_2"', '"straight_9"', "straight_9"),
+    "track no number": ("track = 0.5", "track = true", "track is True; it must be a number"),
+    "track endless": ("track = 0.5", "track = inf", "track is inf; it must be positive, from 0.01 to 5 m"),
+    "huge integer": ("mass = 60.0", "mass = 1" + "0" * 400, "mass is an integer of about 398 digits"),
+    "longer integer": ("mass = 60.0", "mass = 1" + "0" * 5000, "not valid TOML"),
+    "nested": ("mass = 60.0", "mass = " + "[" * 5000, "nested too deep"),
+    "held out no list": ('["straight_2"]', "3", "held_out is 3; it must be a list of texts"),
+    "held out numbers": ('["straight_2"]', "[1]", "held_out[0] is 1; it must be a text"),
+    "negative limits": ("mass = 60.0", "command_limits = [1.0, -1.0]", "command_limits[1] is -1.0; it must be "),
+    "schema true": ("schema = 1", "schema = true", "schema is True"),
+    "long key": ("mass = 60.0", "a." * 200 + "b = 1", "a key of a hundred parts"),
+    "NUL byte": ("a chair", "a\0chair", "NUL byte"),
     "not toml": ("schema = 1", "schema: 1", "not valid TOML"),
 }
 
@@ -148,6 +159,15 @@ def test_a_bad_description_is_named_with_file_and_value(dataset, case):
 BAD_CSV = {
     "missing column": ("ground_truth.csv", "t,x,y,yaw", "t,x,y,heading", "no column 'yaw'"),
     "nan": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,nan,0,0,0,0", "line 3: x is nan"),
+    "text with more in it": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,0,0,0,1_0,0", "v is '1_0'"),
+    "decimal commas": ("command.csv", "1,0.5,0", "1,0,5,0", "line 12: has 4 cells, the header 3"),
+    "quoted decimal comma": ("command.csv", "1,0.5,0", '1,"0,5",0', "v is '0,5'"),
+    "column twice": ("command.csv", "t,v,omega", "t,v,v", "more than one column 'v'"),
+    "semicolons": ("command.csv", "t,v,omega", "t;v;omega", "separated by commas"),
+    "open quote": ("command.csv", "1,0.5,0", '1,"0.5,0', "a quote is not closed"),
+    "huge number": ("command.csv", "1,0.5,0", "1,1e400,0", "v is inf; it must be finite"),
+    "NUL byte": ("command.csv", "0.2,0,0", "0.2,\0,0", "line 4: has a NUL byte"),
+    "huge header": ("command.csv", "t,v,omega", "t,v,omega" + "x" * 200_000, "at most 100000 are read"),
     "text": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,left,0,0,0,0", "x is 'left'"),
     "short row": ("odometry.csv", "0.1,0,0,0,0,0", "0.1,0", "y is ''"),
     "time backwards": ("command.csv", "0.2,0,0", "0.05,0,0", "it must increase"),
@@ -166,6 +186,28 @@ def test_a_bad_table_is_named_with_file_and_value(dataset, case):
     with pytest.raises(ValueError, match=name) as caught:
         load_log(dataset)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["dataset.toml", "trials/straight_1/command.csv"])
+def test_files_with_a_byte_order_mark_or_other_line_ends_or_blank_lines_are_read(dataset, name):
+    before = load_log(dataset)
+    path = dataset / name
+    text = path.read_text()
+    for data in (b"\xef\xbb\xbf" + text.encode(), text.replace("\n", "\r\n").encode(), (text + "\n\n \n").encode(),
+                 text.replace("\n", "\r").encode()):
+        path.write_bytes(data)
+        after = load_log(dataset)
+        assert after.spec == before.spec
+        np.testing.assert_array_equal(after.trials[0].command.v, before.trials[0].command.v)
+
+
+@pytest.mark.parametrize("name", ["dataset.toml", "trials/straight_1/command.csv"])
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_file_in_another_encoding_is_named(dataset, name, encoding):
+    path = dataset / name
+    path.write_bytes((path.read_text() + "# Stra\xdfe\n").encode(encoding))
+    with pytest.raises(ValueError, match=f"{name}, line .*is not UTF-8. Save the file as UTF-8"):
+        load_log(dataset)
 
 
 def test_missing_parts_of_a_dataset_are_named(dataset):

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from sysid.logs.log import Command, OdometryStream, Start, Trial
-from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
+from sysid.missing.catalogue import Hypothesis, hypotheses, outside_hypotheses
+from sysid.missing.catalogue import falsifiers as known
 from sysid.missing.joint_fit import Refit
-from sysid.verdict import falsification, falsifiers
+from sysid.verdict import falsification
 from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
 from sysid.verdict.falsification import course_of, sizes_in_parts
-from sysid.verdict.falsifiers import FALSIFIERS, QUIET, SPLITS, Falsifier, side
+from sysid.verdict.falsifiers import QUIET, SPLITS, side
 from sysid.verdict.found import Candidate, Search, Thresholds
 from sysid.verdict.guards import guarded
 from sysid.verdict.result import Stood
+from whill_mjx.effects import EFFECTS
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, QUANTITIES, STATES, Axis, Falsifier
 from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick
@@ -60,9 +63,11 @@ def test_the_interval_of_a_sum_holds_the_sum():
 def test_every_effect_of_the_catalogue_says_what_would_contradict_it():
     for name in ("whill_cr_physical", "whill_cr"):
         spec, params = preset(name)
-        assert {one.effect for one in hypotheses(spec, params)} <= set(FALSIFIERS)
-    assert "turn_efficiency" in FALSIFIERS and "pose_delay" in FALSIFIERS
-    assert all(one.by in {*SPLITS, *QUIET} for each in FALSIFIERS.values() for one in each)
+        looked_for = (*hypotheses(spec, params), *outside_hypotheses(spec, params, ()))
+        assert {one.effect for one in looked_for} <= set(known())
+    assert "turn_efficiency" in known() and "pose_delay" in known()
+    assert all(one.by in {*SPLITS, *QUIET} for each in known().values() for one in each)
+    assert (tuple(SPLITS), tuple(QUIET)) == (QUANTITIES, STATES)
 
 
 def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
@@ -100,7 +105,7 @@ def test_an_effect_whose_law_differs_by_a_factor_of_two_is_not_contradicted():
 
 
 def test_what_is_half_as_large_late_in_a_drive_is_no_effect_without_the_time_in_its_law():
-    [lasting] = [one for one in FALSIFIERS["dry_friction"] if one.by == "time in the drive"]
+    [lasting] = [one for one in EFFECTS["dry_friction"].card.forbids if one.by == "time in the drive"]
     assert fitted((1.0, 0.5), prediction=lasting)[2].outcome == "falsified"
     assert fitted((1.0, 0.9), prediction=lasting)[2].outcome == "holds"
 
@@ -122,7 +127,7 @@ def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(othe
     quiet = np.zeros((6, 600, 1), bool)
     quiet[:, :300] = True
     p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
-    settled = falsifiers._SETTLED
+    settled = GONE_WHEN_SETTLED
     tested = falsification._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
     assert tested.outcome == outcome
 

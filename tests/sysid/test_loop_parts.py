@@ -1,12 +1,13 @@
 """Parts of the closed loop on hand-made residuals: agreement, hypotheses, wander, whitening."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sysid.errors.noise import fit_roughness, fit_whitener
-from sysid.missing.catalogue import ROUND, Axis, Hypothesis, base_values, hypotheses, with_catalogue
+from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
 from sysid.missing.drives import DRAIN, SESSION, Drives
 from sysid.missing.evidence import Columns
@@ -14,10 +15,13 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
+from sysid.verdict import null_refits
+from sysid.verdict import search as search_module
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import Candidate, Search, Thresholds
 from sysid.verdict.search import _decide, _own
+from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
 
 
@@ -118,6 +122,55 @@ def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_th
     if verdict == "none":
         assert not found.accepted and not found.classes and found.final is found.base and found.share == 0
         assert found.excess == (pytest.approx(excess), pytest.approx(excess))
+
+
+def base_fit(excess):
+    """A fit without effects that leaves so much above the noise, of a single sample."""
+    residual = np.full((1, 1), np.sqrt(1 + excess))
+    return Refit((), np.zeros(1), np.zeros(0), 1 + excess, residual, np.zeros((1, 1, 1)), np.zeros(0))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("excess", "alarms"), [(3.3, 0), (4.5, 2)])  # standard deviations of a day's, 3.2 are alpha
+def test_a_simulated_day_is_an_alarm_where_the_verdict_would_be_that_something_is_missing(excess, alarms, monkeypatch):
+    base = base_fit(excess)
+    refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones((1, 1, 1))),
+                               reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
+    monkeypatch.setattr(null_refits, "_days", lambda *_: [(refitter, base)] * 2)
+    monkeypatch.setattr(null_refits, "at_fit", lambda *_: None)
+    monkeypatch.setattr(null_refits, "Solver", lambda *_: None)
+    monkeypatch.setattr(null_refits, "imitation", lambda *_: None)
+    monkeypatch.setattr(null_refits, "best", lambda *_: (np.zeros(1), np.zeros(1), (np.zeros(1),)))
+    scan = SimpleNamespace(smallest=np.linspace(0.0, 1.0, 100), null=np.zeros((100, 1)))
+    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
+    nulls = null_refits.run(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), scan, Thresholds(), 2)
+    assert (nulls.p == 1.0).all() and nulls.alarms == alarms
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("left", "pairs"), [(0.0, False), (9.0, True)])
+def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left, pairs, monkeypatch):
+    """The last fit before a stand-in is dropped leaves nothing; the fit without it leaves `left`."""
+    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
+
+    def drop(found, *_):
+        found.accepted[-1] = replace(found.accepted[-1], refit=base_fit(left))
+
+    asked = []
+    scan = SimpleNamespace(p_family=0.0, gain=None, worth=None, q=None)
+    for name in ("at_fit", "Solver", "imitation", "best", "_class_of"):
+        monkeypatch.setattr(search_module, name, lambda *_: None)
+    monkeypatch.setattr(search_module, "run", lambda *_: scan)
+    monkeypatch.setattr(search_module, "scan_pairs", lambda *_, **__: scan)
+    monkeypatch.setattr(search_module, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
+    monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
+    monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
+    monkeypatch.setattr(search_module, "_decide", lambda *_: None)
+    drives = SimpleNamespace(mask=np.ones(1), courses=SimpleNamespace(of_trial=np.zeros(1, int)))
+    refitter = SimpleNamespace(fit=lambda *_: base_fit(10.0), drives=drives,
+                               reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
+    search_module.search(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), None)
+    assert bool(asked) == pairs
 
 
 @pytest.mark.quick

@@ -8,7 +8,7 @@ import pytest
 
 from sysid.follow_up.trust import at_the_end, intervals, undone
 from sysid.logs.metrics import replicate_noise
-from sysid.missing.catalogue import Axis, Hypothesis, hypotheses, pushed_anywhere
+from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit
@@ -16,6 +16,7 @@ from sysid.missing.pose_fit import by_own_noise
 from sysid.missing.refit import Refitter
 from sysid.replay.records import Measured
 from sysid.verdict.rounds import elsewhere
+from whill_mjx.effects.side_force import pushed_anywhere
 from whill_mjx.vehicle.presets import preset
 
 pytestmark = pytest.mark.quick

@@ -9,8 +9,8 @@ import pytest
 
 from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
 from sysid.logs.metrics import ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
-from sysid.logs.scenarios import SCENARIOS, Scenario, command_sequence
 from sysid.pages.report import summaries
+from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
 
 pytestmark = pytest.mark.quick
 
@@ -59,7 +59,7 @@ def test_the_start_speeds_hold_until_the_first_command():
 
 
 def test_an_ideal_vehicle_has_no_error():
-    command = command_sequence("figure_eight", Scenario())
+    command = Command(*command_table("figure_eight", Scenario()).T)
     t = np.arange(0.0, 20.0, 0.05)
     start = Start(1.0, -2.0, 0.7)
     truth = PoseStream(t, *integrate(command, start, t))
@@ -69,7 +69,7 @@ def test_an_ideal_vehicle_has_no_error():
 
 def test_replicate_noise_is_found_whatever_the_start_pose():
     random = np.random.default_rng(0)
-    command = command_sequence("straight", Scenario())
+    command = Command(*command_table("straight", Scenario()).T)
     t = np.arange(0.0, 10.0, 0.02)
     trials = []
     for i in range(1, 4):
@@ -90,7 +90,7 @@ def test_a_held_out_drive_is_held_against_its_replicates_in_the_training_trials(
     t = np.arange(0.0, 10.0, 0.02)
     trials = []
     for manoeuvre, spread in (("straight", 0.02), ("circle", 0.1)):
-        command = command_sequence(manoeuvre, Scenario())
+        command = Command(*command_table(manoeuvre, Scenario()).T)
         for i in range(1, 4):
             x, y, yaw = integrate(command, Start(0.0, 0.0, 0.0), t)
             truth = PoseStream(t, x + spread * random.normal(size=len(t)), y, yaw)
@@ -111,9 +111,9 @@ def test_only_numbered_trials_with_equal_commands_are_replicates():
     assert [[trial.name for trial in group] for group in replicate_groups(trials)] == [["a_1", "a_2"]]
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", PAPER_MANOEUVRES)
 def test_every_manoeuvre_starts_and_ends_at_rest(name):
-    command = command_sequence(name, Scenario(v=0.4, omega=0.7, length=5.0))
+    command = Command(*command_table(name, Scenario(v=0.4, omega=0.7, length=5.0)).T)
     rest = command.t < 0.95
     assert not command.v[rest].any() and not command.omega[rest].any()
     assert command.v[-1] == command.omega[-1] == 0.0
@@ -121,8 +121,8 @@ def test_every_manoeuvre_starts_and_ends_at_rest(name):
 
 
 def test_the_figure_eight_turns_as_far_to_the_left_as_to_the_right():
-    command = command_sequence("figure_eight", Scenario(omega=0.5))
+    command = Command(*command_table("figure_eight", Scenario(omega=0.5)).T)
     assert command.omega.sum() * 0.1 == pytest.approx(0.0, abs=0.11)
     assert rmse(np.array([3.0, 4.0])) == pytest.approx(np.sqrt(12.5))
     with pytest.raises(ValueError, match="unknown manoeuvre"):
-        command_sequence("spiral")
+        Command(*command_table("spiral").T)

@@ -16,7 +16,6 @@ from cart import cart
 from sysid import fit as fit_module
 from sysid.fit import Arguments
 from sysid.logs.log import Command, OdometryStream, PoseStream, make_trial
-from sysid.logs.scenarios import Scenario
 from sysid.logs.synthetic import write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
@@ -26,7 +25,7 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
-from whill_mjx.logs.manoeuvres import command_table
+from whill_mjx.logs.manoeuvres import Scenario, command_table
 from whill_mjx.vehicle.specs import WHILL_CR
 
 DT = 0.02

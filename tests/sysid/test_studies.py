@@ -257,6 +257,33 @@ def test_a_study_of_another_problem_is_refused(tmp_path):
         SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, method="cmaes", problem={"data": "monday"})
 
 
+URLS = [
+    "postgresql://bob:hush-hush@localhost:1/name", "postgresql://bob:hush%2Dhush@localhost:1/name",
+    "postgresql://bob:hush-hush@server:port/name", "postgresql://bob:hush-@:/hush@localhost:1/name",
+    "postgresql://bob:hush-hush", "bob:hush-hush@localhost/name", "nosuch://bob:hush-hush@localhost/name",
+    "postgresql://localhost:1/name?sslpassword=hush-hush&connect_timeout=1",
+]
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("url", URLS)
+def test_a_password_in_a_storage_is_not_in_its_errors(url):
+    with pytest.raises(ValueError, match="storage") as caught:
+        open_storage(url)
+    assert "hush" not in str(caught.value) and "***" in str(caught.value)
+    # A traceback would show the library's own error.
+    assert caught.value.__suppress_context__ or caught.value.__context__ is None
+
+
+@pytest.mark.quick
+def test_a_storage_is_shown_with_user_server_and_name_and_without_its_password():
+    shown = studies.without_secrets("postgresql://bob:hush-hush@server:5432/name?sslpassword=hush&application_name=fit")
+    assert shown == "postgresql://bob:***@server:5432/name?sslpassword=***&application_name=fit"
+    for harmless in ("", "journal:runs/a:b@c.log", "postgresql://bob@server/name", "sqlite:////tmp/study.db",
+                     "postgresql://server:5432/name", "postgresql://[::1]:5432/name"):
+        assert studies.without_secrets(harmless) == harmless
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize(("text", "message"), [
     ("study.log", "neither journal:FILE nor a URL"),

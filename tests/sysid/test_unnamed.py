@@ -14,9 +14,11 @@ from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.follow_up.unnamed import Bench, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
 from sysid.logs.log import OdometryStream, PoseStream, Start, Trial
 from sysid.logs.manoeuvre_library import make_command
+from sysid.missing.catalogue import base_values
 from sysid.missing.unexplained import PHASES, align, wave_turns
 from sysid.pages.loop_page import describe_unnamed
 from sysid.pages.loop_page import wrench as wrench_section
+from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from whill_mjx.effects.unnamed import KNOTS, MAP
 from whill_mjx.vehicle.config import VehicleConfig
@@ -55,7 +57,7 @@ def bench():
         search=SimpleNamespace(base=base, verdict="unexplained", excess=(0.0, 0.0)),
         evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
     made = Bench(result)
-    slopes = made.drives.differences(made.values, made.u, np.full(2, 0.02))
+    slopes = made.drives.linearised(made.values, made.u, np.full(2, 0.02))[1]
     base.jacobian = made.white(made.drives, slopes)
     return made
 
@@ -93,6 +95,18 @@ def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
     _, read, _ = load_vehicle(tmp_path / "vehicle.toml")
     for name, value in report["parameters"].items():
         np.testing.assert_allclose(get_values(read, [name])[0], value, rtol=1e-6)
+
+
+@quick
+def test_the_vehicle_of_a_wrench_has_what_a_refit_to_poses_added():
+    _, params = preset("whill_cr_physical")
+    result = SimpleNamespace(reference=SimpleNamespace(params=params))
+    plain = vehicle_of(result, {})
+    refitted = with_effects(plain, ("sensor_delay", "lateral_damping"))
+    values = {**base_values(refitted), "lateral_damping.c_rear": 3.0}
+    found = vehicle_of(result, values)
+    assert [one.name for one in found.effects] == [one.name for one in refitted.effects]
+    assert base_values(found) == pytest.approx(values)
 
 
 def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_angle(bench):

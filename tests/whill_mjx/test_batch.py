@@ -46,6 +46,15 @@ print(json.dumps(told))
 COUNT = 3
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("changes", [{"count": 0}, {"count": -2}, {"count": 2.5}, {"spread": float("nan")},
+                                     {"spread": -0.1}, {"second_tries": float("nan")}])
+def test_a_batch_refuses_arguments_that_are_no_number_of_instances_or_spread(changes):
+    (name, value), = changes.items()
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        make_batch(*make_env("obstacle_course", height=16, width=16), **{"count": 2, **changes})
+
+
 @pytest.fixture(scope="module")
 def batch():
     """Episodes of three steps, vehicles that differ, and compiled reset and step."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,32 +13,46 @@ import numpy as np
 import pytest
 from effects_in_hand import chair, motion_at, path, quick, run, yielding
 
-from whill_mjx.effects import EFFECTS, make_effect
+import whill_mjx
+from whill_mjx.effects import EFFECTS, equation, make_effect, make_effects
 from whill_mjx.effects.base import place_of
+from whill_mjx.effects.card import Scale
 from whill_mjx.vehicle.dynamics import add_payload, drive, measure, nominal_world, place
 from whill_mjx.vehicle.kinematics import body_twist
 from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.types import parameters_of
 
-DRIVES = {"pid_drive", "torque_drive"}  # no disturbances: without them nothing drives
-BASE = {"air_drag", "axle_pivot", "forward_slip", "lateral_damping", "odometry_lag", "rolling_contact",
-        "rolling_resistance", "slip_traction", "suspension", "wheel_damping", "wheel_inertia"}  # fmt: skip
-OUTSIDE = {"pose_delay"}  # act on whole recorded paths: test_effect_pose_delay.py
+DRIVES = {name for name, kind in EFFECTS.items() if kind.card.drives}  # no disturbances: without them nothing drives
+OUTSIDE = {name for name, kind in EFFECTS.items() if place_of(kind) == "outside"}  # test_effect_pose_delay.py
 CATALOGUE = sorted(set(EFFECTS) - DRIVES - OUTSIDE)
-NAMED = {
-    "command_delay", "command_dead_zone", "acceleration_limit", "jerk_limit", "command_scale", "command_quantisation",
-    "actuator_lag", "torque_saturation", "supply_sag", "drive_gain_difference", "dry_friction",
-    "wheel_radius_difference", "track_width", "payload_shift", "yaw_scrub", "omni_roller_friction", "caster_kick",
-    "traction_limit", "turn_efficiency", "rolling_resistance_speed", "quadratic_drag", "side_force", "slope", "wind",
-    "backlash", "odometry_scale", "sensor_delay", "clock_offset", "gyro_bias", "command_expiry", "encoder_resolution",
-    "gyro_range", "state_rate", "incline", "ramp", "bump", "unnamed",
-}  # fmt: skip
 
 
 @quick
-def test_every_named_effect_is_in_the_catalogue():
-    assert set(EFFECTS) == NAMED | BASE | DRIVES | OUTSIDE
+def test_every_class_of_an_effect_in_the_package_is_in_the_catalogue_in_order_of_the_names():
+    texts = [path.read_text() for path in (Path(whill_mjx.__file__).parent / "effects").glob("*.py")]
+    names = [name for text in texts for name in re.findall(r'^    name = "(\w+)"$', text, re.MULTILINE)]
+    assert list(EFFECTS) == sorted(names) and len(names) == len(set(names))
+
+
+@quick
+def test_effects_that_the_loop_looks_for_have_an_order_of_their_own():
+    """Seeds of tests and verdicts depend on it."""
+    orders = [kind.card.order for kind in EFFECTS.values() if kind.card.variants]
+    assert np.isfinite(orders).all() and len(orders) == len(set(orders))
+
+
+@quick
+def test_cards_name_effects_and_parameters_that_exist():
+    spec, params = preset("whill_cr_physical")
+    scale = Scale(spec, frozenset(describe(params)))
+    for name, kind in EFFECTS.items():
+        assert {other for one in kind.card.alike for other in one.names} <= set(EFFECTS) - {name}
+        for variant in kind.card.variants_of(scale):
+            for parameter in [axis.parameter for axis in variant.axes] + [each for each, _ in variant.constants]:
+                holder, _, field = parameter.rpartition(".")
+                assert field in parameters_of(EFFECTS[holder or name])
 
 
 @quick
@@ -90,12 +105,25 @@ def test_every_effect_vanishes_to_the_last_bit_at_its_neutral_value(name):
 @quick
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_every_effect_is_on_the_page_of_effects_with_its_parameters(name):
-    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text().splitlines()
-    rows = [line for line in page if line.startswith(f"| `{name}` |")]
+    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text().partition("## What the closed loop")[0]
+    rows = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
     remedy = "write the page again: python -m benchmarks.effects page"
     assert len(rows) == 1, remedy
     for field, about in parameters_of(EFFECTS[name]).items():
         assert f"`{field}` [{about.unit}]" in rows[0], remedy
+
+
+@quick
+def test_the_equation_of_an_effect_is_the_whole_first_paragraph_of_its_docstring_without_the_source():
+    assert equation(EFFECTS["clock_offset"]).endswith("the pose moved back along its arc.")
+    assert equation(EFFECTS["air_drag"]) == "F = -1/2 rho C_d A |v_air| v_air along the chassis x axis."
+    assert all(equation(kind) for kind in EFFECTS.values())
+
+
+@quick
+def test_effects_of_several_names_come_in_the_order_of_a_vehicle():
+    names = [effect.name for effect in make_effects(["wind", "yaw_scrub", "command_delay", "slope", "wind"])]
+    assert names == ["command_delay", "wind", "yaw_scrub", "slope"]
 
 
 @quick
@@ -108,8 +136,9 @@ def test_an_unknown_effect_or_parameter_names_the_known_ones():
 
 # Derivatives
 
-ROUNDING = {"encoder_resolution", "gyro_range", "state_rate", "command_expiry"}
-"""Made of steps: their derivatives are finite, and differences across a step mean nothing."""
+ROUNDING = {name for name, kind in EFFECTS.items() if kind.card.stepped} - {"command_quantisation"}
+"""Made of steps: their derivatives are finite, and differences across a step mean nothing. Those by the size of a step
+of `command_quantisation` are right."""
 
 
 @lru_cache
@@ -140,7 +169,7 @@ def test_forward_mode_derivatives_of_every_effect_agree_with_central_differences
     with jax.enable_x64(True):
         kind, about = EFFECTS[name], parameters_of(EFFECTS[name])
         model, motions, inputs = wide_inputs()
-        where = place_of(make_effect(name))
+        where = place_of(EFFECTS[name])
         usual = {field: low + 0.37 * (high - low) for field, (low, high) in kind.typical.items()}
         values = np.array([usual.get(field, about[field].neutral) for field in about])
 

@@ -7,7 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from whill_mjx.drive import DriveOptions, find_vehicle, main, parse_effect, with_effects
+from whill_mjx.drive import DriveOptions, main, parse_effect, with_effects
 from whill_mjx.logs.manoeuvres import MANOEUVRES, Scenario, command_table
 from whill_mjx.logs.simulated_sensors import Sensors
 from whill_mjx.vehicle.vehicle_file import load_vehicle
@@ -79,7 +79,7 @@ def test_the_vehicle_that_was_driven_is_kept_and_can_be_driven_again(dataset):
     values = {effect.name: effect for effect in params.effects}
     assert float(values["command_delay"].delay) == pytest.approx(0.2)
     assert provenance["effects"] == "command_delay:delay=0.2 odometry_scale:linear=1.1"
-    _, again = find_vehicle(str(dataset / "vehicle.toml"))
+    _, again, _ = load_vehicle(str(dataset / "vehicle.toml"))
     assert [effect.name for effect in again.effects] == [effect.name for effect in params.effects]
 
 
@@ -137,7 +137,7 @@ def test_sensors_that_cannot_be_are_refused(change, message):
 
 @pytest.mark.quick
 def test_an_effect_changes_in_place_or_is_appended():
-    _, params = find_vehicle("whill_cr_physical")
+    _, params, _ = load_vehicle("whill_cr_physical")
     changed = with_effects(params, ["yaw_scrub:torque=6", "slope:along_x=0.02", "traction_limit"])
     names = [effect.name for effect in changed.effects]
     assert names == [*(effect.name for effect in params.effects), "slope", "traction_limit"]

@@ -93,6 +93,19 @@ def test_a_diverged_vehicle_ends_the_episode_and_is_counted(course):
     assert np.isfinite(float(outcome.reward)) and np.isfinite(np.asarray(after.vehicle.qpos)).all()
 
 
+@pytest.mark.parametrize("action", [[jnp.nan, 0.0], [1.0, jnp.nan]])
+def test_an_action_that_is_no_number_is_standstill_and_ends_the_episode(course, action):
+    _, params, begin, advance = course
+    state = begin(params, jax.random.key(0))
+    after, outcome = advance(params, state, jnp.array(action))
+    assert bool(outcome.terminated) and bool(after.done) and bool(after.vehicle.diverged)
+    assert outcome.metrics["diverged"] == 1 and outcome.metrics["success"] == outcome.metrics["collision"] == 0
+    np.testing.assert_array_equal(after.command, [0.0, 0.0])
+    still, _ = advance(params, state, jnp.zeros(2))
+    np.testing.assert_array_equal(after.vehicle.qpos, still.vehicle.qpos)
+    assert np.isfinite(float(outcome.reward))
+
+
 def test_other_parameters_and_worlds_need_no_second_compilation(course):
     _, params, begin, advance = course
     size = advance._cache_size()
@@ -131,6 +144,15 @@ def test_unknown_tasks_and_layouts_are_refused():
         make_env("slalom")
     with pytest.raises(ValueError, match="randomised"):
         make_env("corridor", layout="maze")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("changes", [{"height": 0}, {"width": -3}, {"height": 16.5}, {"width": True},
+                                     {"exploring_starts": float("nan")}])
+def test_an_environment_refuses_arguments_that_make_no_image_or_share(changes):
+    (name, value), = changes.items()
+    with pytest.raises(ValueError, match=f"environment: {name} is {value}; it must "):
+        make_env("obstacle_course", **changes)
 
 
 @pytest.mark.quick

@@ -17,7 +17,6 @@ from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.base import place_of
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import (
-    GRAVITY,
     SMOOTH_LOAD,
     _substep,
     forces,
@@ -31,16 +30,13 @@ from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.specs import GRAVITY
 from whill_mjx.vehicle.types import parameters_of
 
 QUICK_TO_COMPILE = {"xla_llvm_disable_expensive_passes": True, "xla_backend_optimization_level": 1}
-STEPPED = {"command_quantisation", "encoder_resolution", "gyro_range", "state_rate", "command_expiry"}
+STEPPED = {name for name, kind in EFFECTS.items() if kind.card.stepped}
 """Made of steps: no derivative; test_catalogue.py tests that theirs are finite."""
-ODD = {
-    "body.com_y", "bump.y", "caster_kick.start_angle", "drive_gain_difference.difference", "gyro_bias.bias",
-    "incline.along_y", "payload_shift.y", "ramp.direction", "side_force.sideways", "slope.along_y",
-    "wheel_radius_difference.difference", "wind.along_y",
-}  # fmt: skip
+ODD = {"body.com_y"} | {f"{name}.{one}" for name, kind in EFFECTS.items() for one in kind.card.mirrored}
 """Parameters that change their sign in a mirror, where left is right."""
 SHOWN = {"bump": {"rise": 0.02, "width": 0.3, "x": 0.9, "y": 0.2},
          "ramp": {"rise": 0.1, "length": 1.0, "distance": 0.65, "direction": 0.2},
@@ -69,7 +65,7 @@ def with_effects_at(places):
         return make_effect(name, **{**values, **SHOWN.get(name, {})})
 
     left_out = have | STEPPED | ELSEWHERE
-    names = [name for name in EFFECTS if name not in left_out and place_of(make_effect(name)) in places]
+    names = [name for name in EFFECTS if name not in left_out and place_of(EFFECTS[name]) in places]
     names.sort(key=lambda name: name != "pid_drive")  # what scales its force comes behind it
     body = replace(params.body, com_y=jnp.asarray(0.01), com_z=jnp.asarray(0.1))
     return spec, replace(params, body=body, effects=(*params.effects, *map(gentle, names)))

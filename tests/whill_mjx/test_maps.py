@@ -59,13 +59,27 @@ def test_pixels_become_cells_with_the_last_row_at_the_bottom(tmp_path):
     ("changes", "message"),
     [({"resolution": None}, "no field 'resolution'"), ({"resolution": "-1"}, "must be positive"),
      ({"origin": "[0, 0]"}, r"must be \[x, y, yaw\]"), ({"free_thresh": "0.9"}, "free_thresh"),
-     ({"negate": "no"}, "finite"), ({"image": "other.png"}, "is missing"), ({"mode": "raw"}, "trinary")],
+     ({"negate": "no"}, "finite"), ({"negate": "2"}, "one of 0, 1"), ({"resolution": "nan"}, "resolution is nan"),
+     ({"origin": "0"}, r"must be \[x, y, yaw\]"), ({"image": "other.png"}, "is missing"), ({"mode": "raw"}, "trinary")],
 )  # fmt: skip
 def test_bad_map_files_are_refused(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message):
         load_map(write(tmp_path, [[0, 254]], **changes))
     with pytest.raises(ValueError, match="does not exist"):
         load_map(tmp_path / "nothing.yaml")
+
+
+@pytest.mark.parametrize(("data", "message"), [
+    (b"", "is missing or no PGM"), (b"P5\n2 1\n255\n", "is missing or no PGM"), (b"not an image", "no PGM or PNG"),
+    (b"P5\n100000 100000\n255\n\0", "is 100000 x 100000 pixels; at most 50000000"),
+    (b"P5\n2 1\n65535\n\0\0\0\0", "8 bits per colour"),
+    (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff\x08\0\0\0\0", "is 2147483647 x 2147483647 pixels"),
+])  # fmt: skip
+def test_empty_and_huge_images_are_refused(tmp_path, data, message):
+    path = write(tmp_path, [[0, 254]])
+    (tmp_path / "map.pgm").write_bytes(data)
+    with pytest.raises(ValueError, match=f"map.pgm: .*{message}"):
+        load_map(path)
 
 
 def test_a_room_has_four_walls_with_the_free_space_on_their_left():

@@ -12,7 +12,7 @@ from whill_mjx import command_line, drive, evaluate, export_mjcf, look
 pytestmark = pytest.mark.quick
 COMMANDS = {
     "look": (look.Look, look.main, True),
-    "drive": (drive.DriveOptions, drive.cli, False),
+    "drive": (drive.DriveOptions, drive.drive_and_say, False),
     "export_mjcf": (export_mjcf.Options, export_mjcf.main, True),
     "evaluate": (evaluate.EvaluateOptions, evaluate.main, False),
 }

@@ -63,7 +63,17 @@ def test_corridor_has_the_papers_limits_and_no_smoothness_term():
 def test_course_actions_cover_one_metre_per_second_both_ways_and_bad_ones_are_tamed():
     course = ObstacleCourse()
     np.testing.assert_allclose(scale_action(course, jnp.array([-3.0, 2.0])), [-1.0, 1.0])
-    np.testing.assert_allclose(scale_action(course, jnp.array([jnp.nan, 0.5])), [0.0, 0.5])
+    for bad in ([jnp.nan, 0.5], [0.5, jnp.nan]):
+        np.testing.assert_allclose(scale_action(course, jnp.array(bad)), [0.0, 0.0])
+        np.testing.assert_allclose(scale_action(Corridor(), jnp.array(bad)), [0.0, 0.0])
+    np.testing.assert_allclose(scale_action(course, jnp.array([jnp.inf, -jnp.inf])), [1.0, -1.0])
+
+
+@pytest.mark.parametrize(("field", "value"), [("v_max", float("nan")), ("omega_max", "x"), ("max_steps", 1.5),
+                                              ("gate_x", (1.0,)), ("goal_radius", -1.0)])
+def test_a_task_refuses_fields_that_are_no_numbers_or_out_of_range(field, value):
+    with pytest.raises(ValueError, match=f"task: {field} is "):
+        ObstacleCourse(**{field: value})
 
 
 def test_corridor_randomisation_spans_the_papers_ranges():

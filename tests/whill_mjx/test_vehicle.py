@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -345,6 +345,41 @@ def test_a_state_that_is_not_finite_is_flagged_and_contained():
     assert not period(params, state, jnp.array([0.1, 0.0])).diverged
 
 
+@pytest.mark.parametrize("command", [(3.0, 0.0), (-3.0, 0.0), (0.0, 4.0), (0.0, -4.0)])
+def test_a_vehicle_cuts_commands_to_its_limits(command):
+    spec, params = preset("whill_cr_physical")
+    slow = dataclasses.replace(spec, v_min=-0.2, v_max=0.4, omega_max=0.6)
+    model = build_model(slow)
+    period = jax.jit(lambda state, command: drive(model, params, state, command))
+    cut = np.clip(command, (-0.2, -0.6), (0.4, 0.6))
+    asked = limited = place(model, params, 0.0, 0.0, 0.0)
+    for _ in range(3):
+        asked, limited = period(asked, jnp.asarray(command)), period(limited, jnp.asarray(cut))
+    np.testing.assert_array_equal(asked.qpos, limited.qpos)
+    assert not asked.diverged
+
+
+def test_commands_within_the_limits_and_their_derivatives_are_left_as_they_are():
+    model, params, _ = compiled_period("whill_cr_paper")  # no delay
+    state = place(model, params, 0.0, 0.0, 0.0)
+
+    def speed(model, command):
+        return substep(model, params, state, command).qvel[:6].sum()
+
+    free = build_model(model.spec, VehicleConfig(limited=False))
+    for command in ((1.0, -1.0), (-1.0, 1.0), (0.3, 0.2)):  # the first two at the limits themselves
+        kept, plain = (jax.jacfwd(partial(speed, one))(jnp.asarray(command)) for one in (model, free))
+        np.testing.assert_array_equal(kept, plain)
+        assert np.abs(plain).max() > 0
+
+
+@pytest.mark.quick
+def test_the_documented_chair_has_the_makers_limits_and_others_those_of_the_papers_course():
+    documented, paper = (preset(name)[0] for name in ("whill_cr_documented", "whill_cr_ramp"))
+    assert (documented.v_min, documented.v_max, documented.omega_max) == (-0.556, 1.667, 1.68)
+    assert (paper.v_min, paper.v_max, paper.omega_max) == (-1.0, 1.0, 1.0)
+
+
 @pytest.mark.quick
 def test_unknown_vehicle_names_the_known_ones():
     with pytest.raises(ValueError, match="unknown vehicle 'tricycle'.*whill_cr"):
@@ -352,10 +387,19 @@ def test_unknown_vehicle_names_the_known_ones():
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize(("field", "value"), [("mass", -1.0), ("track", 0.0), ("wheel_radius", float("nan"))])
+@pytest.mark.parametrize(("field", "value"), [
+    ("mass", -1.0), ("track", 0.0), ("wheel_radius", float("nan")), ("track", True), ("v_max", float("inf")),
+    ("body_length", "x"), ("omega_max", -1.0)])
 def test_a_spec_refuses_what_is_not_physical(field, value):
     with pytest.raises(ValueError, match=f"{field} is .*must be positive"):
         dataclasses.replace(WHILL_CR, **{field: value})
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("field", "value"), [("physics_dt", float("nan")), ("physics_dt", 0.0), ("control_dt", -0.1)])
+def test_time_steps_are_positive_numbers(field, value):
+    with pytest.raises(ValueError, match=f"{field} is .*must be positive"):
+        VehicleConfig(**{field: value})
 
 
 @pytest.mark.quick

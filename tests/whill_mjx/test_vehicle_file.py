@@ -6,7 +6,9 @@ import jax
 import pytest
 
 from sysid.replay.models import with_effects
+from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.types import VehicleParams, parameters_of
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
 pytestmark = pytest.mark.quick
@@ -45,14 +47,55 @@ def test_intervals_and_provenance_are_kept(saved):
         ("wheel_radius = 0.1325", "wheel_radius = -1.0", "wheel_radius is -1.0; it must be positive"),
         ("wheel_radius = 0.1325", "wheel_size = 0.1325", "Remove the entry"),
         ("schema = 1", "schema 1", "not a TOML file"),
+        ("schema = 1", "schema = true", "schema is True"),
+        ("track = 0.496", "track = true", "spec.track is True; it must be a number"),
+        ("body_length = 0.985", 'body_length = "x"', "spec.body_length is 'x'; it must be a number"),
+        ("v_max = 1.0", "v_max = nan", "spec.v_max is nan; it must be a number"),
+        ("omega_max = 1.0", "omega_max = -1.0", "spec.omega_max is -1.0; it must be positive"),
+        ("fov_y = 1.2", "fov_y = 3.2", "spec.camera.fov_y is 3.2; it must be positive, from 0.01 to 3.1 rad"),
+        ("pitch = 0.15", "tilt = 0.15", "spec.camera has unknown field 'tilt'.*Remove the entry"),
+        ("track = 0.496\n", "", r"spec has no field 'track' \[m\]. Add it"),
+        ("value = 52.0", "value = inf", "body.mass is inf; it must be positive, from 0.01 to 10000 kg"),
+        ("value = 52.0", "value = 1" + "0" * 400, "body.mass is an integer of about 398 digits"),
+        ("value = 27.7", "value = -1e9 # ", "pid_drive.kp is -1000000000.0; it must be positive|must lie within 0"),
+        ('name = "forward_slip"', 'name = "pid_drive"', "pid_drive"),
+        ("interval = [50.0, 55.0]", "interval = [55.0, 50.0]", "the lower end comes first"),
+        ("interval = [50.0, 55.0]", "interval = [nan, 50.0]", r"body.mass.interval\[0\] is nan; it must be a number"),
     ],
 )
 def test_a_bad_file_is_refused_with_its_name_and_the_rule(saved, old, new, message):
     text = saved.read_text()
     assert old in text
     saved.write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         load_vehicle(saved)
+        load_intervals(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+def test_an_effect_that_is_there_twice_is_refused(saved):
+    text = saved.read_text()
+    first, end = text.index('[[effects]]\nname = "forward_slip"'), text.index('[[effects]]\nname = "rolling_contact"')
+    saved.write_text(text[:end] + text[first:end] + text[end:])
+    with pytest.raises(ValueError, match="effect 'forward_slip' is there twice.*Remove one of them"):
+        load_vehicle(saved)
+
+
+@pytest.mark.parametrize("name", ["whill_cr", "whill_cr_ramp", "whill_cr_paper", "whill_cr_physical",
+                                  "whill_cr_documented", "whill_cr_castored", "husky", "warthog", "create"])
+def test_every_effect_at_its_neutral_and_usual_values_may_be_in_a_file(tmp_path, name):
+    spec, params = preset(name)
+    have = {effect.name for effect in params.effects}
+    for choose in (lambda about, usual: about.neutral, lambda about, usual: usual[0], lambda about, usual: usual[1],
+                   lambda about, usual: about.low, lambda about, usual: about.high):
+        more = []
+        for other in EFFECTS.values():
+            if other.name not in have:
+                values = {key: choose(about, other.typical.get(key, (about.neutral, about.neutral)))
+                          for key, about in parameters_of(other).items()}
+                more.append(make_effect(other.name, **values))
+        path = save_vehicle(tmp_path / "vehicle.toml", spec, VehicleParams(params.body, (*params.effects, *more)))
+        assert len(load_vehicle(path)[1].effects) == len(EFFECTS)
 
 
 def test_a_file_from_before_a_parameter_was_added_has_it_neutral(tmp_path):
@@ -69,6 +112,21 @@ def test_a_file_from_before_a_parameter_was_added_has_it_neutral(tmp_path):
     path.write_text(text.replace("[effects.parameters.sag]", "[effects.parameters.damping]"))
     with pytest.raises(ValueError, match="suspension"):
         load_vehicle(path)
+
+
+def test_a_built_in_vehicle_is_loaded_by_its_name_and_named_as_its_origin():
+    spec, params, provenance = load_vehicle("whill_cr_ramp")
+    assert (spec, provenance) == (preset("whill_cr_ramp")[0], {"preset": "whill_cr_ramp"})
+    assert [effect.name for effect in params.effects] == [effect.name for effect in preset("whill_cr_ramp")[1].effects]
+
+
+def test_a_file_of_any_ending_is_read_as_a_vehicle_file(saved):
+    assert load_vehicle(saved.rename(saved.with_suffix("")))[2] == {"fit": "none"}
+
+
+def test_a_name_that_is_neither_lists_all_that_are_known():
+    with pytest.raises(ValueError, match="unknown vehicle 'whill'.*create, .*whill_cr, .*whill_cr_ramp.*vehicle file"):
+        load_vehicle("whill")
 
 
 def test_a_missing_file_tells_how_to_make_one(tmp_path):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, Axis, Card, Variant
 from whill_mjx.effects.smooth import yielding_by
 from whill_mjx.vehicle.types import Drive, Motion, parameter
 
@@ -17,12 +18,20 @@ from whill_mjx.vehicle.types import Drive, Motion, parameter
 class ActuatorLag(Effect):
     """(1 + (1 - c) T d/dt) (1 + c T d/dt) F = F_wanted, on the force or the torque of each side (backward Euler).
 
-    One lag where c = 0; a filter and a winding behind one another, as slow together, where it is more.
+    With c = 0 it is one lag. With c > 0 it is two lags in a row, such as a filter and a winding; their time constants
+    add up to T.
     """
 
     name = "actuator_lag"
     typical = {"time_constant": (0.02, 0.15), "cascade": (0.0, 0.5)}
     source = "estimate"
+    card = Card(
+        order=60,
+        variants=(Variant((Axis("time_constant", 0.03, limit=10.0), Axis("cascade", 0.1, dependent=True, limit=5.0))),),
+        forbids=(SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, GONE_WHEN_SETTLED),
+        sensor="motor currents",
+        shown_by_pose=True,
+    )
     time_constant: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time constant of the drive, the sum of both lags")
     cascade: jax.Array = parameter("-", 0.0, 0.5, 0.0, "share of it in the second lag, c")
 
@@ -42,6 +51,6 @@ class ActuatorLag(Effect):
         return wanted + (before - wanted) * self._kept(share, motion)
 
     def _kept(self, share: jax.Array, motion: Motion) -> jax.Array:
-        """Share of what was that a lag keeps in a step."""
+        """Share of its old output that a lag keeps in one step."""
         lag = self.time_constant * share
         return lag / (lag + motion.dt)

@@ -15,8 +15,8 @@ from whill_mjx.vehicle.types import World, parameter
 class AxlePivot(Effect):
     """y -> y (1 - f) at the passive contacts: they carry load, but less of the roll; with f = 1 none of it.
 
-    In a turn the load then shifts between the driven wheels alone, and so does what they can brake with: a chair that
-    brakes hard out of a turn is turned back by its outer wheel. On a skid drive, without passive wheels, it is nothing.
+    In a turn the load then shifts between the driven wheels alone, and so does the force with which they can brake. The
+    outer wheel turns a chair back that brakes hard out of a turn. A skid drive has no passive wheels: no effect there.
     """
 
     name = "axle_pivot"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_ALL_DRIVE, SAME_BACKWARD, Axis, Card, Variant
 from whill_mjx.effects.smooth import scale_drive
 from whill_mjx.vehicle.types import Drive, Motion, parameter
 
@@ -19,21 +20,27 @@ class Gap:
 
     angle: jax.Array  # (2,) rad, within +-play
     rate: jax.Array  # (2,) rad/s
-    due: jax.Array  # (2,) N m, what is left of a blow that fell late in the step before
+    due: jax.Array  # (2,) N m, rest of a blow that came late in the previous step
 
 
 @struct.dataclass
 class Backlash(Effect):
     """The motor crosses the gap by itself: I d2(phi)/dt2 = T, |phi| <= beta; at +-beta it strikes the wheel and stays.
 
-    I is the motor's part of the spin inertia of one side: after a reversal to torque T nothing reaches the wheel for
-    sqrt(4 beta I / T). Then the momentum gathered meanwhile does, at once: nothing of it is lost, it comes late, and a
-    controller that sees the wheel's speed may hunt. The blow lasts one physics step from where the gap closes.
+    I is the motor's share of the spin inertia of one side. After a reversal to torque T nothing reaches the wheel for
+    sqrt(4 beta I / T). Then all momentum gathered meanwhile arrives in one blow, which lasts one physics step from the
+    instant at which the gap closes. A controller that sees the wheel's speed may hunt.
     """
 
     name = "backlash"
     typical = {"play": (0.0035, 0.0175), "rotor": (0.3, 1.0)}
     source = "estimate: 0.2 to 1 degree at the wheel; hub motors have none. Two masses with a gap: Nordin 2002"
+    card = Card(
+        order=230,
+        variants=(Variant((Axis("play", 0.007, limit=10.0),)),),
+        forbids=(GONE_WHEN_SETTLED, SAME_BACKWARD, SAME_ALL_DRIVE),
+        sensor="encoders on the motors beside those on the wheels",
+    )
     play: jax.Array = parameter("rad", 0.0, 0.2, 0.0, "half of the free angle at the wheel, beta")
     rotor: jax.Array = parameter("-", 0.1, 1.0, 1.0, "share of a side's spin inertia that is the motor's")
 

@@ -1,10 +1,11 @@
 """What an effect is, and how a tuple of effects acts together.
 
-An effect is a frozen pytree whose leaves are its own parameters. It acts at one place, by one method named after it:
+An effect is a frozen pytree whose leaves are its own parameters. It acts at one place, by one method named after the
+place:
 
     command(memory, command (2,), motion)   -> memory, command     delay, dead zone, limiter
     actuation(memory, Drive, motion)        -> memory, Drive       controller, lag, saturation
-    force(memory, motion)                   -> memory, Wrench      friction, slip, drag; what reacts comes last
+    force(memory, motion)                   -> memory, Wrench      friction, slip, drag; those that react come last
     world(memory, World)                    -> memory, World       slope, ground, true geometry
     sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
     outside(memory, path (R, 3), dt)        -> memory, path        latency of a pose measured from outside; replays only
@@ -15,19 +16,21 @@ Effects of one place act in the order of the tuple; forces add up. At its neutra
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.vehicle.types import Motion, Wrench
+from whill_mjx.effects.card import Card
+from whill_mjx.vehicle.types import Motion, World, Wrench
 
-GRAVITY = 9.81  # [m/s^2], turns the load of a contact into the mass that it carries
+TINY = 1e-12  # keeps divisions defined at a step or a width of 0
 PLACES = ("command", "actuation", "force", "world", "sensing", "outside")
 
 
 class Effect:
-    """Base of all effects: no memory unless `init` says so."""
+    """Base of all effects. An effect has no memory unless it defines `init`."""
 
     name: ClassVar[str] = ""
     typical: ClassVar[dict[str, tuple[float, float]]] = {}
@@ -35,20 +38,33 @@ class Effect:
     source: ClassVar[str] = ""
     """Where equation and usual values come from; "estimate" where no source is known."""
     reacts: ClassVar[bool] = False
-    """Of place `force`: it depends on the drive and on all other forces (`motion.others`), and so acts after them."""
+    """Whether an effect of place `force` depends on the drive and all other forces (`motion.others`): it acts last."""
     room_fixed: ClassVar[bool] = False
     """Whether the motion depends on where in the room the vehicle starts and which way it faces."""
+    card: ClassVar[Card] = Card()
+    """What the closed loop needs to look for the effect in a log."""
 
     def init(self) -> Any:
         """Memory at the start of a drive."""
         return ()
 
 
-def place_of(effect: Effect) -> str:
-    """The one place where `effect` acts; TypeError if it has none or several."""
+class Surface(Effect):
+    """Base of effects that shape the ground. They define `height(x, y)`; see `whill_mjx.vehicle.ground`."""
+
+    room_fixed = True
+
+    def world(self, memory: tuple[()], world: World) -> tuple[tuple[()], World]:
+        """World with this surface on its ground."""
+        return memory, replace(world, ground=(*world.ground, self))
+
+
+def place_of(effect: Effect | type[Effect]) -> str:
+    """The one place where an effect or its class acts; TypeError if it has none or several."""
     places = [place for place in PLACES if hasattr(effect, place)]
     if len(places) != 1:
-        raise TypeError(f"effect {type(effect).__name__} acts at {places}; an effect has exactly one of {PLACES}.")
+        name = effect.__name__ if isinstance(effect, type) else type(effect).__name__
+        raise TypeError(f"effect {name} acts at {places}; an effect has exactly one of {PLACES}.")
     return places[0]
 
 
@@ -62,7 +78,7 @@ def apply_chain(effects: tuple, memory: tuple, place: str, value: Any, *context:
 
 
 def sum_forces(effects: tuple, memory: tuple, motion: Motion, reacts: bool) -> tuple[tuple, Wrench]:
-    """Sum of the wrenches of the effects of place `force` that react, or of those that do not; and the new memory."""
+    """New memory, and the summed wrench of the effects of place `force` that react, or of those that do not."""
     memory_list = list(memory)
     total = Wrench.zero()
     for index, effect in enumerate(effects):
@@ -86,7 +102,7 @@ def contact_wrench(motion: Motion, forward: jax.Array, left: jax.Array, normal: 
 
 
 def yaw_rate(motion: Motion) -> jax.Array:
-    """Turning of the chassis about the ground's normal [rad/s]."""
+    """Yaw rate of the chassis about the ground's normal [rad/s]."""
     return (motion.ground_axes[2] * motion.angular_velocity).sum()
 
 
@@ -127,3 +143,8 @@ def resting_mass(motion: Motion) -> jax.Array:
     x = motion.world.geometry.contact_x
     front = jnp.clip((motion.com[0] - x[0]) / (x[2] - x[0]), 0.01, 0.99)
     return motion.total_mass / 2 * jnp.stack([1 - front, 1 - front, front, front])
+
+
+def in_steps(value: jax.Array, step: jax.Array) -> jax.Array:
+    """Values of any shape rounded to multiples of `step`; unchanged where the step is 0."""
+    return jnp.where(step > 0, step * jnp.round(value / jnp.maximum(step, TINY)), value)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, Alike, Axis, Card, Variant
 from whill_mjx.vehicle.types import Motion, parameter
 
-SLOTS = 8  # changes of the command that may be under way at once; older ones are taken as arrived
+SLOTS = 8  # changes of the command that can be under way at once; older ones count as arrived
 
 
 @struct.dataclass
@@ -24,13 +25,23 @@ class CommandMemory:
 class CommandDelay(Effect):
     """A command acts `delay` after it is sent: u(t) = u_sent(t - delay).
 
-    Changes are kept with their age, so any delay is possible and the derivative with respect to it is defined: within
-    one physics step before its time a change is blended in linearly.
+    Changes are stored with their age, so any delay is possible. A change is blended in linearly over the last physics
+    step of its delay, so the derivative with respect to the delay is defined.
     """
 
     name = "command_delay"
     typical = {"delay": (0.02, 0.2)}
     source = "estimate; a command takes 2.6 ms on the serial line alone"
+    card = Card(
+        order=10,
+        variants=(Variant((Axis("delay", 0.04, limit=10.0),), kind="parameter_shift"),),
+        forbids=(SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, GONE_WHEN_SETTLED),
+        sensor="a log of the commands as the vehicle receives them",
+        shown_by_pose=True,
+        alike=(Alike(("sensor_delay", "clock_offset", "state_rate"), "shifts in time",
+                     "an outside pose, which sees the first alone"),
+               Alike(("pose_delay",), "shifts in time", "odometry, which sees the first alone")),
+    )
     delay: jax.Array = parameter("s", 0.0, 0.5, 0.0, "time from sending a command to its effect")
 
     def init(self) -> CommandMemory:
@@ -49,9 +60,9 @@ class CommandDelay(Effect):
         return CommandMemory(value, age + motion.dt), delayed
 
     def ahead(self, commands: jax.Array, dt: float) -> jax.Array:
-        """What acts in each of S physics steps of `dt` [s], of the commands (S, 2) sent in them and none before.
+        """The command (S, 2) in force in each of S physics steps of `dt` [s], from the commands (S, 2) sent in them.
 
-        The result of `command` step by step, however many changes are under way, for commands that are all known.
+        The same as `command` step by step, but for any number of changes under way. Before the first step none is sent.
         """
         steps = self.delay / dt
         whole = jnp.floor(steps)

@@ -6,19 +6,19 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect
+from whill_mjx.effects.base import TINY, Effect
+from whill_mjx.effects.card import Card
 from whill_mjx.vehicle.types import Motion, parameter
 
 MAKER = {"linear": 0.004 / 3.6, "angular": 0.004 / 3.6 / 0.496, "v_min": -0.556, "v_max": 1.667, "omega_max": 1.68}
 """The chair's values: words of 0.004 km/h, -500 to 1500 forward and +-750 turning (wheel difference over the track)."""
-TINY = 1e-12  # keeps the division defined at a step of 0
 
 
 @struct.dataclass
 class CommandQuantisation(Effect):
     """u -> q trunc(u / q), clamped: truncation toward zero, as the drivers do it.
 
-    Not smooth in u; in q it is differentiable but for the jumps from one multiple to the next.
+    Not smooth in u. In q it is differentiable, except at the jumps from one multiple to the next.
     """
 
     name = "command_quantisation"
@@ -27,6 +27,7 @@ class CommandQuantisation(Effect):
         "v_min": (-0.556, -0.556), "v_max": (1.667, 1.667), "omega_max": (1.68, 1.68),
     }  # fmt: skip
     source = "maker's protocol specification, Rev 10, SetVelocity: 1.111 mm/s and 2.240 mrad/s"
+    card = Card(stepped=True)
     linear: jax.Array = parameter("m/s", 0.0, 0.02, 0.0, "step of v")
     angular: jax.Array = parameter("rad/s", 0.0, 0.04, 0.0, "step of omega")
     v_min: jax.Array = parameter("m/s", -5.0, 0.0, float("-inf"), "smallest v")

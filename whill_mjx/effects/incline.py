@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import Effect
-from whill_mjx.vehicle.types import World, parameter
+from whill_mjx.effects.base import Surface
+from whill_mjx.effects.card import Card
+from whill_mjx.vehicle.types import parameter
 
 
 @struct.dataclass
-class Incline(Effect):
+class Incline(Surface):
     """The ground is a plane through the room's origin that rises by a towards +x and by b towards +y.
 
-    The vehicle climbs and tilts, and its camera with it; `slope` is the same motion seen from the ground plane, where
-    gravity tilts instead and the vehicle's height stays.
+    The vehicle climbs and tilts, and its camera with it. `slope` is the same motion in coordinates of the ground plane:
+    gravity tilts instead, and the vehicle's height stays.
     """
 
     name = "incline"
-    room_fixed = True
     typical = {"along_x": (-0.08, 0.08), "along_y": (-0.05, 0.05)}
     source = "estimate: wheelchair ramps to 1:12 (0.083 rad), cross slopes to 1:20"
+    card = Card(mirrored=("along_y",))
     along_x: jax.Array = parameter("rad", -0.3, 0.3, 0.0, "rise of the ground towards +x of the room, a")
     along_y: jax.Array = parameter("rad", -0.3, 0.3, 0.0, "rise of the ground towards +y of the room, b")
-
-    def world(self, memory: tuple[()], world: World) -> tuple[tuple[()], World]:
-        """World with this surface on its ground."""
-        return memory, replace(world, ground=(*world.ground, self))
 
     def height(self, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Height [m] and slopes at places of any shape; the normal is (-sin a, -sin b, ...)."""

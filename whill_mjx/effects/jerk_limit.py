@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_ALL_DRIVE, Axis, Card, Falsifier, Variant
 from whill_mjx.vehicle.types import Motion, parameter
 
 
@@ -22,13 +23,20 @@ class JerkMemory:
 class JerkLimit(Effect):
     """The command followed at a limited jerk: |d2v/dt2| <= j, an S-shaped ramp of duration 2 sqrt(step / j).
 
-    The acceleration grows with j, and falls along a = sqrt(2 j e) as the distance e to the command closes, so that it
-    is 0 when the command is reached; the steps of that fall add up to e in discrete time.
+    The acceleration grows at the rate j. It then falls along a = sqrt(2 j e) with the distance e to the command, so
+    that it is 0 when the command is reached. In discrete time the steps of that fall add up to e.
     """
 
     name = "jerk_limit"
     typical = {"linear": (5.0, 50.0), "angular": (10.0, 100.0)}
     source = "estimate: ramps of 0.1 to 0.3 s"
+    card = Card(
+        order=40,
+        variants=(Variant((Axis("linear", 20.0, form="inverse"), Axis("angular", 40.0, form="inverse"))),),
+        forbids=(Falsifier("lasts as the root of the command's step", "size of the step"), GONE_WHEN_SETTLED,
+                 SAME_ALL_DRIVE),
+        sensor="a log of the wheel-speed targets inside the vehicle",
+    )
     linear: jax.Array = parameter("m/s^3", 0.2, 100.0, float("inf"), "largest change of the acceleration of v")
     angular: jax.Array = parameter("rad/s^3", 0.4, 200.0, float("inf"), "largest change of the acceleration of omega")
 
@@ -39,7 +47,7 @@ class JerkLimit(Effect):
         """Smoothed command (2,)."""
         jerk = jnp.stack([self.linear, self.angular])
         value, change = memory.value, memory.change
-        step = jerk * motion.dt**2  # by which the change may change
+        step = jerk * motion.dt**2  # largest difference between two changes
         # The change b from which steps of b, b - step, b - 2 step, ... add up to the distance.
         distance = jnp.abs(command - value)
         braking = 4 * distance / (1 + jnp.sqrt(1 + 8 * distance / step))

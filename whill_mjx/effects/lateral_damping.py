@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.effects.base import GRAVITY, Effect, contact_wrench, resting_mass
+from whill_mjx.effects.base import Effect, contact_wrench, resting_mass
+from whill_mjx.vehicle.specs import GRAVITY
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 TOUCHING = 3.0  # a passive wheel loses its damping smoothly below a third of the load that it has at rest
@@ -14,12 +15,12 @@ TOUCHING = 3.0  # a passive wheel loses its damping smoothly below a third of th
 
 @struct.dataclass
 class LateralDamping(Effect):
-    """F_y = -c m v_y at each contact, c of its axle, m the mass it carries: driven wheels now, passive ones at rest.
+    """F_y = -c m v_y at each contact, with c of its axle and m the mass it carries (of passive wheels: at rest).
 
-    A tyre holds by its load. The rollers of a passive wheel turn in bearings, whose viscous drag does not know it: with
-    the present load, a front axle that lifts as the vehicle pulls away would let it turn more easily, and fits of
-    vehicles that do not brought the centre of mass down to the floor, where no load shifts. Source of the law and of
-    c: reference paper, Table II.
+    A tyre's grip follows its present load. The rollers of a passive wheel turn in bearings, whose viscous drag does not
+    depend on it. With the present load, a front axle that lifts while the vehicle pulls away would make turning easier.
+    Fits of real vehicles, where this is not so, then put the centre of mass on the floor to avoid the shift of load.
+    Source of the law and of c: reference paper, Table II.
     """
 
     name = "lateral_damping"

@@ -14,9 +14,9 @@ from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 @struct.dataclass
 class OdometryLag(Effect):
-    """First-order low-pass of the reported v and omega; the pose, from encoder counts, is not filtered.
+    """First-order low-pass of the reported v and omega; the pose comes from encoder counts and is not filtered.
 
-    Source: the maker's driver documentation (motor speed is low-pass filtered; use angle and counter instead).
+    Source: the maker's driver documentation, which advises to use angle and counter instead of the filtered speed.
     """
 
     name = "odometry_lag"

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import LAW_OF_SPEED, SAME_ALL_DRIVE, SAME_BACKWARD, Alike, Axis, Card, Variant
 from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 
 @struct.dataclass
 class ScaleMemory:
-    """The pose read last, and how far the reported position has moved away from it."""
+    """The latest pose, and by how much the reported position differs from it."""
 
     pose: jax.Array  # (3,) x, y, yaw
     shift: jax.Array  # (2,) m
@@ -22,11 +23,18 @@ class ScaleMemory:
 
 @struct.dataclass
 class OdometryScale(Effect):
-    """v -> s_v v, omega -> s_omega omega, and the pose they add up to: the odometry's radius or track is wrong."""
+    """v -> s_v v, omega -> s_omega omega, and the pose they integrate to: the odometry's radius or track is wrong."""
 
     name = "odometry_scale"
     typical = {"linear": (0.98, 1.02), "angular": (0.95, 1.05)}
     source = "published wheel radii of the chair, 0.1325 and 0.135 m; tracks 0.490 and 0.496 m"
+    card = Card(
+        order=240,
+        variants=(Variant((Axis("linear", 0.005, signed=True), Axis("angular", 0.01, signed=True))),),
+        forbids=(LAW_OF_SPEED, SAME_BACKWARD, SAME_ALL_DRIVE),
+        sensor="an outside pose",
+        alike=(Alike(("command_scale", "wheel_radius_difference"), "scales of distance", "an outside pose"),),
+    )
     linear: jax.Array = parameter("-", 0.7, 1.3, 1.0, "scale of distance and speed")
     angular: jax.Array = parameter("-", 0.5, 2.0, 1.0, "scale of heading and yaw rate")
 

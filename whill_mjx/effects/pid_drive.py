@@ -8,6 +8,7 @@ import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import Card
 from whill_mjx.effects.planar import look_ahead
 from whill_mjx.effects.wheel_pid import PidMemory, pid, pid_memory
 from whill_mjx.vehicle.types import Drive, Motion, Wrench, parameter
@@ -20,6 +21,7 @@ class PidDrive(Effect):
     name = "pid_drive"
     typical = {"kp": (10.0, 28.0), "ki": (0.0, 0.5), "kd": (0.0, 0.75), "integral_limit": (0.5, 1.5)}
     source = "reference paper, Table II"
+    card = Card(drives=True)
     kp: jax.Array = parameter("1/s", 0.5, 60.0, 0.0, "proportional gain")
     ki: jax.Array = parameter("1/s^2", 0.0, 20.0, 0.0, "integral gain")
     kd: jax.Array = parameter("-", 0.0, 0.9, 0.0, "derivative gain")
@@ -55,8 +57,8 @@ class ForwardSlip(Effect):
 class RollingContact(Effect):
     """Driven wheels roll without slip: the torque that makes their speed that of the ground after one step.
 
-    The paper's model has no wheel-spin state; with this effect its wheels follow the body.
-    `grip` = 0 is neutral (the wheels are left alone), 1 is rolling without slip.
+    The paper's model has no wheel speeds of its own; this effect makes its wheels follow the body. With `grip` = 0 it
+    does nothing, with 1 the wheels roll without slip.
     """
 
     name = "rolling_contact"

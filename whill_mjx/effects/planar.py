@@ -1,4 +1,4 @@
-"""The chassis on the ground as a rigid body in the plane: where it will be one step on.
+"""The chassis as a rigid body in the plane of the ground: its motion after the next physics step.
 
 A wheel that grips is stiff: its force follows the speeds that wheel and chassis have after the step, not before it.
 Effects that react so (`Effect.reacts`) act last, when the sum of all other forces on the chassis is known.
@@ -16,7 +16,7 @@ from whill_mjx.vehicle.types import Motion
 
 @struct.dataclass
 class Ahead:
-    """Planar motion after one step under all forces but those of the wheels in question; chassis frame."""
+    """Planar motion after one step under all forces except those of the gripping wheels; chassis frame."""
 
     forward: jax.Array  # (2,) speed of the driven contacts of the left and the right side [m/s]
     left: jax.Array  # (2,) speed of the rear and the front contacts to the left [m/s]
@@ -25,9 +25,9 @@ class Ahead:
 
 
 def look_ahead(motion: Motion) -> Ahead:
-    """Speeds of the contacts one physics step on, under `motion.others` and gravity.
+    """Speeds of the contacts after one physics step under `motion.others` and gravity.
 
-    m (v' + omega x v) = F and I omega' = T about the centre of mass, in the chassis frame; pitch and roll go on.
+    m (v' + omega x v) = F and I omega' = T about the centre of mass, in the chassis frame. Pitch and roll rates stay.
     """
     mass, com = motion.total_mass, motion.com
     others, rate = motion.others, yaw_rate(motion)
@@ -47,7 +47,7 @@ def look_ahead(motion: Motion) -> Ahead:
 
 
 def spin_response(motion: Motion) -> jax.Array:
-    """Spin acceleration per motor torque (2,) [1/(kg m^2)], of both wheels together and of one against the other.
+    """Spin acceleration per motor torque (2,) [1/(kg m^2)]: with both sides in the same and in opposite directions.
 
     The wheels roll without slip and turn the chassis about the driven axle, whose tyres hold it sideways.
     """
@@ -59,7 +59,7 @@ def spin_response(motion: Motion) -> jax.Array:
 
 
 def by_mode(values: jax.Array, factors: jax.Array) -> jax.Array:
-    """Values (2,) of the left and the right side, their mean times factors[0], their difference times factors[1]."""
+    """Values (2,) of the left and right side with their mean times factors[0] and their difference times factors[1]."""
     together = (values[0] + values[1]) / 2 * factors[0]
     against = (values[1] - values[0]) / 2 * factors[1]
     return jnp.stack([together - against, together + against])

@@ -7,20 +7,27 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import SAME_ALL_DRIVE, SHOWS_AT_BOTH_ENDS, Axis, Card, Variant
 from whill_mjx.vehicle.types import parameter
 
 
 @struct.dataclass
 class PoseDelay(Effect):
-    """y(t) = x(t - tau) of the outside pose: its stamps are those of receipt, not of measurement.
+    """y(t) = x(t - tau) of the outside pose: its time stamps are those of receipt, not of measurement.
 
-    Acts in replays of logs alone. The pose a drive starts with is as late as all others, so the drive is seen from
-    there; before it the vehicle went on as in its first instant.
+    It acts in replays of logs only. The first pose of a drive is as late as all others, so the path is aligned to it.
+    Before the first instant the vehicle is assumed to have moved as in it.
     """
 
     name = "pose_delay"
     typical = {"delay": (0.05, 0.6)}
     source = "lidar poses of the published DRIVE logs lag their own gyro by 0.2 to 0.6 s"
+    card = Card(
+        order=280,
+        variants=(Variant((Axis("delay", 0.05, limit=20.0),)),),
+        forbids=(SHOWS_AT_BOTH_ENDS, SAME_ALL_DRIVE),
+        shown_by_pose=True,
+    )
     delay: jax.Array = parameter("s", 0.0, 1.5, 0.0, "age of an outside pose at its time stamp")
 
     def outside(self, memory: tuple[()], path: jax.Array, dt: float) -> tuple[tuple[()], jax.Array]:
@@ -41,7 +48,7 @@ class PoseDelay(Effect):
 
 
 def _gone_back(poses: jax.Array, path: jax.Array, time: jax.Array, dt: float) -> jax.Array:
-    """Poses (R, 3) moved by times (R,) [s], none of them positive, along the arc of the path's first step."""
+    """Poses (R, 3) moved by times (R,) [s], all at most 0, along the arc of the path's first step."""
     step = (path[1] - path[0]) / dt
     turned = step[2] * time
     chord = time * jnp.sinc(turned / (2 * jnp.pi)) / jnp.sinc(step[2] * dt / (2 * jnp.pi))

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench
+from whill_mjx.effects.smooth import REST_SPEED, soft_sign
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
-
-REST_SPEED = 0.02  # [m/s], smooths the change of sign at rest
 
 
 @struct.dataclass
@@ -23,5 +22,5 @@ class RollingResistance(Effect):
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench of the losses at the four contacts."""
-        loss = -self.mu_r * motion.normal_force * jnp.tanh(motion.contact_vx / REST_SPEED)
+        loss = -self.mu_r * motion.normal_force * soft_sign(motion.contact_vx, REST_SPEED)
         return memory, contact_wrench(motion, loss, jnp.zeros(4))

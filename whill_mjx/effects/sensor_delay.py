@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, Axis, Card, Variant
 from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 SLOTS = 16  # readings kept; SLOTS * GAP is the longest delay
@@ -20,24 +21,30 @@ class PastReadings:
     """Readings of the past, newest first."""
 
     value: jax.Array  # (SLOTS, 5) x, y, yaw, v, omega
-    age: jax.Array  # () s, of the newest; each of the others is one gap older than the one before
+    age: jax.Array  # () s, of the newest; each next one is one gap older
 
 
 @struct.dataclass
 class SensorDelay(Effect):
-    """y(t) = x(t - tau) of the pose of the odometry, y(t) = x(t - tau - tau_v) of its speeds.
+    """y(t) = x(t - tau) for the pose of the odometry, y(t) = x(t - tau - tau_v) for its speeds.
 
-    Speeds that come from counts of an encoder are means over the time between two counts, and older by half of it.
-
-    A reading is kept every 20 ms and those between are interpolated. Before the first one the vehicle is taken to have
+    Speeds from encoder counts are means over the time between two counts, and older by half of that time. A reading is
+    stored every 20 ms; between stored readings we interpolate. Before the first one the vehicle is assumed to have
     stood at the odometry's origin.
     """
 
     name = "sensor_delay"
     typical = {"delay": (0.005, 0.1), "speed": (0.0, 0.02)}
     source = "estimate"
+    card = Card(
+        order=250,
+        variants=(Variant((Axis("delay", 0.02),)),),
+        forbids=(SAME_FOR_ANY_STEP, SHOWS_AT_BOTH_ENDS, GONE_WHEN_SETTLED),
+        sensor="an outside pose on the clock of the commands",
+        shown_by_pose=True,
+    )
     delay: jax.Array = parameter("s", 0.0, 0.3, 0.0, "age of a reading when it is reported, tau")
-    speed: jax.Array = parameter("s", 0.0, 0.1, 0.0, "by how much its speeds are older, tau_v")
+    speed: jax.Array = parameter("s", 0.0, 0.1, 0.0, "additional age of its speeds, tau_v")
 
     def init(self) -> PastReadings:
         return PastReadings(jnp.zeros((SLOTS, 5)), GAP * jnp.ones(()))

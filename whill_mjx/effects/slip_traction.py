@@ -13,23 +13,26 @@ from whill_mjx.effects.planar import held, look_ahead
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 ROUNDS = 2  # of the implicit step
-NEWTON = 2  # steps towards how fast a wheel slides beyond its creep
-TINY = 1e-6  # [N], [m/s] or [-], keeps ratios defined where nothing grips and slopes where nothing slides
+NEWTON = 2  # steps for the sliding speed beyond the creep
+TINY = 1e-6  # [N], [m/s] or [-], keeps ratios defined without grip and slopes defined without sliding
 
 
 @struct.dataclass
 class SlipTraction(Effect):
     """Slip force of driven wheels in a friction circle: mu N q / sqrt(1 + q^2), q^2 = (s_x / s0)^2 + (s_y / s0_y)^2.
 
-    s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact; s0 and s0_y are the sliding speeds along
-    and across the wheel at which the force has 1/sqrt(2) of its limit. A tyre creeps as its force bends it, by s0_i F_i
-    / (mu N) each way, and beyond that it slides against its force, by p F / (mu N): F_i = mu N s_i / (s0_i + p), with
-    the p that gives F its size. A wheel that slides is held by mu N against the way that it slides (Coulomb), whatever
-    s0 are; one that creeps across, as all do in a bend, grips along as it does on a straight. (With sqrt(s0_i^2 +
-    |s|^2) in place of s0_i + p, each way by itself, 6 mm/s across made a wheel of s0 = 1 mm/s six times softer along,
-    and a chair's bends a thousandth too wide.) The wheel gets the reaction -r F_x. Both are advanced implicitly: F is
-    taken at the speeds that wheels and chassis will have after the step, so that any s0 and s0_y are stable at any
-    step. Passive wheels roll: they carry `mu_free` N sideways only.
+    s = (r spin - v_x, -v_y) is the sliding velocity at each driven contact. At the sliding speeds s0 (along the wheel)
+    and s0_y (across it) the force has 1/sqrt(2) of its limit.
+
+    A tyre creeps as its force bends it, by s0_i F_i / (mu N) in each direction i. Beyond that it slides against its
+    force, by p F / (mu N). So F_i = mu N s_i / (s0_i + p), with the p that gives F its size. For a wheel that slides,
+    this is Coulomb friction mu N against the sliding velocity, for any s0. A wheel that creeps across, as all do in a
+    bend, grips along as it does on a straight. With sqrt(s0_i^2 + |s|^2) instead of s0_i + p it would not: 6 mm/s
+    across would make a wheel of s0 = 1 mm/s six times softer along.
+
+    The wheel gets the reaction -r F_x. Both are advanced implicitly: F is that at the speeds of wheels and chassis
+    after the step, so any s0 and s0_y are stable at any step. Passive wheels roll; they carry at most `mu_free` N,
+    sideways.
     """
 
     name = "slip_traction"
@@ -37,8 +40,8 @@ class SlipTraction(Effect):
     typical = {"mu": (0.2, 0.9), "slip_speed": (0.005, 0.1), "side_slip_speed": (0.02, 0.1), "mu_free": (0.0, 0.1)}
     source = "estimate: 0.6 to 0.9 dry, 0.2 to 0.4 wet"
     mu: jax.Array = parameter("-", 0.05, 1.5, 0.0, "friction coefficient of driven wheels")
-    slip_speed: jax.Array = parameter("m/s", 0.0005, 2.0, 0.05, "sliding speed along the wheel of half grip, s0")
-    side_slip_speed: jax.Array = parameter("m/s", 0.001, 2.0, 0.05, "sliding speed across the wheel of half grip, s0_y")
+    slip_speed: jax.Array = parameter("m/s", 0.0005, 2.0, 0.05, "sliding speed along the wheel at 71 % grip, s0")
+    side_slip_speed: jax.Array = parameter("m/s", 0.001, 2.0, 0.05, "sliding speed across it at 71 % grip, s0_y")
     mu_free: jax.Array = parameter("-", 0.0, 1.0, 0.0, "sideways friction coefficient of passive wheels")
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
@@ -85,8 +88,10 @@ class SlipTraction(Effect):
         return memory, replace(wrench, spin_torque=reaction + yielding.factor * change)
 
     def _beyond_creep(self, along: jax.Array, across: jax.Array) -> jax.Array:
-        """p (4,) [m/s] of sliding velocities (4,) along and across: by Newton's method on |F|, from what is right along
-        one axis."""
+        """p (4,) [m/s] for sliding velocities (4,) along and across, by Newton's method on |F|.
+
+        It starts from the solution for sliding along one axis only.
+        """
         share = (along / self.slip_speed) ** 2 + (across / self.side_slip_speed) ** 2 + TINY  # q^2
         speed = jnp.sqrt(along**2 + across**2 + TINY**2)
         beyond = speed * jnp.sqrt(share) / (1.0 + jnp.sqrt(1.0 + share))

@@ -9,11 +9,14 @@ import jax.numpy as jnp
 
 from whill_mjx.vehicle.types import Drive, Yielding
 
+REST_SPEED = 0.02  # [m/s] width over which forces change their sign at rest
+REST_RATE = 0.05  # [rad/s] width over which torques change their sign at rest
+
 
 def soft_limit(value: jax.Array, limit: jax.Array) -> jax.Array:
-    """value / (1 + (value / limit)^4)^(1/4): `value` below its limit, the limit far above, 0.84 of it where they meet.
+    """value / (1 + (value / limit)^4)^(1/4): `value` far below the limit, 0.84 of it at the knee.
 
-    Sharper than limit * tanh(value / limit), and `value` to the last bit at limit = inf.
+    Sharper than limit * tanh(value / limit), and exactly `value` at limit = inf.
     """
     square = jnp.square(value / limit)
     return value / jnp.sqrt(jnp.sqrt(1 + jnp.square(square)))
@@ -25,18 +28,18 @@ def soft_sign(value: jax.Array, width: float) -> jax.Array:
 
 
 def scale_drive(drive: Drive, factor: jax.Array) -> Drive:
-    """Force and torque of the drive times `factor`, () or (2,): either drive uses one of the two."""
+    """Force and torque of the drive times `factor`, () or (2,); a vehicle's drive uses one of them."""
     return replace(drive, force=drive.force * factor, torque=drive.torque * factor,
                    yielding=yielding_by(drive, factor))
 
 
 def yielding_by(drive: Drive, factor: jax.Array) -> Yielding:
-    """How the drive's torque yields where only a share of it, () or (2,), still reaches the wheel within the step."""
+    """How the drive's torque yields if only a share `factor` of it, () or (2,), reaches the wheel within the step."""
     return replace(drive.yielding, factor=drive.yielding.factor * factor)
 
 
 def limit_drive(drive: Drive, force: jax.Array, torque: jax.Array) -> Drive:
-    """The drive with force and torque limited (`soft_limit`): where the limit holds the torque, it yields no more."""
+    """The drive with force and torque limited by `soft_limit`; a torque at its limit yields no further."""
     square = jnp.square(jnp.square(drive.torque / torque))
     share = 1 / ((1 + square) * jnp.sqrt(jnp.sqrt(1 + square)))  # the limit's slope
     return replace(drive, force=soft_limit(drive.force, force), torque=soft_limit(drive.torque, torque),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import Card
 from whill_mjx.vehicle.types import Motion, Odometry, parameter
 
 MAKER = {"period": 0.02}
@@ -17,15 +18,16 @@ MAKER = {"period": 0.02}
 
 @struct.dataclass
 class StateRate(Effect):
-    """The odometry of the latest message, one every `period`: a value is up to a period old.
+    """The odometry is that of the latest message, one every `period`: a value is up to one period old.
 
-    On average a delay of half a period. `whill_mjx.drive` samples the simulated state at the log's own rate, so this
-    effect is for what acts on the state between messages. Not smooth in the period.
+    The mean delay is half a period. `whill_mjx.drive` samples the simulated state at the log's own rate, so this effect
+    is for programs that act on the state between messages. Not smooth in the period.
     """
 
     name = "state_rate"
     typical = {"period": (0.01, 0.05)}
     source = "maker's drivers: 50 Hz of at most 100 Hz; 2 Hz by default on the CR2"
+    card = Card(stepped=True)
     period: jax.Array = parameter("s", 0.0, 1.0, 0.0, "time between two messages")
 
     def init(self) -> jax.Array:

@@ -15,9 +15,9 @@ from whill_mjx.vehicle.types import World, parameter
 class Suspension(Effect):
     """Each contact is a spring that a quarter of the weight compresses by s, with zeta times the critical damping.
 
-    When drive and brakes pull, a soft chair nods at sqrt(g / s) before its loads have shifted, and its wheels turn with
-    the nodding: seen in their speed, it looks like a late command and a high gain. Of a chair that hardly gives way
-    loads shift at once: they are those at the end of a physics step (`vehicle.sprung_forces`), whatever the sag.
+    When drive or brakes pull, a soft chair nods at sqrt(g / s) before its loads have shifted, and its wheels turn with
+    the nodding. In the wheel speeds this looks like a late command and a high gain. On a stiff chair the loads shift at
+    once. Loads are those at the end of a physics step (`vehicle.dynamics`), so any sag is stable.
     """
 
     name = "suspension"

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import Card
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle.types import Drive, Motion, Yielding, parameter
 
-TINY = 1e-6  # [N m] or [rad/s], keeps shares defined where torque or target does not change
+TINY = 1e-6  # [N m] or [rad/s], keeps shares defined at constant torque or target
 
 
 @struct.dataclass
@@ -43,31 +44,32 @@ class DriveMemory:
 class TorqueDrive(Effect):
     """T = clip(kp e + ki integral of e + kff v_target / r, +-limit) with e = v_target / r - spin.
 
-    A controller that runs every `period` seconds and holds its torque meanwhile knows a spin that is half a period old
-    on average: that of kp's e is. Its integral counts every jump of the wanted speed half a period too long, which is a
-    feed-forward kff of ki period / 2; another makes up for bearings that resist with speed.
+    A controller that runs every `period` seconds and holds its torque in between sees a spin that is half a period old
+    on average: kp acts on that old spin. Its integral counts every jump of the wanted speed half a period too long,
+    which equals a feed-forward kff of ki period / 2. More kff can compensate bearings that resist with speed.
 
-    e and its integral are those in the middle of the physics step, with the acceleration that this torque gives to
-    rolling wheels under the load of the step before: a controller that acts all the time, not once in a step. Where a
-    wheel slips it accelerates otherwise; e is then taken as it turns out (`Yielding`).
+    e and its integral are those in the middle of the physics step: the controller acts all the time, not once in a
+    step. They include the acceleration that this torque gives to rolling wheels under the load of the previous step. A
+    wheel that slips accelerates differently; `Yielding` then corrects e.
 
-    While the torque is at its limit the integral goes on at `windup` times its rate: 1 is a plain PI controller, which
-    overshoots after a long acceleration, 0 stops integrating (anti-windup). A target that jumps within a step comes as
-    the mean of before and after. The torque follows that mean, but whether the limit is met does not: once the next
-    step shows where the target went, the integral becomes that of a jump, or the chair's path would depend on the time
-    of a command by fits and starts.
+    While the torque is at its limit the integral goes on at `windup` times its rate. 1 is a plain PI controller, which
+    overshoots after a long acceleration; 0 stops integrating (anti-windup). A target that jumps within a step arrives
+    as the mean of its values before and after. The torque follows that mean, but whether it reaches its limit does not.
+    So the next step, which shows where the target went, corrects the integral to that of a jump. Without this the
+    chair's path would not depend smoothly on the time of a command.
     """
 
     name = "torque_drive"
     typical = {"kp": (2.0, 20.0), "ki": (2.0, 30.0), "limit": (8.0, 30.0), "kff": (0.0, 0.2)}
     source = "estimate, for the chair"
+    card = Card(drives=True)
     kp: jax.Array = parameter("N m s/rad", 0.1, 200.0, 0.0, "proportional gain")
     ki: jax.Array = parameter("N m/rad", 0.0, 500.0, 0.0, "integral gain")
     limit: jax.Array = parameter("N m", 1.0, 2000.0, float("inf"), "largest torque of one side")
     windup: jax.Array = parameter("-", 0.0, 1.0, 0.0, "rate of the integral while the torque is at its limit")
 
     kff: jax.Array = parameter("N m s/rad", 0.0, 50.0, 0.0, "feed-forward of the wanted speed")
-    period: jax.Array = parameter("s", 0.0, 0.01, 0.0, "between two runs of a controller that is sampled")
+    period: jax.Array = parameter("s", 0.0, 0.01, 0.0, "time between two runs of a sampled controller")
 
     def init(self) -> DriveMemory:
         none = jnp.zeros(2)

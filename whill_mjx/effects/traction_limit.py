@@ -6,6 +6,7 @@ import jax
 from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean
+from whill_mjx.effects.card import GONE_WHEN_SETTLED, SAME_ALL_DRIVE, SAME_LEFT_AND_RIGHT, Axis, Card, Variant
 from whill_mjx.effects.smooth import limit_drive
 from whill_mjx.vehicle.types import Drive, Motion, parameter
 
@@ -16,14 +17,21 @@ TINY = 1e-3  # [N], keeps the limit defined where a wheel has lifted
 class TractionLimit(Effect):
     """F -> F / (1 + (F / mu N)^4)^(1/4) on each side, N the load of its driven wheels; a torque is limited at mu N r.
 
-    As with traction control: the drive never asks for more than the ground gives along the wheels, so wheels and
-    odometry stay with the body. Wheels that break away, and the share of the grip that cornering takes, are
-    `slip_traction` in the physical base model. The knee is that of `soft_limit`.
+    Like traction control: the drive never asks for more than the ground can give along the wheels, so wheels and
+    odometry stay with the body. `slip_traction` of the physical base model has wheels that break away, and grip that
+    cornering uses up. The knee is that of `soft_limit`.
     """
 
     name = "traction_limit"
     typical = {"mu": (0.2, 0.9)}
     source = "estimate: 0.6 to 0.9 dry, 0.2 to 0.4 wet"
+    card = Card(
+        order=170,
+        variants=(Variant((Axis("slip_traction.mu", -0.15, form="factor"),), kind="parameter_shift"),),
+        forbids=(SAME_LEFT_AND_RIGHT, GONE_WHEN_SETTLED, SAME_ALL_DRIVE),
+        sensor="wheel encoders beside an outside pose",
+        limits="The cap ignores cornering, and wheels never break away; `slip_traction` models both.",
+    )
     mu: jax.Array = parameter("-", 0.02, 2.0, float("inf"), "traction coefficient of the driven wheels")
 
     def actuation(self, memory: tuple[()], drive: Drive, motion: Motion) -> tuple[tuple[()], Drive]:

@@ -1,4 +1,4 @@
-"""A wrench without a name: what a fit found and no effect of the catalogue explains."""
+"""A wrench without a name: found by a fit, and explained by no effect of the catalogue."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean, yaw_rate
-from whill_mjx.effects.smooth import soft_sign
+from whill_mjx.effects.smooth import REST_RATE, REST_SPEED, soft_sign
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 KNOTS = 12
@@ -23,8 +23,6 @@ QUANTITIES = {
 """What the wrench may depend on, by number from 1, and its unit. Angles repeat after a full turn."""
 MAP = "place in the room"
 PERIODIC = ("left wheel's angle", "right wheel's angle", "heading in the room")
-REST_SPEED = 0.02  # [m/s] below which a vehicle rests, and that smooths the change of sign at rest
-REST_RATE = 0.05  # [rad/s] likewise
 TURN = 2 * jnp.pi
 
 
@@ -39,7 +37,7 @@ class UnnamedMemory:
 
 
 def quantities(memory: UnnamedMemory, motion: Motion) -> jax.Array:
-    """Values (11,) of `QUANTITIES`; of the place, its x."""
+    """Values (11,) of `QUANTITIES`; for the place its x."""
     speed = motion.spin.mean() * motion.wheel_radius
     rate = yaw_rate(motion)
     x, y = motion.position
@@ -66,15 +64,16 @@ def between(position: jax.Array, count: int) -> jax.Array:
 class Unnamed(Effect):
     """F_x = f(z) and T_z = g(z): tables over one quantity z of the motion, interpolated linearly.
 
-    z is chosen by `quantity`: 1 time in the drive, 2 speed, 3 yaw rate, 4 and 5 angle of the left and the right wheel,
-    6 heading in the room, 7 time and 8 distance since rest, 9 x and 10 y of the chassis origin in the room. The knots
-    lie evenly from `low` to `high`, and the ends hold beyond; angles repeat, with knots every 30 degrees from 0 on.
-    11 is a map of the room, of four knots along x from `low` to `high` by three along y from `low_y` to `high_y`, those
-    of the least y first, interpolated along both. A wheel stands at `start_angle` when a drive
-    begins, which nobody knows: it is another one in every drive. With `with_motion` = 1 the force
-    turns with the direction in which each side rolls and the torque with that of the turn, as friction does (negative
-    values brake); with 0 they push whatever the motion. `sysid.close_loop` writes it where something is missing that
-    the catalogue does not have; it names nothing.
+    `quantity` chooses z: 1 time in the drive, 2 speed, 3 yaw rate, 4 and 5 angle of the left and the right wheel, 6
+    heading in the room, 7 time and 8 distance since rest, 9 x and 10 y of the chassis origin in the room. The knots are
+    evenly spaced from `low` to `high`; beyond them the value of the last knot holds. Angles repeat, with a knot every
+    30 degrees from 0 on. 11 is a map of the room: four knots along x from `low` to `high` by three along y from `low_y`
+    to `high_y`, the row of the smallest y first, interpolated along both.
+
+    A wheel starts a drive at `start_angle`, which is unknown and differs between drives. With `with_motion` = 1 the
+    force changes sign with the rolling direction of each side and the torque with that of the turn, as friction does
+    (negative values brake). With 0 they do not depend on the motion. `sysid.close_loop` writes this effect where
+    something is missing that no effect of the catalogue explains; it names nothing.
     """
 
     name = "unnamed"
@@ -84,10 +83,10 @@ class Unnamed(Effect):
                **{f"force_{k}": (-10.0, 10.0) for k in range(1, KNOTS + 1)},
                **{f"torque_{k}": (-5.0, 5.0) for k in range(1, KNOTS + 1)}}
     source = "fitted by `sysid.close_loop`; sizes are estimates"
-    quantity: jax.Array = parameter("-", 1.0, 11.0, 1.0, "which quantity, 1 to 11")
-    low: jax.Array = parameter("SI", -1000.0, 1000.0, 0.0, "value of it at the first knot")
-    high: jax.Array = parameter("SI", -1000.0, 1000.0, 1.0, "value of it at the last knot")
-    with_motion: jax.Array = parameter("-", 0.0, 1.0, 0.0, "1 where the wrench turns with the motion")
+    quantity: jax.Array = parameter("-", 1.0, 11.0, 1.0, "number of the quantity z, 1 to 11")
+    low: jax.Array = parameter("SI", -1000.0, 1000.0, 0.0, "z at the first knot")
+    high: jax.Array = parameter("SI", -1000.0, 1000.0, 1.0, "z at the last knot")
+    with_motion: jax.Array = parameter("-", 0.0, 1.0, 0.0, "1 where the wrench changes sign with the motion")
     start_angle: jax.Array = parameter("rad", -6.3, 6.3, 0.0, "angle of the wheels at the start of the drive")
     low_y: jax.Array = parameter("m", -1000.0, 1000.0, 0.0, "y of a map's first row")
     high_y: jax.Array = parameter("m", -1000.0, 1000.0, 1.0, "y of its last row")

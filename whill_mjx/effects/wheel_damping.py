@@ -15,7 +15,7 @@ from whill_mjx.vehicle.types import Motion, Wrench, parameter
 class WheelDamping(Effect):
     """T = -d spin on each driven wheel about its axle: bearings, gears and motor resist with speed.
 
-    While the wheels roll it is a rolling resistance that rises with speed; a wheel that skids is slowed by it alone.
+    For rolling wheels it is a rolling resistance that grows with speed. A skidding wheel is slowed by nothing else.
     """
 
     name = "wheel_damping"

@@ -15,12 +15,11 @@ from whill_mjx.vehicle.types import World, parameter
 class WheelInertia(Effect):
     """J = ratio * J_nominal of each driven wheel, its tyre, its motor and its gears together, about its axle.
 
-    A rotor behind a gear counts with the square of its ratio, which can make J several times a wheel's own. While
-    the wheels roll J hardly shows: the chair's mass is much more. A wheel that skids is thrown by J alone.
+    A rotor behind a gear counts with the square of its ratio, which can make J several times that of the wheel alone.
+    While the wheels roll J hardly shows, because the chair's mass is much larger. Only J holds back a skidding wheel.
 
-    A wheel that is slowed down turns the chassis forward by its angular momentum, and the loads shift. What turns with
-    the wheel itself does so: all of J with a direct drive or a hub motor, `reaction` 1. A rotor behind a gear turns
-    faster but weighs in J with the gear's square, so that little of its J does.
+    The angular momentum of a wheel that slows down tips the chassis forward, and the loads shift. With a direct drive
+    or a hub motor all of J does so (`reaction` 1). A rotor behind a gear has little angular momentum for its part of J.
     """
 
     name = "wheel_inertia"

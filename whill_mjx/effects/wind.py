@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
+from whill_mjx.effects.card import FIXED_IN_ROOM, SAME_BACKWARD, Axis, Card, Variant
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 
@@ -16,13 +17,23 @@ from whill_mjx.vehicle.types import Motion, Wrench, parameter
 class Wind(Effect):
     """A force (F_x, F_y) fixed in the room, at the chassis origin; no area or air speed is needed.
 
-    On level ground a slope gives the same motion, but for the shift of load between the wheels.
+    A slope gives the same motion, except for the shift of load between the wheels.
     """
 
     name = "wind"
     room_fixed = True
     typical = {"along_x": (-10.0, 10.0), "along_y": (-10.0, 10.0)}
     source = "estimate: 5 N is about 3 m/s on 0.8 m^2"
+    card = Card(
+        order=220,
+        variants=lambda scale: (
+            Variant((Axis("along_x", scale.force / 2, signed=True), Axis("along_y", scale.force / 2, signed=True))),
+        ),
+        forbids=(*FIXED_IN_ROOM, SAME_BACKWARD),
+        sensor="an anemometer, or the same drive out of the wind",
+        shown_by_pose=True,
+        mirrored=("along_y",),
+    )
     along_x: jax.Array = parameter("N", -200.0, 200.0, 0.0, "force towards +x of the room")
     along_y: jax.Array = parameter("N", -200.0, 200.0, 0.0, "force towards +y of the room")
 

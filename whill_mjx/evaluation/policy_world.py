@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bridge.policy import Contract, read_policy
-from whill_mjx.command_line import OptionError
+from whill_mjx.command_line import OptionError, refusing
 from whill_mjx.evaluation.policy_file import vehicle_file
+from whill_mjx.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.folders import RUN_FILE
+from whill_mjx.reading import read_json
 from whill_mjx.tasks.tasks import TASKS
 
 POLICY = "policy"
@@ -71,10 +73,16 @@ def trained_fields(policy: Path, task: str) -> dict[str, Any]:
     run = policy.parent / RUN_FILE
     if not run.is_file():
         return {}
-    try:
-        saved = dict(json.loads(run.read_text(encoding="utf-8"))["preset"]["task"])
-    except (ValueError, KeyError, TypeError):
-        raise OptionError(f"{run}: does not say how the policy's task was set. Move the policy to another folder and "
-                          "give the fields with --set.") from None  # fmt: skip
-    known = {field.name for field in dataclasses.fields(TASKS[task])}
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in saved.items() if name in known}
+    with refusing():
+        return saved_task(run, [field.name for field in dataclasses.fields(TASKS[task])])
+
+
+def saved_task(run: Path, known: Iterable[str]) -> dict[str, Any]:
+    """The fields of a training's task among the `known` ones; ValueError where its run.json is damaged."""
+    hint = "Put the file of the training there, or take it away to evaluate on the task as it is."
+    content = read_json(run, f"missing. {hint}", hint)
+    preset = check_table(str(run), RUN, content, others=True)["preset"]
+    task = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
+    rows = {field.name: field for field in TASK}
+    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
+            for name, value in task.items() if name in known}

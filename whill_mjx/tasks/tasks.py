@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from whill_mjx.fields import TASK, check_fields
 from whill_mjx.world.scene import Boxes, Marker, Scene, box, default_looks, stack_boxes
 
 LAYOUTS = ("randomised", "fixed")
@@ -45,6 +46,7 @@ class Task:
     """"randomised" draws a new world for each episode, "fixed" is always the same one."""
 
     def __post_init__(self) -> None:
+        check_fields("task", TASK, self)
         if self.layout not in LAYOUTS:
             raise ValueError(f"layout is {self.layout!r}; use one of {LAYOUTS}.")
         if self.v_max <= self.v_min or self.omega_max <= 0:
@@ -116,10 +118,11 @@ class World:
 
 
 def scale_action(task: Task, action: jax.Array) -> jax.Array:
-    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,), clipped to [-1, 1]; NaN counts as 0."""
+    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,), clipped to [-1, 1]; standstill where one is NaN."""
+    stands = jnp.isnan(action).any()
     action = jnp.clip(jnp.nan_to_num(action, nan=0.0, posinf=1.0, neginf=-1.0), -1.0, 1.0)
     v = task.v_min + (action[0] + 1.0) / 2.0 * (task.v_max - task.v_min)
-    return jnp.stack([v, action[1] * task.omega_max])
+    return jnp.where(stands, 0.0, jnp.stack([v, action[1] * task.omega_max]))
 
 
 def reward_terms(

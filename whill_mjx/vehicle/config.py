@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+
+from whill_mjx.fields import TIMES, check_fields
 
 
 @dataclass(frozen=True)
@@ -17,10 +18,12 @@ class VehicleConfig:
     dynamics: str = "fused"
     """How a physics step is computed: "fused" takes the rigid bodies in closed form and everything on single numbers,
     so that it compiles into few kernels; "mjx" calls `mjx.step`. Both give the same motion to rounding."""
+    limited: bool = True
+    """Whether commands are limited to the spec's limits; a replay of a log takes them as they were recorded."""
 
     def __post_init__(self) -> None:
-        known = 0 < self.physics_dt < math.inf and 0 < self.control_dt < math.inf
-        if not known or abs(self.substeps * self.physics_dt - self.control_dt) > 1e-9:
+        check_fields("time steps", TIMES, self)
+        if abs(self.substeps * self.physics_dt - self.control_dt) > 1e-9:
             raise ValueError(
                 f"physics_dt {self.physics_dt} does not divide control_dt {self.control_dt}; choose e.g. 0.005 and 0.1."
             )

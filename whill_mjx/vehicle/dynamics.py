@@ -21,6 +21,7 @@ from whill_mjx.vehicle.ground import footing, plane_under
 from whill_mjx.vehicle.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
 from whill_mjx.vehicle.model import VehicleModel, box_inertia
 from whill_mjx.vehicle.scalars import apart, scan_apart
+from whill_mjx.vehicle.specs import GRAVITY
 from whill_mjx.vehicle.types import (
     Drive,
     Geometry,
@@ -39,7 +40,6 @@ DAMPING_RATIO = 0.5  # [-] of the suspension
 LEAST_SAG = 8.0  # [m/s^2] times the squared physics step: with 3 instead, loads ring and wheels lose the floor
 LOAD_ROUNDS = 2  # in which loads and what wheels pull by them find together
 SMOOTH_LOAD = 0.04  # share of the static load over which a contact loses it smoothly when it lifts
-GRAVITY = 9.81  # [m/s^2]
 
 
 def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
@@ -49,7 +49,7 @@ def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, com
         model: static model.
         params: physical parameters of this instance.
         state: from `place` or the previous step.
-        command: (2,) v [m/s] and omega [rad/s] in force during this step.
+        command: (2,) v [m/s] and omega [rad/s] in force during this step; limited to what the spec allows.
 
     Returns:
         The next state. A non-finite result is replaced by the previous state and flagged `diverged`.
@@ -118,6 +118,7 @@ def forces(
     effects = params.effects
     memory, world = apply_chain(effects, state.memory, "world", nominal_world(model))
     motion = measure(model, params, world, state)
+    command = limited(model, command) if model.config.limited else command
     memory, command = apply_chain(effects, memory, "command", command, motion)
     target = wheel_speeds(command, model.spec.track)
     memory, signal = apply_chain(effects, memory, "actuation", _no_drive(target), motion)
@@ -129,6 +130,15 @@ def forces(
     memory, reaction = sum_forces(effects, memory, dataclasses.replace(motion, others=wrench), reacts=True)
     wrench = wrench + reaction
     return memory, generalised_force(motion, wrench), motion
+
+
+def limited(model: VehicleModel, command: jax.Array) -> jax.Array:
+    """Command (2,) within the vehicle's limits; one that is within them is unchanged, and so is its derivative."""
+    spec = model.spec
+    low = jnp.asarray([spec.v_min, -spec.omega_max], command.dtype)
+    high = jnp.asarray([spec.v_max, spec.omega_max], command.dtype)
+    command = jnp.where(command > high, high, command)
+    return jnp.where(command < low, low, command)
 
 
 def sprung_forces(

@@ -7,31 +7,23 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from whill_mjx.effects import (
-    AccelerationLimit,
-    AirDrag,
-    CasterKick,
-    CommandDelay,
-    CommandExpiry,
-    CommandQuantisation,
-    EncoderResolution,
-    ForwardSlip,
-    GyroRange,
-    LateralDamping,
-    OdometryLag,
-    PidDrive,
-    RollingContact,
-    RollingResistance,
-    SlipTraction,
-    StateRate,
-    TorqueDrive,
-    YawScrub,
-    command_expiry,
-    command_quantisation,
-    encoder_resolution,
-    gyro_range,
-    state_rate,
-)
+from whill_mjx.effects import command_expiry, command_quantisation, encoder_resolution, gyro_range, state_rate
+from whill_mjx.effects.acceleration_limit import AccelerationLimit
+from whill_mjx.effects.air_drag import AirDrag
+from whill_mjx.effects.caster_kick import CasterKick
+from whill_mjx.effects.command_delay import CommandDelay
+from whill_mjx.effects.command_expiry import CommandExpiry
+from whill_mjx.effects.command_quantisation import CommandQuantisation
+from whill_mjx.effects.encoder_resolution import EncoderResolution
+from whill_mjx.effects.gyro_range import GyroRange
+from whill_mjx.effects.lateral_damping import LateralDamping
+from whill_mjx.effects.odometry_lag import OdometryLag
+from whill_mjx.effects.pid_drive import ForwardSlip, PidDrive, RollingContact
+from whill_mjx.effects.rolling_resistance import RollingResistance
+from whill_mjx.effects.slip_traction import SlipTraction
+from whill_mjx.effects.state_rate import StateRate
+from whill_mjx.effects.torque_drive import TorqueDrive
+from whill_mjx.effects.yaw_scrub import YawScrub
 from whill_mjx.vehicle.model import box_inertia
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 from whill_mjx.vehicle.types import Body, VehicleParams
@@ -52,11 +44,15 @@ def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
     }  # fmt: skip
     if name in whill:
         spec = find_spec("whill_cr")
+        if name == "whill_cr_documented":
+            limits: Any = {key: command_quantisation.MAKER[key] for key in ("v_min", "v_max", "omega_max")}
+            spec = replace(spec, **limits)
         return spec, whill[name](spec)
     if name not in SPECS:
-        known = ", ".join(sorted({*SPECS, *whill}))
+        known = ", ".join(sorted({*whill, *SPECS}))
         raise ValueError(f"unknown vehicle {name!r} (known: {known}). Use one of them or a vehicle file.")
-    return SPECS[name], preset_params(SPECS[name], "paper")
+    spec = SPECS[name]
+    return spec, preset_params(spec, "paper")
 
 
 def preset_params(spec: VehicleSpec, kind: str = "paper") -> VehicleParams:

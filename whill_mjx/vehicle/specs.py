@@ -9,6 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from whill_mjx import fields
+
+GRAVITY = 9.81
+"""Standard gravity [m/s^2]."""
+
 
 @dataclass(frozen=True)
 class CameraMount:
@@ -51,18 +56,12 @@ class VehicleSpec:
     v_min: float = -1.0
     v_max: float = 1.0
     omega_max: float = 1.0
-    """Command limits [m/s, rad/s]."""
+    """Limits [m/s, rad/s] to which the vehicle cuts every command."""
     camera: CameraMount = CameraMount()
 
     def __post_init__(self) -> None:
-        for field in ("wheel_radius", "track", "wheelbase", "mass", "wheel_inertia"):
-            value = getattr(self, field)
-            if not value > 0:
-                raise ValueError(f"vehicle {self.name!r}: {field} is {value}; it must be positive (SI units).")
-        if self.drive not in ("differential", "skid"):
-            raise ValueError(f"vehicle {self.name!r}: drive is {self.drive!r}; use 'differential' or 'skid'.")
-        if self.driven_axle not in ("rear", "front"):
-            raise ValueError(f"vehicle {self.name!r}: driven_axle is {self.driven_axle!r}; use 'rear' or 'front'.")
+        fields.check_fields(f"vehicle {fields.shown(self.name)}", fields.SPEC, self)
+        fields.check_fields(f"camera of vehicle {fields.shown(self.name)}", fields.CAMERA, self.camera)
 
     @property
     def rear_x(self) -> float:
@@ -85,7 +84,8 @@ class VehicleSpec:
 # Wheel radius and track: WHILL/ros_whill WHILL.h (0.1325, 0.496). Wheelbase: modelc.xacro (0.60, crude model).
 # Mass with battery about 52 kg and the overall size: recalled from the maker's sheet, not verified; fit or weigh.
 # Rear axle 0.36 m behind the middle of the overall length: an assumption (0.13 m of the chair lie behind the axle).
-# Limits: the paper's +-1 m/s and +-1 rad/s; the vehicle itself accepts -0.556 to 1.667 m/s and +-1.68 rad/s.
+# Limits: the paper's +-1 m/s and +-1 rad/s, which its course is driven with. The chair itself accepts -0.556 to
+# 1.667 m/s and +-1.68 rad/s: those are the limits of the preset "whill_cr_documented".
 WHILL_CR = VehicleSpec(
     name="whill_cr", wheel_radius=0.1325, track=0.496, wheelbase=0.60, mass=52.0, rear_axle_x=-0.36,
     body_length=0.985, body_width=0.554, body_height=0.9,

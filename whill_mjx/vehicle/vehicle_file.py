@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from whill_mjx import fields
 from whill_mjx.effects import EFFECTS
+from whill_mjx.reading import read_toml
+from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
@@ -33,6 +34,7 @@ KIND = "micromobility-vehicle"
 LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period",
          "wheel_inertia.reaction"}
 """Parameters that earlier files do not have: where they are absent they are neutral."""
+NEWER = "Remove the entry or use a newer version of this program."
 
 
 def save_vehicle(
@@ -83,7 +85,20 @@ def _remark(content: Mapping[str, Any]) -> str:
             "# A parameter without one was not fitted, or the log does not determine it.\n")
 
 
-def load_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
+def load_vehicle(name_or_path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
+    """Spec, parameters and provenance of a built-in vehicle or a vehicle file.
+
+    Raises:
+        ValueError: neither a name (the error lists all of them) nor a valid file.
+        FileNotFoundError: as of `read_vehicle`.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".toml" or path.is_file():
+        return read_vehicle(path)
+    return *preset(str(name_or_path)), {"preset": str(name_or_path)}
+
+
+def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str, Any]]:
     """Spec, parameters and provenance of a vehicle file.
 
     Raises:
@@ -91,42 +106,32 @@ def load_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
         FileNotFoundError: there is no such file.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.")
-    try:
-        content = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a TOML file ({error}). Vehicle files are written by sysid.fit.") from error
-    if content.get("kind") != KIND:
-        raise ValueError(f"{path}: kind is {content.get('kind')!r}, not {KIND!r}. Give a vehicle file.")
-    if content.get("schema") != SCHEMA:
-        raise ValueError(
-            f"{path}: schema is {content.get('schema')!r}; this version reads schema {SCHEMA}. Fit the vehicle again."
-        )
-    try:
-        spec = _read_spec(content["spec"])
-        body = _read_parameters(path, "body", Body, content["body"])
-        effects = tuple(_read_effect(path, table) for table in content["effects"])
-    except KeyError as error:
-        rule = "Every vehicle file has spec, body and effects."
-        raise ValueError(f"{path}: no entry {error.args[0]!r}. {rule}") from error
-    except TypeError as error:
-        raise ValueError(f"{path}: {error}. Remove the entry or use a newer version of this program.") from error
-    if not body.mass > 0 or not body.yaw_inertia > 0:
-        raise ValueError(f"{path}: body mass {body.mass} and yaw_inertia {body.yaw_inertia} must be positive.")
-    return spec, VehicleParams(body, effects), content.get("provenance", {})
+    content = _read(path)
+    spec = _read_spec(path, content["spec"])
+    body = _read_parameters(path, "body", Body, content["body"])
+    effects: dict[str, Any] = {}
+    for name, table in _effect_tables(path, content):
+        if name in effects:
+            raise ValueError(f"{path}: effect {name!r} is there twice; each acts once. Remove one of them.")
+        effects[name] = _read_parameters(path, name, EFFECTS[name], table)
+    return spec, VehicleParams(body, tuple(effects.values())), content.get("provenance", {})
 
 
 def load_intervals(path: str | Path) -> dict[str, tuple[float, float]]:
-    """Confidence intervals in a vehicle file by dotted parameter name."""
-    content = tomllib.loads(Path(path).read_text())
-    tables = {"body": content["body"], **{table["name"]: table["parameters"] for table in content["effects"]}}
-    return {
-        f"{holder}.{name}": (entry["interval"][0], entry["interval"][1])
-        for holder, table in tables.items()
-        for name, entry in table.items()
-        if "interval" in entry
-    }
+    """Confidence intervals in a vehicle file by dotted parameter name; errors as of `load_vehicle`."""
+    path = Path(path)
+    content = _read(path)
+    found = {}
+    for holder, table in [("body", content["body"]), *_effect_tables(path, content)]:
+        for name, entry in table.items():
+            whole = fields.check_table(str(path), fields.VALUE, entry, f"{holder}.{name}")
+            if "interval" in whole:
+                where = f"{holder}.{name}.interval"
+                low, high = fields.check(str(path), fields.INTERVAL, whole["interval"], where)
+                if low > high:
+                    raise ValueError(f"{path}: {where} is [{low:g}, {high:g}]; the lower end comes first. Swap them.")
+                found[f"{holder}.{name}"] = (low, high)
+    return found
 
 
 def sha256_of(path: str | Path) -> str:
@@ -145,17 +150,39 @@ def _parameter_tables(holder: str, value: Any, intervals: dict[str, tuple[float,
     return tables
 
 
-def _read_spec(table: dict[str, Any]) -> VehicleSpec:
+def _read(path: Path) -> dict[str, Any]:
+    """Content of a vehicle file, of the right kind and schema."""
+    content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
+                        "Vehicle files are written by sysid.fit.")
+    if content.get("kind") == KIND and content.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: schema is {fields.shown(content.get('schema'))}; this version reads schema {SCHEMA}."
+                         " Fit the vehicle again.")
+    if content.get("kind") != KIND:
+        raise ValueError(f"{path}: kind is {fields.shown(content.get('kind'))}, not {KIND!r}. Give a vehicle file.")
+    return fields.check_table(str(path), fields.VEHICLE, content, remedy=NEWER)
+
+
+def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
     table = dict(table)
-    camera = CameraMount(**table.pop("camera", {}))
-    return VehicleSpec(**table, camera=camera)
+    camera = fields.check_table(str(path), fields.CAMERA, table.pop("camera", {}), "spec.camera", NEWER)
+    checked = fields.check_table(str(path), fields.SPEC, table, "spec", NEWER)
+    try:
+        return VehicleSpec(**checked, camera=CameraMount(**camera))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
-def _read_effect(path: Path, table: dict[str, Any]) -> Any:
-    name = table["name"]
-    if name not in EFFECTS:
-        raise ValueError(f"{path}: unknown effect {name!r} (known: {', '.join(sorted(EFFECTS))}).")
-    return _read_parameters(path, name, EFFECTS[name], table["parameters"])
+def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Name and parameters of each effect of a file."""
+    found = []
+    for index, table in enumerate(content["effects"]):
+        checked = fields.check_table(str(path), fields.EFFECT, table, f"effects[{index}]", NEWER)
+        if checked["name"] not in EFFECTS:
+            raise ValueError(f"{path}: unknown effect {fields.shown(checked['name'])} (known: "
+                             f"{', '.join(sorted(EFFECTS))}). Install or register the package that defines it, or "
+                             "remove the effect.")
+        found.append((checked["name"], checked["parameters"]))
+    return found
 
 
 def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any]) -> Any:
@@ -163,13 +190,14 @@ def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any]) 
     values = {}
     for name, entry in table.items():
         if name not in known:
-            raise ValueError(f"{path}: {holder} has no parameter {name!r} (known: {', '.join(known)}).")
-        value, unit = entry["value"], entry["unit"]
-        if unit != known[name].unit:
-            raise ValueError(f"{path}: {holder}.{name} is in {unit!r}; it must be in {known[name].unit!r}. Convert it.")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-            raise ValueError(f"{path}: {holder}.{name} is {value!r}; it must be a number.")
-        values[name] = float(value)
+            raise ValueError(f"{path}: {holder} has no parameter {fields.shown(name)} (known: {', '.join(known)}). "
+                             "Remove it or use a newer version of this program.")
+        about, dotted = known[name], f"{holder}.{name}"
+        whole = fields.check_table(str(path), fields.VALUE, entry, dotted)
+        if whole["unit"] != about.unit:
+            raise ValueError(f"{path}: {dotted} is in {whole['unit']!r}; it must be in {about.unit!r}. Convert it.")
+        field = fields.parameter_field(dotted, about.unit, about.low, about.high, about.neutral)
+        values[name] = fields.check(str(path), field, whole["value"])
     missing = {name for name in set(known) - set(values) if f"{holder}.{name}" not in LATER}
     if missing:
         raise ValueError(f"{path}: {holder} lacks {', '.join(sorted(missing))}. Give a value and a unit for each.")

@@ -8,18 +8,24 @@ functions of one instance in JAX.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from whill_mjx.fields import MAP, check_table
+from whill_mjx.reading import MB, read_bytes, read_text
 from whill_mjx.world.scene import Boxes, Footprint
 
 FREE, UNKNOWN, OCCUPIED = 0, 1, 2
-KEYS = ("image", "resolution", "origin", "occupied_thresh", "free_thresh", "negate")
+YAML_BYTES, IMAGE_BYTES, HEADER_BYTES = MB // 10, 100 * MB, 10_000
+MAX_CELLS, LONGEST_SIDE = 50 * MB, 50_000
+IMAGE = "is missing or no PGM or PNG of 8 bits per colour. Put the map's image there."
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,59 +67,85 @@ def load_map(path: str | Path) -> GridMap:
         ValueError: a field is missing or out of its range, or the image cannot be read; names file and remedy.
     """
     path = Path(path)
-    table = _read_yaml(path)
-    missing = [key for key in KEYS if key not in table]
-    if missing:
-        raise ValueError(f"{path}: no field {missing[0]!r}; map_server needs {', '.join(KEYS)}. Add it.")
-    if table.get("mode", "trinary") not in ("trinary", "scale"):
-        raise ValueError(f"{path}: mode is {table['mode']!r}; 'trinary' and 'scale' are read here. Save it as trinary.")
-    resolution = _number(path, "resolution", table["resolution"])
-    occupied, free = (_number(path, key, table[key]) for key in ("occupied_thresh", "free_thresh"))
-    parts = table["origin"].strip("[]").split(",")
-    if len(parts) != 3:
-        raise ValueError(f"{path}: origin is {table['origin']}; it must be [x, y, yaw]. Correct it.")
-    x, y, yaw = (_number(path, "origin", part) for part in parts)
-    if not resolution > 0 or not 0 <= free < occupied <= 1:
-        raise ValueError(f"{path}: resolution {resolution} must be positive, and 0 <= free_thresh ({free}) < "
-                         f"occupied_thresh ({occupied}) <= 1. Correct the file.")
-    grey = _read_grey(path.parent / table["image"])
-    darkness = grey / 255.0 if int(_number(path, "negate", table["negate"])) else 1.0 - grey / 255.0
-    cells = np.full(grey.shape, UNKNOWN, np.uint8)
-    cells[darkness > occupied] = OCCUPIED
-    cells[darkness < free] = FREE
-    return GridMap(cells[::-1].copy(), resolution, (x, y, yaw))
+    table = check_table(str(path), MAP, _read_yaml(path))
+    occupied, free = table["occupied_thresh"], table["free_thresh"]
+    if not free < occupied:
+        raise ValueError(f"{path}: free_thresh is {free:g} and occupied_thresh {occupied:g}; the first must be less. "
+                         "Correct the file.")
+    levels, grey = _read_grey(path.parent / table["image"])
+    darkness = levels if table["negate"] else 1.0 - levels
+    kinds = np.full(darkness.shape, UNKNOWN, np.uint8)  # of each level
+    kinds[darkness > occupied] = OCCUPIED
+    kinds[darkness < free] = FREE
+    x, y, yaw = table["origin"]
+    return GridMap(kinds[grey][::-1].copy(), table["resolution"], (x, y, yaw))
 
 
-def _read_yaml(path: Path) -> dict[str, str]:
-    """The flat `key: value` lines of a map file."""
-    if not path.is_file():
-        raise ValueError(f"{path}: does not exist. Give the YAML file of a map.")
-    table = {}
-    for line in path.read_text().splitlines():
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """The flat `key: value` lines of a map file that `MAP` knows, numbers as such."""
+    try:
+        text = read_text(path, YAML_BYTES, "does not exist. Give the YAML file of a map.")
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from None
+    kinds = {field.name: field.kind for field in MAP}
+    table: dict[str, Any] = {}
+    for line in text.split("\n"):
         key, colon, value = line.partition("#")[0].partition(":")
-        if colon and value.strip():
-            table[key.strip()] = value.strip().strip("'\"")
+        key, value = key.strip(), value.strip().strip("'\"")
+        if colon and value and key in kinds:
+            if key in table:
+                raise ValueError(f"{path}: {key} is there twice. Remove one of the lines.")
+            parts = [_number(one) for one in value.strip("[]").split(",")]
+            kind = kinds[key]
+            table[key] = value if kind == "text" else parts if kind == "numbers" else parts[0] if len(
+                parts) == 1 else value
+    if isinstance(table.get("negate"), float) and table["negate"] in (0.0, 1.0):
+        table["negate"] = int(table["negate"])
     return table
 
 
-def _number(path: Path, key: str, text: str) -> float:
+def _number(text: str) -> float | str:
+    """The number that a text is, or the text."""
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{path}: {key} is {text!r}; it must be a finite number. Correct it.")
-    return value
+        return text.strip()
 
 
-def _read_grey(path: Path) -> np.ndarray:
-    """(rows, columns) grey levels 0 to 255, the mean of the colours as map_server takes it."""
+def _read_grey(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Share of white (L,) of each level, and the levels (rows, columns) of an image.
+
+    A level is the sum of the pixel's colours, whose mean map_server takes.
+    """
     import cv2
 
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if image is None or image.dtype != np.uint8:
-        raise ValueError(f"{path}: is missing or no image of 8 bits per colour. Put the map's PGM or PNG there.")
-    return image[..., :3].mean(-1) if image.ndim == 3 else image.astype(float)
+    try:
+        data = read_bytes(path, IMAGE_BYTES, IMAGE)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from None
+    size = _image_size(data)
+    if size is not None and (max(size) > LONGEST_SIDE or size[0] * size[1] > MAX_CELLS):
+        raise ValueError(f"{path}: is {size[0]} x {size[1]} pixels; at most {MAX_CELLS} pixels, {LONGEST_SIDE} a side, "
+                         "are read. Cut the map.")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if size else None
+    except (cv2.error, MemoryError):
+        image = None
+    if image is None or image.dtype != np.uint8 or not image.size:
+        raise ValueError(f"{path}: {IMAGE}")
+    if image.ndim == 2:
+        return np.arange(256) / 255.0, image
+    colours = image[..., :3]
+    sums = colours.sum(-1, dtype=np.uint16)
+    return np.arange(255 * colours.shape[-1] + 1) / colours.shape[-1] / 255.0, sums
+
+
+def _image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the header of a PGM or PNG states; None of anything else."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24:
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    header = re.match(rb"P[2356]\s(?:\s|#[^\n]*\n)*(\d{1,9})\s(?:\s|#[^\n]*\n)*(\d{1,9})\s", data[:HEADER_BYTES])
+    return (int(header[1]), int(header[2])) if header else None
 
 
 def wall_segments(grid: GridMap) -> np.ndarray:

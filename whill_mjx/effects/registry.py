@@ -1,0 +1,173 @@
+"""All known effects by name: those of this package, of installed packages, and those that a program registers.
+
+An installed package offers effects by entry points of the group `whill_mjx.effects`, one for each class:
+
+    [project.entry-points."whill_mjx.effects"]
+    my_effect = "my_package.my_module:MyEffect"
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.effects.base import PLACES, Effect, place_of
+from whill_mjx.effects.card import Card
+from whill_mjx.vehicle.types import parameters_of
+
+GROUP = "whill_mjx.effects"
+"""Group of the entry points."""
+Kind = TypeVar("Kind", bound=type[Effect])
+
+
+class Registry(Mapping[str, type[Effect]]):
+    """Effect classes by name: this package's in order of their names, then entry points by name, then registered ones.
+
+    Modules and entry points are loaded when an effect is first looked up, not on import. So a module that defines an
+    effect can import this package, whichever of the two is imported first.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, type[Effect]] = {}
+        self._loaded = False
+
+    def __getitem__(self, name: str) -> type[Effect]:
+        return self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+    def add(self, kind: type[Effect]) -> None:
+        """Add a checked effect at the end; a class that is defined again takes the place of its older self."""
+        known = self._all()
+        check_effect(kind)
+        other = known.get(kind.name)
+        if other is not None and (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
+            raise ValueError(f"effect {kind.name!r} of {kind.__module__}: {other.__module__} has one of this name. "
+                             "Choose another name.")
+        known[kind.name] = kind
+
+    def remove(self, name: str) -> None:
+        """Forget an effect; KeyError where there is none of this name."""
+        del self._all()[name]
+
+    def _all(self) -> dict[str, type[Effect]]:
+        if not self._loaded:
+            self._loaded = True  # first: what is loaded may register an effect
+            try:
+                self._load()
+            except BaseException:
+                self._known, self._loaded = {}, False
+                raise
+        return self._known
+
+    def _load(self) -> None:
+        own = [info.name for info in pkgutil.iter_modules([str(Path(__file__).parent)])]
+        kinds = [kind for name in own for kind in effects_in(importlib.import_module(f"whill_mjx.effects.{name}"))]
+        for kind in sorted(kinds, key=lambda kind: kind.name):
+            self.add(kind)
+        for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
+            self.add(_loaded(point))
+
+
+EFFECTS = Registry()
+"""Every known effect by name; docs/effects.md lists those of this package."""
+
+
+def register(kind: Kind) -> Kind:
+    """Make an effect known by its name to vehicle files, fits and the closed loop. Also a decorator of its class.
+
+    Raises:
+        TypeError: it is no effect, or acts at none or several places.
+        ValueError: its name, a parameter or its card is wrong, or another effect has its name.
+    """
+    EFFECTS.add(kind)
+    return kind
+
+
+def unregister(name: str) -> None:
+    """Forget an effect that was registered; KeyError where there is none of this name."""
+    EFFECTS.remove(name)
+
+
+def effects_in(module: ModuleType) -> list[type[Effect]]:
+    """The effects that a module defines itself."""
+    kinds = [kind for _, kind in inspect.getmembers(module, inspect.isclass) if issubclass(kind, Effect)]
+    return [kind for kind in kinds if kind.name and kind.__module__ == module.__name__]
+
+
+def check_effect(kind: type[Effect]) -> None:
+    """Raise TypeError or ValueError where a class is not a complete effect; names the rule and the remedy."""
+    if not (isinstance(kind, type) and issubclass(kind, Effect) and is_dataclass(kind)):
+        raise TypeError(f"{kind!r} is not an effect. Derive it from whill_mjx.effects.base.Effect and decorate it with "
+                        "flax.struct.dataclass.")
+    place_of(kind)
+    about = parameters_of(kind)
+    if not kind.name.isidentifier() or kind.name == "body":
+        raise ValueError(f"{kind.__qualname__}: the name {kind.name!r} must be an identifier other than 'body'.")
+    if not about:
+        raise ValueError(f"effect {kind.name!r} has no parameter. Declare its fields with "
+                         "whill_mjx.vehicle.types.parameter.")
+    named = set(kind.typical) | set(kind.card.mirrored)
+    if not callable(kind.card.variants):
+        named |= {axis.parameter for variant in kind.card.variants for axis in variant.axes}
+    unknown = sorted(one for one in named if "." not in one and one not in about)
+    if unknown:
+        raise ValueError(f"effect {kind.name!r} has no parameter {unknown[0]!r} (known: {', '.join(about)}). Correct "
+                         "its card or its usual values.")
+
+
+def make_effect(name: str, **values: float) -> Effect:
+    """The effect of this name with arrays as leaves; parameters that are not given are neutral.
+
+    Raises:
+        ValueError: no such effect, or no such parameter; names the known ones.
+    """
+    if name not in EFFECTS:
+        raise ValueError(f"unknown effect {name!r} (known: {', '.join(sorted(EFFECTS))}). Correct the name.")
+    known = parameters_of(EFFECTS[name])
+    for field in values:
+        if field not in known:
+            raise ValueError(f"effect {name!r} has no parameter {field!r} (known: {', '.join(known)}). Correct it.")
+    effect = EFFECTS[name](**values)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), effect)
+
+
+def make_effects(names: Iterable[str]) -> tuple[Effect, ...]:
+    """The neutral effects of these names, each once, in the order of a vehicle: by place, then as in `EFFECTS`."""
+    order = list(EFFECTS)
+    effects = [make_effect(name) for name in dict.fromkeys(names)]
+    return tuple(sorted(effects, key=lambda effect: (PLACES.index(place_of(effect)), order.index(effect.name))))
+
+
+def equation(kind: type[Effect]) -> str:
+    """The equation of an effect in one line: the first paragraph of its docstring, without the source."""
+    return " ".join((kind.__doc__ or "").split("\n\n")[0].split()).partition(" Source:")[0]
+
+
+def card_of(name: str) -> Card:
+    """The card of an effect; a blank one for a name that is no effect."""
+    return EFFECTS[name].card if name in EFFECTS else Card()
+
+
+def _loaded(point: EntryPoint) -> type[Effect]:
+    """The class of an entry point; ImportError names the package that it comes from."""
+    try:
+        return point.load()
+    except Exception as error:
+        package = point.dist.name if point.dist else "unknown"
+        raise ImportError(f"effect {point.name!r} of the installed package {package!r} ({point.value}) cannot be "
+                          f"loaded: {error}. Mend or uninstall that package.") from error
