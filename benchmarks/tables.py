@@ -211,5 +211,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(prog="python -m benchmarks.tables", description=__doc__).parse_args()  # --help and mistakes end here
+    argparse.ArgumentParser(description=__doc__).parse_args()  # --help and mistakes end here
     main()
