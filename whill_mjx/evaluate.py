@@ -29,10 +29,10 @@ import tyro
 from whill_mjx.env import make_env
 from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
-from whill_mjx.evaluation.policy_file import RUN_FILE, PolicyFile, load_policy
+from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
-from whill_mjx.folders import claim_folder
+from whill_mjx.folders import RUN_FILE, claim_folder
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 

@@ -65,10 +65,10 @@ def _intervals(axis: Any, log: Log) -> None:
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     axis.set_xlim(low / 3, high * 3)
+    _label(axis, "Sampling: an upright line is regular", "interval between samples [ms]", "share of intervals below")
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
     axis.xaxis.set_minor_formatter("{x:g}")
-    _label(axis, "Sampling: an upright line is regular", "interval between samples [ms]", "share of intervals below")
 
 
 def _velocities(axis: Any, log: Log) -> None:

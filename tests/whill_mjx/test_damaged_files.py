@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from damaged_bytes import check
 
-from whill_mjx.evaluation.policy_world import saved_task
+from whill_mjx.evaluation.policy_world import trained_fields
 from whill_mjx.tasks.tasks import ObstacleCourse, make_task
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
@@ -56,10 +56,9 @@ def test_a_damaged_map(tmp_path, name):
 def test_a_damaged_note_of_a_training(tmp_path):
     path = tmp_path / "run.json"
     good = json.dumps({"command": {"seed": 0}, "preset": {"task": dataclasses.asdict(ObstacleCourse())}}).encode()
-    known = {field.name for field in dataclasses.fields(ObstacleCourse)}
 
     def read():
-        task = saved_task(path, known)
+        task = trained_fields(tmp_path / "policy", "obstacle_course")
         try:
             make_task("obstacle_course", **task)
         except ValueError as error:  # of two values that do not go together, which the command names

@@ -25,8 +25,6 @@ from whill_mjx.vehicle.model import VehicleModel
 from whill_mjx.vehicle.types import VehicleParams
 
 RUNTIMES = ("jax", "onnxruntime")
-RUN_FILE = "run.json"
-"""In the folder of a training, beside the policies that it exports: its command and its preset, task included."""
 OTHER_RUNTIME = "Evaluate with the runtime 'onnxruntime' instead."
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,16 +72,12 @@ def trained_fields(policy: Path, task: str) -> dict[str, Any]:
     run = policy.parent / RUN_FILE
     if not run.is_file():
         return {}
+    hint = "Put the file of the training there, or move the policy to another folder and give the fields with --set."
     with refusing():
-        return saved_task(run, [field.name for field in dataclasses.fields(TASKS[task])])
-
-
-def saved_task(run: Path, known: Iterable[str]) -> dict[str, Any]:
-    """The fields of a training's task among the `known` ones; ValueError where its run.json is damaged."""
-    hint = "Put the file of the training there, or take it away to evaluate on the task as it is."
-    content = read_json(run, f"missing. {hint}", hint)
-    preset = check_table(str(run), RUN, content, others=True)["preset"]
-    task = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
-    rows = {field.name: field for field in TASK}
-    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
-            for name, value in task.items() if name in known}
+        content = read_json(run, f"missing. {hint}", hint)
+        preset = check_table(str(run), RUN, content, others=True)["preset"]
+        saved = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
+        rows = {field.name: field for field in TASK}
+        known = {field.name for field in dataclasses.fields(TASKS[task])}
+        return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
+                for name, value in saved.items() if name in known}
