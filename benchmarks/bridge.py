@@ -232,6 +232,7 @@ def reaction_times(bridge: Bridge, name: str, inject: Any, end: Any, repeats: in
         robot.wait_until(moving_after(time.monotonic()))
         if name != "killed_first":
             time.sleep(0.7 + 0.037 * (i + phase))
+            robot.wait_until(moving_after(time.monotonic()))  # a busy machine may have stopped it meanwhile
         at = time.monotonic()
         inject(bridge)
         found.append(1e3 * robot.first_zero(at))
@@ -329,7 +330,9 @@ def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, re
     run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
     run.simulate.wait(30 + 4 * resets)
     results, _ = run.finish()
-    episodes = results["episodes"]
+    moved = [t for t, v, omega in results["commands"] if v or omega]
+    # the first episodes may be over before the nodes have found each other: nothing moves, and nothing needs a zero
+    episodes = [episode for episode in results["episodes"] if any(0 <= episode["ended"] - t < 0.2 for t in moved)]
     stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
                 for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
     run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")

@@ -2,7 +2,7 @@
 
     python -m benchmarks.house                                  # what the sources alone show
     python -m benchmarks.house --against CHECKOUT --lowered     # which compiled programs are the same, letter by letter
-    python -m benchmarks.house --against CHECKOUT --times       # paired medians, where programs differ
+    python -m benchmarks.house --against CHECKOUT --times fit loop   # medians of both, where programs differ
 
 A floor is a step of the longest chain of imports inside a package, circles counted as one file. Imports inside
 functions and for type checking count.
@@ -18,10 +18,10 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 from benchmarks.harness import figure, record
 from benchmarks.import_graph import circles, floors, import_graph
@@ -30,6 +30,7 @@ from benchmarks.prose import sentences
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
 CLAIM = "a stranger finds the room in a minute"
+TIMED = ("physics", "environment", "learner", "fit", "loop")
 LONG, MANY = 60, 6  # lines of a function, and arguments, beyond which it counts
 
 
@@ -70,16 +71,23 @@ def dialect(root: Path = ROOT) -> int:
 
 
 def files_naming(effect: str, root: Path = ROOT) -> int:
-    """Files of the packages that name an effect of the catalogue in code, its own included: each must be changed where
-    it is added. Effects that other code needs by name (parts of presets) are not a measure of that."""
+    """Files of the packages that name an effect in code, its own included."""
     found = 0
     for package in PACKAGES:
         for path in (root / package).rglob("*.py"):
             tree = ast.parse(path.read_text())
-            found += any(isinstance(node, ast.Constant) and node.value == effect or
-                         isinstance(node, ast.ImportFrom) and (node.module or "").endswith(f".{effect}")
-                         for node in ast.walk(tree)) or path.stem == effect
+            found += path.stem == effect or any(
+                isinstance(node, ast.Constant) and node.value == effect
+                or isinstance(node, ast.ImportFrom) and (node.module or "").endswith(f".{effect}")
+                for node in ast.walk(tree))
     return found
+
+
+def files_of_new_effect(root: Path = ROOT) -> int:
+    """Files that the effect from outside needs which tests simulate, fit and name: its own, and what names it here."""
+    text = (root / "tests/sysid/outside_effect.py").read_text()
+    [name] = re.findall(r'^    name = "(\w+)"', text, re.MULTILINE)
+    return 1 + files_naming(name, root)
 
 
 def from_sources(root: Path = ROOT) -> dict[str, dict]:
@@ -91,12 +99,11 @@ def from_sources(root: Path = ROOT) -> dict[str, dict]:
     spoken = [one for page in pages(root) for one in sentences(page.read_text())]
     lines = sum(len(path.read_text().splitlines()) for path in (root / "sysid").rglob("*.py"))
     top = {package: len(list((root / package).glob("*.py"))) for package in PACKAGES}
-    simple = ("supply_sag", "backlash", "wind", "jerk_limit", "gyro_bias")
     counts: dict[str, tuple[float, str]] = {
         "import_circles": (len(circles(graph)), "count"),
         **{f"import_floors_{package}": (floors(graph, package), "count") for package in PACKAGES},
         **{f"files_top_{package}": (number, "count") for package, number in top.items()},
-        "files_per_new_effect": (max(files_naming(name, root) for name in simple), "count"),
+        "files_per_new_effect": (files_of_new_effect(root), "count"),
         "functions_over_60": (len(long), "count"), "functions_over_6_arguments": (len(many), "count"),
         "lines_sysid": (lines, "count"), "names_sysid": (public_names(root / "sysid"), "count"),
         "sentences_over_35_words": (sum(len(one.split()) > 35 for one in spoken), "count"),
@@ -129,7 +136,8 @@ def _run(tree: Path, *arguments: str) -> dict:
     script = Path(__file__).with_name("house_programs.py")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        environment = {**os.environ, "PYTHONPATH": str(tree)}
+        path = os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path}
         subprocess.run([sys.executable, str(script), "--out", str(out), *arguments], check=True, cwd=tree,
                        env=environment)
         found: dict = json.loads(out.read_text())
@@ -145,15 +153,14 @@ def compare_programs(other: Path) -> dict[str, dict]:
             for name in mine}
 
 
-def compare_times(other: Path, repeats: int) -> dict[str, dict]:
-    """Median of paired ratios of seconds, this tree over the other, one pair after the other."""
+def compare_times(other: Path, programs: list[str], rounds: int) -> dict[str, dict]:
+    """Medians of this tree's seconds over the other's, each tree in a process of its own, one after the other."""
     ratios: dict[str, list[float]] = {}
-    for number in range(repeats):
-        began = time.perf_counter()
-        mine, theirs = (_run(tree, "--times") for tree in (ROOT, other))
-        for name, seconds in mine.items():
-            ratios.setdefault(name, []).append(seconds / theirs[name])
-        print(f"pair {number + 1} of {repeats}, {time.perf_counter() - began:.0f} s: "
+    for number in range(rounds):
+        mine, theirs = (_run(tree, "--times", *programs) for tree in (ROOT, other))
+        for name, taken in mine.items():
+            ratios.setdefault(name, []).append(median(taken) / median(theirs[name]))
+        print(f"round {number + 1} of {rounds}: "
               + ", ".join(f"{name} {each[-1]:.3f}" for name, each in ratios.items()), flush=True)
     return {f"time_ratio_{name}": figure(each, "ratio") for name, each in ratios.items()}
 
@@ -165,8 +172,8 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, help="another checkout of the project")
     parser.add_argument("--lowered", action="store_true", help="compare lowered programs with it")
-    parser.add_argument("--times", action="store_true", help="compare seconds with it")
-    parser.add_argument("--repeats", type=int, default=5, help="pairs of runs")
+    parser.add_argument("--times", nargs="*", choices=TIMED, default=[], help="programs whose seconds are compared with it")
+    parser.add_argument("--rounds", type=int, default=1, help="of timing both trees, five calls a program each")
     options = parser.parse_args()
     if (options.lowered or options.times) and options.against is None:
         parser.error("--lowered and --times need --against CHECKOUT")
@@ -174,7 +181,7 @@ def main() -> None:
     if options.lowered:
         figures |= compare_programs(options.against.resolve())
     if options.times:
-        figures |= compare_times(options.against.resolve(), options.repeats)
+        figures |= compare_times(options.against.resolve(), options.times, options.rounds)
     for name, one in figures.items():
         print(f"{name}: {one['value']:g} {one['unit']}")
     record("house", CLAIM, figures)

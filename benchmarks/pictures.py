@@ -137,7 +137,7 @@ def loop(run: Path, out: Path) -> None:
     right.set_xlim(left=0.0)
     right.locator_params(axis="x", nbins=5)
     right.set(xlabel="left radius less right radius, share of the nominal" if name.startswith("wheel_radius") else name,
-              title="Each manoeuvre by itself finds the same size")
+              title="Each manoeuvre finds the same size")
     right.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.18))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)

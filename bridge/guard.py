@@ -169,6 +169,7 @@ class GuardLink:
         ended = self._process is None or self._process.poll() is not None
         if self._start is not None and ended and now - self._started >= self.RESTART:
             self._process, self._started = self._start(), now
+            self._heard, self._trusted = None, -self.STALE  # what the one before said counts no more
 
     def heard(self, now: float, text: str) -> None:
         """Take a heartbeat of a guard."""

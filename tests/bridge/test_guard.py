@@ -120,8 +120,9 @@ def test_guard_that_ended_is_started_again_after_a_pause():
     assert link.problem(1.1) == "the guard ended with code 1"
     link.keep(1.2)
     assert len(started) == 1
+    link.heard(2.05, json.dumps(GOOD))
     link.keep(2.1)
-    assert len(started) == 2
+    assert len(started) == 2 and link.problem(2.11) == "no guard is running"  # whatever the dead one said
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "[]", "{}", '{"session": 3, "driving": true}', '{"session": "a"}'])
