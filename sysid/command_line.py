@@ -11,6 +11,7 @@ from typing import Any
 
 from sysid.search.result import Progress
 from whill_mjx import command_line
+from whill_mjx.heartbeat import Heartbeat
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
@@ -18,7 +19,8 @@ def run(options: type, main: Callable[[Any], Any], description: str | None, **mo
 
     def cached(chosen: Any) -> None:
         keep_compiled()
-        main(chosen)
+        with Heartbeat():  # progress bars tick while something long is computed
+            main(chosen)
 
     command_line.run(options, cached, description, **more)
 

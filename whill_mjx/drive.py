@@ -253,7 +253,7 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     check_place("--out", options.out)
 
 
-def drive(options: DriveOptions) -> None:
+def drive_and_say(options: DriveOptions) -> None:
     """Drive, and say what to do with the dataset."""
     folder = main(options)
     count = len(list((folder / "trials").iterdir()))
@@ -262,7 +262,7 @@ def drive(options: DriveOptions) -> None:
 
 def cli() -> None:
     """Command line."""
-    run(DriveOptions, drive, __doc__, positional=False)
+    run(DriveOptions, drive_and_say, __doc__, positional=False)
 
 
 if __name__ == "__main__":

@@ -219,7 +219,8 @@ def _parse(text: str, like: Any, whole: str) -> Any:
         parts = tuple(float(part) for part in text.split(",")) if isinstance(like, tuple) else ()
         value = parts or type(like)(text)
     except ValueError as error:
-        raise OptionError(f"--set {whole}: {text!r} is no {type(like).__name__}. Correct it.") from error
+        kind = {int: "whole number", float: "number", tuple: "list of numbers"}.get(type(like), type(like).__name__)
+        raise OptionError(f"--set {whole}: {text!r} is no {kind}. Correct it.") from error
     if parts and len(parts) != len(like):
         raise OptionError(f"--set {whole}: {len(parts)} numbers where {len(like)} are needed. Correct it.")
     if not all(math.isfinite(one) for one in parts or (value,) if isinstance(one, float)):

@@ -26,6 +26,7 @@ th, td { padding: .18rem .6rem; border-bottom: 1px solid #e6e6e6; text-align: le
 th { font-weight: 600; border-bottom: 1px solid #9a9a9a; white-space: nowrap; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; } th.n { text-align: right; }
 caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; }
+td.i { white-space: nowrap; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
 figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img, video { max-width: 100%; }

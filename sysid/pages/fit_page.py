@@ -95,7 +95,8 @@ def in_words(report: dict[str, Any], shown: int = 6) -> list[str]:
     known = [one for one in report["parameters"] if one["identifiable"]]
     for one in sorted(known, key=_change, reverse=True)[:shown]:
         low, high = one["interval"]
-        lines.append(f"{one['name']}: {one['initial']:.4g} -> {one['value']:.4g} {one['unit']} "
+        unit = "" if one["unit"] == "-" else f" {one['unit']}"
+        lines.append(f"{one['name']}: {one['initial']:.4g} -> {one['value']:.4g}{unit} "
                      f"({one['confidence']:.0%} interval {low:.4g} to {high:.4g})")
     unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
     if len(known) > shown:

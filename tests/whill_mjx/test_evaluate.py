@@ -262,7 +262,7 @@ def test_task_fields_come_from_the_run_the_policy_and_the_command(seeker):
     run.unlink()
     with pytest.raises(ValueError, match="no field 'gate'"):
         choose_task(EvaluateOptions(str(seeker), set=("gate=1",)), policy)
-    with pytest.raises(ValueError, match="is no int"):
+    with pytest.raises(ValueError, match="is no whole number"):
         choose_task(EvaluateOptions(str(seeker), set=("gates=two",)), policy)
 
 

@@ -73,7 +73,7 @@ def mistaken(command, words, capsys):
     ("evaluate", "planner --set gate=1", "no field 'gate'"),
     ("evaluate", "planner --set goal_x=nan", "--set goal_x=nan: must be finite"),
     ("evaluate", "planner --set gate_x=1", "--set gate_x=1: 1 numbers where 2 are needed"),
-    ("evaluate", "planner --set max_steps=0", "must be at least 1"),
+    ("evaluate", "planner --set max_steps=0", "max_steps is 0; it must be positive"),
     ("evaluate", "planner --sweep nope=1", "unknown axis 'nope'"),
     ("evaluate", "planner --sweep nope", "'nope' is no axis of a sweep"),
     ("evaluate", "planner --sweep light=1:2", "light=1:2"),
@@ -103,11 +103,14 @@ def test_a_mistake_ends_with_one_line_and_code_2(command, words, told, tmp_path,
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"preset": {"task": 3}}', "\ufeff{}"])
-def test_a_damaged_note_beside_a_policy_is_named(text, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("text", "said"), [
+    ("{", "not valid JSON"), ("[]", "is []; it must be a JSON object"),
+    ('{"preset": {"task": 3}}', "preset.task is 3; it must be a table"), ("\ufeff{}", "no field 'preset'"),
+])  # fmt: skip
+def test_a_damaged_note_beside_a_policy_is_named(text, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     marker_seeker.write(tmp_path / "run" / "policy")
     (tmp_path / "run" / "run.json").write_text(text, encoding="utf-8")
     code, line = mistaken("evaluate", "run/policy --out new", capsys)
-    assert code == command_line.REFUSED and "run.json: does not say how the policy's task was set" in line
+    assert code == command_line.REFUSED and f"run.json: {said}" in line
     assert not (tmp_path / "new").exists()

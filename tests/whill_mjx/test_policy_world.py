@@ -9,7 +9,6 @@ import pytest
 
 from bridge.policy import PolicyFileError
 from bridge.simulate import make_vehicle, parse_arguments
-from whill_mjx.command_line import OptionError
 from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.policy_world import find_policy, read_world
@@ -72,5 +71,5 @@ def test_the_world_of_no_policy_is_refused_and_so_is_a_damaged_note(trained, tmp
     assert read_world(tmp_path).fields == {"v_min": 0.0, "v_max": marker_seeker.HIGH[0], "omega_max": 1.0,
                                            "action_repeat": 2}  # fmt: skip
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(OptionError, match="run.json: does not say"):
+    with pytest.raises(ValueError, match="run.json: not valid JSON"):
         read_world(tmp_path / "policy")

@@ -214,7 +214,8 @@ def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], o
     moving = "".join(html.video(path.name, "Episodes that failed, as the camera saw them and from above")
                      for path in videos)  # fmt: skip
     sections += [html.Section("Videos", moving)] if videos else []
-    subtitle = f"{first['episodes']} episodes with each driver; computed on {evaluation['device']}"
+    device = " ".join(dict.fromkeys(evaluation["device"].split(": ")))
+    subtitle = f"{first['episodes']} episodes with each driver; computed on {device}"
     write_whole(out, html.html_page(f"Evaluation of {evaluation['policy']} in the task {task}", sections, subtitle))
     return out
 
@@ -225,7 +226,7 @@ def _figures(drivers: dict[str, Any]) -> str:
     for name in (name for name in WORDS if f"{name}_interval_95" in first):
         row: list[Any] = [WORDS[name]]
         for figures in drivers.values():
-            row += [_shown(name, figures[name]), _interval(name, figures[f"{name}_interval_95"])]
+            row += [_shown(name, figures[name]), html.Cell(_interval(name, figures[f"{name}_interval_95"]), "i")]
         rows.append(row)
     header = ["figure", *(text for name in drivers for text in (_driver(name), "95 % interval"))]
     main_name = next(iter(drivers))
@@ -250,7 +251,7 @@ def _caption(path: Path) -> str:
     stem = path.stem
     if stem.startswith("sweep_"):
         return f"Success over {stem.removeprefix('sweep_').replace('_', ' ')}"
-    return CAPTIONS.get(stem, f"Drives from above: {stem.removeprefix('paths_').replace('_', ' ')}")
+    return CAPTIONS.get(stem, f"Drives from above: {_driver(stem.removeprefix('paths_').replace('_', ' '))}")
 
 
 def _shown(name: str, value: float | None) -> str:

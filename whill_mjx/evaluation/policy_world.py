@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.policy import Contract, read_policy
-from whill_mjx.command_line import OptionError, refusing
+from whill_mjx.command_line import OptionError
 from whill_mjx.evaluation.policy_file import vehicle_file
 from whill_mjx.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.folders import RUN_FILE
@@ -48,7 +48,7 @@ def read_world(path: str | Path) -> PolicyWorld:
 
     Raises:
         PolicyFileError: there is no policy, or it is damaged.
-        OptionError: its task is unknown, or the run.json beside it is damaged.
+        ValueError: its task is unknown, or the run.json beside it is damaged.
     """
     folder = find_policy(path)
     checked = read_policy(folder)
@@ -67,17 +67,16 @@ def trained_fields(policy: Path, task: str) -> dict[str, Any]:
     """Fields of a policy's task from the run.json of its training, which lies beside it; empty where none does.
 
     Raises:
-        OptionError: the run.json is damaged.
+        ValueError: the run.json is damaged; names file, field, value, rule and remedy.
     """
     run = policy.parent / RUN_FILE
     if not run.is_file():
         return {}
     hint = "Put the file of the training there, or move the policy to another folder and give the fields with --set."
-    with refusing():
-        content = read_json(run, f"missing. {hint}", hint)
-        preset = check_table(str(run), RUN, content, others=True)["preset"]
-        saved = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
-        rows = {field.name: field for field in TASK}
-        known = {field.name for field in dataclasses.fields(TASKS[task])}
-        return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
-                for name, value in saved.items() if name in known}
+    content = read_json(run, f"missing. {hint}", hint)
+    preset = check_table(str(run), RUN, content, others=True)["preset"]
+    saved = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
+    rows = {field.name: field for field in TASK}
+    known = {field.name for field in dataclasses.fields(TASKS[task])}
+    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
+            for name, value in saved.items() if name in known}

@@ -45,7 +45,8 @@ def write_index(out: Path, evaluation: dict[str, Any], task: str) -> Path:
     files = [(name, text) for name, text in FILES.items() if (out / name).is_file()]
     sections.append(html.Section("Files", html.links(files)))
     title = f"Training in the task {task.replace('_', ' ')}"
-    write_whole(out / INDEX, html.html_page(title, sections, f"{evaluation['env_steps']} environment steps"))
+    subtitle = f"the policy of environment step {evaluation['env_steps']}"
+    write_whole(out / INDEX, html.html_page(title, sections, subtitle))
     return out / INDEX
 
 
