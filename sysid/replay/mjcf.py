@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import SERVO_GAIN, Entry, Robot, default_paths, load_robot, resolve, write_mjcf
+from sysid.replay.mjcf_file import Entry, Robot, default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
 from sysid.replay.rollout import quaternion_product
 
@@ -72,7 +72,8 @@ def mjcf_model(
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry] = {}
     if robot.motors:
-        bounds["drive.kp"] = (SERVO_GAIN, SERVO_GAIN / 100, SERVO_GAIN * 100, "N m s/rad")
+        gain, high = robot.drive_gain
+        bounds["drive.kp"] = (gain, gain / 100, high, "N m s/rad")
     for name in names:
         given = parameters[name] if isinstance(parameters, Mapping) else None
         if name == "drive.kp" and robot.motors:

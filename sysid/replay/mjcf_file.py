@@ -20,7 +20,10 @@ from whill_mjx.reading import MB, decoded, read_bytes
 MODEL_BYTES = 20 * MB
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
-SERVO_GAIN = 1.0  # N m s/rad of the velocity servos that a model without actuators gets
+SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
+ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
+SERVO_STEPS = 2  # the least number of timesteps in that time
+REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 FIELDS = {  # KIND, FIELD -> array of the model, column, unit
     ("body", "mass"): ("body_mass", None, "kg"),
     **{("body", f"com_{axis}"): ("body_ipos", i, "m") for i, axis in enumerate("xyz")},
@@ -100,6 +103,8 @@ class Robot:
     """1 where a positive speed of the joint drives forwards."""
     motors: bool
     """The actuators take a torque, and not a speed."""
+    drive_gain: tuple[float, float]
+    """Gain of a speed controller before motors, and the highest stable one [N m s/rad over the motor's gain]."""
     point: np.ndarray  # (3,) middle between the driven wheels, root's frame
     forward: np.ndarray  # (3,) root's frame
     wheel_radius: float
@@ -126,6 +131,11 @@ def load_robot(
         ids = [host.joint(name).id for name in joints]
         bodies = [int(host.jnt_bodyid[one]) for one in ids]
         radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
+        inertias = [_wheel_inertias(host, one, radius) for one in ids]
+        if _add_servos(spec, joints, inertias):
+            host = spec.compile()
+            data = mujoco.MjData(host)
+            mujoco.mj_kinematics(host, data)
         if not (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
             bottom = float(data.xpos[bodies[0], 2]) - _wheel_radius(path, host, bodies[0], radius)
             spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom])
@@ -145,14 +155,31 @@ def load_robot(
     middle = (data.xanchor[ids[0]] + data.xanchor[ids[1]]) / 2 - data.xpos[host.body_rootid[bodies[0]]]
     sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
     actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
-    for _ in range(round(SETTLE / host.opt.timestep)):
+    root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids])
+    _settle(path, host, data, speed, turning, float(radius))
+    return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
+                 _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
+                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy())
+
+
+def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:
+    """Let the model come to rest on its floor, without a command; ValueError where it does not."""
+    remedy = "Check its contacts, the gains and inertias of its wheels, and its timestep."
+    faults = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    steps = round(SETTLE / host.opt.timestep)
+    fastest = 0.0
+    for step in range(steps):
         mujoco.mj_step(host, data)
-    if not np.isfinite(data.qpos).all():
-        raise ValueError(f"{path}: at rest on its floor the model becomes non-finite. Check its contacts and timestep.")
-    root = int(host.jnt_qposadr[free])
-    return Robot(path, spec, host, root, int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids]), _pair(actuators),
-                 (sign[0], sign[1]), _are_motors(path, host, actuators), rotation.T @ middle, rotation.T @ forward,
-                 float(radius), distance if track is None else track, data.qpos.copy())
+        if any(data.warning[int(fault)].number for fault in faults) or not np.isfinite(data.qpos).all():
+            raise ValueError(f"{path}: the model explodes while it settles on its floor, after "
+                             f"{(step + 1) * host.opt.timestep:.3f} s (a position, speed or acceleration is not "
+                             f"finite or huge). {remedy}")
+        if step >= 0.8 * steps:  # a wheel that shakes passes through 0
+            rims = np.abs(data.qvel[list(wheels)]) * radius
+            fastest = max(fastest, float(np.linalg.norm(data.qvel[speed : speed + 3])), *map(float, rims))
+    if fastest > REST_SPEED:
+        raise ValueError(f"{path}: after {SETTLE:g} s on its floor, without a command, the model still moves at "
+                         f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
 
 
 def resolve(robot: Robot, path: str) -> Entry:
@@ -265,7 +292,7 @@ def _wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, st
 
 
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
-    """Give the model a free joint, servos on its wheels and names to its geoms, where it has none."""
+    """Give the model a free joint and names to its geoms, where it has none."""
     spec.compiler.fusestatic = False
     top = next(body for body in spec.bodies if any(joint.name == joints[0] for joint in body.joints))
     while top.parent.name != "world":
@@ -275,16 +302,56 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
     elif top.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError(f"{path}: body {top.name!r} hangs on joint {top.joints[0].name!r}; a vehicle moves freely. "
                          "Give it a freejoint, or no joint.")
-    for joint in joints:
-        if not any(actuator.target == joint for actuator in spec.actuators):
-            actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.set_to_velocity(kv=SERVO_GAIN)
     for body in spec.bodies:
         taken = {geom.name for geom in spec.geoms}
         for k, geom in enumerate(body.geoms):
             plain = body.name if k == 0 else f"{body.name}_{k}"
             if not geom.name and plain and plain not in taken:
                 geom.name = plain
+
+
+def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
+    """Give velocity servos to wheels without actuators; whether there were any.
+
+    Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
+    vehicles follow within the same time. A wheel that slips is far lighter, so the integration is implicit in speed.
+    MuJoCo softens a contact with the inverse inertia of what touches: a wheel without a motor's rotor would creep.
+    """
+    bare = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)]
+    time = max(SERVO_TIME, SERVO_STEPS * spec.option.timestep)
+    for k in bare:
+        actuator = spec.add_actuator(name=joints[k], target=joints[k], trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        wheel, total = inertias[k]
+        actuator.set_to_velocity(kv=total / time)
+        joint = spec.joint(joints[k])
+        joint.armature += max(ROTOR_SHARE * total - wheel, 0.0)
+    if bare:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return bool(bare)
+
+
+def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float) -> tuple[float, float]:
+    """Inertia about a wheel's axle [kg m^2]: of the wheel alone, and with half of the vehicle that rolls on two."""
+    body = int(host.jnt_bodyid[joint])
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, host.body_iquat[body])
+    axis = turn.reshape(3, 3).T @ host.jnt_axis[joint]
+    wheel = float(axis**2 @ host.body_inertia[body] + host.dof_armature[host.jnt_dofadr[joint]])
+    return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / 2
+
+
+def _drive_gain(
+    host: mujoco.MjModel, actuators: Sequence[int], inertias: Sequence[tuple[float, float]],
+) -> tuple[float, float]:  # fmt: skip
+    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable.
+
+    The controller's torque is computed before a step, so it may take away at most a wheel's whole speed in one.
+    """
+    wheel, total = (min(one) for one in zip(*inertias, strict=True))
+    motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
+    time = max(SERVO_TIME, SERVO_STEPS * host.opt.timestep)
+    high = wheel / host.opt.timestep
+    return min(total / time, high / 2) / motor, high / motor
 
 
 def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:

@@ -191,6 +191,48 @@ def test_a_urdf_gets_floor_freedom_and_servos_and_stands_still_on_its_wheels(tmp
     assert set(mjcf_model(path).params.values) == {"actuator.*_wheel_joint.gain", "geom.*_wheel.friction"}
 
 
+def driven_straight(robot, v, seconds=2.0):
+    """Speed over the second half of a drive in C MuJoCo from rest, with a constant command."""
+    host, data, way = robot.host, mujoco.MjData(robot.host), []
+    data.qpos[:] = robot.rest
+    data.ctrl[list(robot.actuators)] = np.array(robot.sign) * v / robot.wheel_radius
+    for _ in range(2):
+        for _ in range(round(seconds / 2 / host.opt.timestep)):
+            mujoco.mj_step(host, data)
+        way.append(data.qpos[robot.root : robot.root + 2].copy())
+    return np.linalg.norm(way[1] - way[0]) / (seconds / 2)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("timestep", [0.0005, 0.002])
+@pytest.mark.parametrize("wheel", [1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("vehicle", [0.05, 1.0, 10.0])
+def test_added_servos_drive_light_and_heavy_robots_at_the_commanded_speed(tmp_path, vehicle, wheel, timestep):
+    """Masses and inertias are times these numbers; the cart drags a ball of rubber."""
+    text = URDF
+    for old, name, scale in (("8", "mass value", vehicle), ("0.5", "mass value", vehicle * wheel),
+                             *((old, axis, vehicle) for old in ("0.1", "0.2") for axis in ("ixx", "iyy", "izz")),
+                             *(("0.002", axis, vehicle * wheel) for axis in ("ixx", "iyy", "izz"))):
+        text = text.replace(f'{name}="{old}"', f'{name}="{float(old) * scale}"')
+    path = tmp_path / "cart.urdf"
+    path.write_text(text)
+    assert driven_straight(load_robot(path, timestep=timestep), 0.6) == pytest.approx(0.6, rel=0.1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (('kv="1"', 'implicitfast', 'armature="0.01"'), ('kv="500"', 'Euler', ''), "explodes while it settles"),
+    (('size="10 10 0.1"',), ('size="10 10 0.1" contype="0" conaffinity="0"',), "still moves at .* it falls")])
+def test_a_model_that_does_not_come_to_rest_is_refused_with_the_reason(tmp_path, old, new, message):
+    text = ROBOT
+    for one, other in zip(old, new, strict=True):
+        text = text.replace(one, other)
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"robot.xml: .*{message}.*Check its contacts, the gains"):
+        load_robot(path)
+
+
 @pytest.mark.quick
 def test_a_robot_is_placed_with_its_axle_at_the_start_and_wheels_that_turn_forwards(robot_file):
     plant, params = mjcf_model(robot_file).plant, mjcf_model(robot_file).params
@@ -239,6 +281,8 @@ def test_motors_get_a_speed_controller_of_their_own(tmp_path):
     model = mjcf_model(path, ["body.base.mass"])
     assert set(model.params.values) == {"drive.kp", "body.base.mass"}
     assert model_space(model.params).log.all()
+    wheel = 0.4 * 0.5 * 0.1**2 + 0.01
+    assert dict(model.params.about)["drive.kp"].high == pytest.approx(wheel / 0.01)  # at most the speed in one step
 
 
 @pytest.mark.quick
