@@ -355,14 +355,28 @@ def _drive_gain(
 
 
 def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
-    """Radius of the largest round geom of a wheel."""
+    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
     kinds = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
-    round_ones = [int(kind) for kind in kinds]
-    sizes = [float(size[0]) for size, kind, owner in zip(host.geom_size, host.geom_type, host.geom_bodyid, strict=True)
-             if owner == body and int(kind) in round_ones]
+    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, kinds)]
+    touching = [one for one in round_ones if _touches_ground(host, one)]
+    sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
     if not sizes and known is None:
         raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to give its radius. Give wheel_radius.")
     return max(sizes) if sizes else float(known or 0.0)
+
+
+def _parts(host: mujoco.MjModel, body: int) -> np.ndarray:
+    """Geoms of a body and of all that is fixed to it."""
+    return np.flatnonzero(host.body_weldid[host.geom_bodyid] == host.body_weldid[body])
+
+
+def _touches_ground(host: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom may touch a plane of the world, or any geom where there is none: a visual one does not."""
+    ground = np.flatnonzero((host.geom_bodyid == 0) & (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    if not len(ground):
+        return bool(host.geom_contype[geom] | host.geom_conaffinity[geom])
+    masks = host.geom_contype[geom] & host.geom_conaffinity[ground]
+    return bool((masks | host.geom_contype[ground] & host.geom_conaffinity[geom]).any())
 
 
 def _are_motors(path: Path, host: mujoco.MjModel, actuators: Sequence[int]) -> bool:
@@ -382,7 +396,11 @@ def default_paths(robot: Robot) -> tuple[str, ...]:
     host = robot.host
     joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
     bodies = host.jnt_bodyid[joints]
-    geoms = [int(np.flatnonzero(host.geom_bodyid == body)[0]) for body in bodies]
+    geoms = [max((int(one) for one in _parts(host, body) if _touches_ground(host, int(one))),
+                 key=lambda one: host.geom_rbound[one], default=None) for body in bodies]
+    if any(one is None for one in geoms):
+        raise ValueError(f"{robot.path}: a driven wheel has no geom that touches the ground (contype and conaffinity). "
+                         "Give it one.")
     found = []
     for kind, ids, field in (("actuator", robot.actuators, "gain"), ("joint", joints, "damping"),
                              ("geom", geoms, "friction")):

@@ -20,7 +20,7 @@ from sysid.logs.synthetic import write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import load_robot, resolve, write_mjcf
+from sysid.replay.mjcf_file import default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
 from sysid.search.fitting import fit_log
@@ -257,6 +257,30 @@ def test_a_robot_is_placed_with_its_axle_at_the_start_and_wheels_that_turn_forwa
 def test_a_wrong_path_says_what_is_known(robot_file, parameters, message):
     with pytest.raises(ValueError, match=message):
         mjcf_model(robot_file, parameters)
+
+
+VISUAL = '<geom type="sphere" size="0.14" contype="0" conaffinity="0" group="2" density="0"/>'
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("old", "new"), [
+    ('<geom name="{}_tyre"', VISUAL + '<geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', '<geom name="{}_hub" type="cylinder" size="0.04 0.02" mass="0.1"/><geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', '<geom name="{}_cap" type="box" size="0.12 0.01 0.12" contype="2" conaffinity="4" mass="0"'
+                             '/><geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', VISUAL + '<body name="{}_rim"><geom name="{}_tyre"')])
+def test_friction_is_fitted_on_what_touches_the_ground(tmp_path, old, new):
+    """A visual geom first, a hub, a cap that meets only other things, and a tyre on a body fixed to the wheel's."""
+    text = ROBOT
+    for side in ("left", "right"):
+        text = text.replace(old.format(side), new.replace("{}", side))
+        if "_rim" in new:
+            head, tail = text.split(f'name="{side}_tyre"')
+            text = f'{head}name="{side}_tyre"{tail.replace("</body>", "</body></body>", 1)}'
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    robot = load_robot(path)
+    assert "geom.*_tyre.friction" in default_paths(robot) and robot.wheel_radius == pytest.approx(0.1)
 
 
 @pytest.mark.quick
