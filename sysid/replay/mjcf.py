@@ -100,7 +100,7 @@ def mjcf_model(
         return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
                                   if name in entries}, Path(folder) / "model.xml")
 
-    return Model(robot.path.name, plant, params, write).with_effects(effects)
+    return Model(robot.path.name, plant, params, write, robot.notes).with_effects(effects)
 
 
 def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, Any, Any]:
@@ -108,7 +108,10 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
     from mujoco import mjx
 
     host, root, speed = robot.host, robot.root, robot.speed
-    nominal = mjx.put_model(host)
+    try:
+        nominal = mjx.put_model(host)
+    except NotImplementedError as error:
+        raise ValueError(f"{robot.path}: MJX cannot step it: {error} Change or remove this in the file.") from None
     blank = mjx.make_data(nominal)
     float_type = jnp.result_type(float)
     point, ahead = jnp.asarray(robot.point, float_type), jnp.asarray(robot.forward, float_type)

@@ -110,6 +110,8 @@ class Robot:
     wheel_radius: float
     track: float
     rest: np.ndarray  # qpos after SETTLE
+    notes: tuple[str, ...] = ()
+    """What was left out of the file."""
 
 
 def load_robot(
@@ -142,6 +144,11 @@ def load_robot(
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
+        notes = _leave_out_contacts(path, spec, host)
+        if notes:
+            host = spec.compile()
+            data = mujoco.MjData(host)
+            mujoco.mj_kinematics(host, data)
     except (ValueError, KeyError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         text = str(error).strip()
         raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}. Correct the "
@@ -159,7 +166,7 @@ def load_robot(
     _settle(path, host, data, speed, turning, float(radius))
     return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
                  _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
-                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy())
+                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(), notes)
 
 
 def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:
@@ -292,8 +299,12 @@ def _wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, st
 
 
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
-    """Give the model a free joint and names to its geoms, where it has none."""
+    """Give the model a free joint and names to its bodies and geoms, where it has none."""
     spec.compiler.fusestatic = False
+    named = {body.name for body in spec.bodies}
+    for k, body in enumerate(spec.bodies):
+        if not body.name:
+            body.name = next(name for name in (f"body_{k}", f"body_{k}_unnamed") if name not in named)
     top = next(body for body in spec.bodies if any(joint.name == joints[0] for joint in body.joints))
     while top.parent.name != "world":
         top = top.parent
@@ -308,6 +319,30 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
             plain = body.name if k == 0 else f"{body.name}_{k}"
             if not geom.name and plain and plain not in taken:
                 geom.name = plain
+
+
+def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
+    """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
+
+    left_out: dict[tuple[str, str], str] = {}
+    for one, other, declared in geom_pairs(host):
+        kinds = [int(host.geom_type[geom]) for geom in (one, other)]
+        if has_collision_fn(*kinds):  # type: ignore[arg-type]
+            continue
+        shapes = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds]
+        geoms = " and ".join(f"geom {mujoco.mj_id2name(host, KINDS['geom'], int(geom)) or geom!r} ({shape})"
+                             for geom, shape in zip((one, other), shapes, strict=True))
+        bodies = [int(host.geom_bodyid[geom]) for geom in (one, other)]
+        if declared >= 0 or 0 in bodies or host.body_rootid[bodies[0]] != host.body_rootid[bodies[1]]:
+            raise ValueError(f"{path}: MJX has no contact between {geoms}. Replace one by a sphere, capsule or box, or "
+                             "let their contype and conaffinity keep them apart.")
+        names = sorted(mujoco.mj_id2name(host, KINDS["body"], body) for body in bodies)
+        left_out.setdefault((names[0], names[1]), f"{path.name}: MJX has no contact between {geoms}; contacts between "
+                            f"their bodies {names[0]} and {names[1]} are left out")
+    for first, second in left_out:
+        spec.add_exclude(name=f"{first}_{second}_left_out", bodyname1=first, bodyname2=second)
+    return tuple(left_out.values())
 
 
 def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:

@@ -259,6 +259,37 @@ def test_a_wrong_path_says_what_is_known(robot_file, parameters, message):
         mjcf_model(robot_file, parameters)
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize(("first", "second"), [
+    ("cylinder", "box"), ("box", "cylinder"), ("ellipsoid", "box"), ("capsule", "cylinder"), ("box", "box")])
+def test_contacts_that_mjx_lacks_between_parts_of_a_robot_are_left_out_with_a_note(tmp_path, first, second):
+    """A caster on a swivel of its own, beside a bumper: two shapes that may meet."""
+    path = tmp_path / "robot.xml"
+    caster = ROBOT.index('<geom name="caster"')
+    path.write_text(ROBOT[:caster] + f'''
+      <body name="bumper" pos="-0.3 0 0.3"><joint axis="1 0 0"/>
+        <geom name="rubber" type="{first}" size="0.02 0.02 0.02" mass="0.1"/></body>
+      <body name="swivel" pos="0.3 0 0.3"><joint axis="0 0 1"/>
+        <geom name="fork" type="{second}" size="0.02 0.02 0.02" mass="0.1"/></body>''' + ROBOT[caster:])
+    robot = load_robot(path)
+    lacking = {first, second} in ({"cylinder", "box"}, {"ellipsoid", "box"})
+    between = [note for note in robot.notes if "rubber" in note and "fork" in note]
+    assert len(between) == lacking
+    assert all("bodies bumper and swivel are left out" in note for note in between)
+    model = mjcf_model(path)  # MJX takes it
+    written = mujoco.MjModel.from_xml_path(str(model.write(tmp_path, model.params)))
+    assert model.notes == robot.notes and written.nexclude == len(robot.notes)
+
+
+@pytest.mark.quick
+def test_a_contact_with_the_room_that_mjx_lacks_is_one_line_with_both_geoms(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace('<body name="base"', '<geom name="pillar" type="cylinder" size="0.1 1" pos="3 0 1"/>'
+                                  '<body name="base"').replace('contype="0" conaffinity="0"', ''))
+    with pytest.raises(ValueError, match=r"no contact between geom 'pillar' .cylinder. and geom 'box' .box.. Replace"):
+        load_robot(path)
+
+
 VISUAL = '<geom type="sphere" size="0.14" contype="0" conaffinity="0" group="2" density="0"/>'
 
 
