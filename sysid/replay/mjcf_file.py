@@ -13,11 +13,10 @@ import jax
 import mujoco
 import numpy as np
 
+from sysid.replay.robot_files import read_robot
 from whill_mjx.fields import Field, check
 from whill_mjx.logs.dataset import write_text
-from whill_mjx.reading import MB, decoded, read_bytes
 
-MODEL_BYTES = 20 * MB
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
@@ -119,9 +118,8 @@ def load_robot(
     timestep: float | None = None,
 ) -> Robot:
     """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
-    decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF or URDF file."))
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec, replaced = read_robot(path, wheels, wheel_radius)
         joints = _wheel_joints(path, spec, wheels)
         _complete(path, spec, joints)
         if timestep is not None:
@@ -166,7 +164,8 @@ def load_robot(
     _settle(path, host, data, speed, turning, float(radius))
     return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
                  _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
-                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(), notes)
+                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(),
+                 (*replaced, *notes))
 
 
 def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import struct
+import sys
 import threading
 import tomllib
 
@@ -287,6 +290,99 @@ def test_a_contact_with_the_room_that_mjx_lacks_is_one_line_with_both_geoms(tmp_
     path.write_text(ROBOT.replace('<body name="base"', '<geom name="pillar" type="cylinder" size="0.1 1" pos="3 0 1"/>'
                                   '<body name="base"').replace('contype="0" conaffinity="0"', ''))
     with pytest.raises(ValueError, match=r"no contact between geom 'pillar' .cylinder. and geom 'box' .box.. Replace"):
+        load_robot(path)
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory):
+    """Bytes of a cube of 0.2 m in binary STL."""
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [-0.1, 0.1])).reshape(3, 8).T
+    triangles = [corner for corner in itertools.combinations(range(8), 3)
+                 if any(len(set(corners[list(corner), axis])) == 1 for axis in range(3))]
+    rows = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[list(one)].ravel(), 0) for one in triangles)
+    return b" " * 80 + struct.pack("<I", len(triangles)) + rows
+
+
+BODY = '<collision><origin xyz="0 0 0.45"/><geometry><mesh filename="{}"/></geometry></collision>'
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("named", "lies"), [
+    ("package://cart_description/meshes/body.stl", "cart_description/meshes/body.stl"),
+    ("package://cart_description/meshes/body.stl", "cart_description/urdf/meshes/body.stl"),
+    ("package://cart_description/body.stl", "cart_description/urdf/body.stl"),
+    ("../meshes/body.stl", "cart_description/meshes/body.stl"), ("body.stl", "cart_description/urdf/body.stl"),
+    ("package://other_package/meshes/body.dae", "other_package/meshes/body.stl"),
+    ("file:///elsewhere/body.stl", "cart_description/meshes/deep/body.stl")])
+def test_meshes_are_found_where_packages_usually_have_them(tmp_path, cube, named, lies):
+    path, mesh = tmp_path / "cart_description" / "urdf" / "cart.urdf", tmp_path / lies
+    path.parent.mkdir(parents=True)
+    mesh.parent.mkdir(parents=True, exist_ok=True)
+    mesh.write_bytes(cube)
+    path.write_text(URDF.replace("</inertial>", "</inertial>" + BODY.format(named), 1))
+    robot = load_robot(path)
+    assert robot.host.nmesh == 1 and robot.notes == ()
+    assert np.ptp(robot.host.mesh_vert, axis=0) == pytest.approx([0.2, 0.2, 0.2], abs=1e-5)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("content", [None, b"solid body\n facet normal 0 0 1\n", b"", b"not a mesh"])
+def test_a_mesh_that_is_missing_or_unreadable_becomes_a_box_of_its_links_inertia_with_a_note(tmp_path, content):
+    path = tmp_path / "cart.urdf"
+    text = URDF.replace("</inertial>", "</inertial>" + BODY.format("package://cart/body.stl"), 1)
+    text = text.replace("<inertial>", '<inertial><origin xyz="0 0 0.35"/>', 1)  # where the box is, above the floor
+    path.write_text(text.replace('<geometry><cylinder radius="0.1" length="0.04"/></geometry>',
+                                 '<geometry><mesh filename="wheel.stl"/></geometry>'))
+    for name in ("body", "wheel") if content is not None else ():
+        (tmp_path / f"{name}.stl").write_bytes(content)
+    robot = load_robot(path, wheel_radius=0.1)
+    assert len(robot.notes) == 3 and "mesh package://cart/body.stl of link base is not found" in robot.notes[0]
+    assert "a cylinder of 0.1 m radius stands in" in robot.notes[1]
+    box = robot.host.geom_size[robot.host.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)]
+    sides = 2 * box[0]
+    np.testing.assert_allclose(8 / 12 * (np.sum(sides**2) - sides**2), [0.1, 0.1, 0.2], rtol=1e-4)
+    assert driven_straight(robot, 0.6) == pytest.approx(0.6, rel=0.1)
+
+
+@pytest.mark.quick
+def test_a_mesh_that_an_mjcf_file_lacks_becomes_a_box(tmp_path, cube):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace("<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>', 1)
+                    .replace('name="box" type="box" size="0.2 0.15 0.05"', 'name="box" type="mesh" mesh="hull"')
+                    .replace('mass="8" contype="0" conaffinity="0"', 'mass="8" pos="0 0 0.2"'))
+    note = load_robot(path).notes[0]
+    assert "mesh hull.stl of body base is not found, or MuJoCo cannot read it; a box of 0.1 x" in note
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "hull.stl").write_bytes(cube)
+    robot = load_robot(path)
+    written = write_mjcf(robot, {}, tmp_path / "elsewhere.xml")
+    assert robot.notes == () and mujoco.MjModel.from_xml_path(str(written)).nmesh == 1
+
+
+@pytest.mark.quick
+def test_a_xacro_file_is_expanded_with_packages_from_the_folders_around_it(tmp_path):
+    pytest.importorskip("xacro")
+    path = tmp_path / "cart_description" / "urdf" / "cart.urdf.xacro"
+    path.parent.mkdir(parents=True)
+    (path.parent / "sizes.xacro").write_text('<robot xmlns:xacro="http://www.ros.org/wiki/xacro">'
+                                             '<xacro:property name="radius" value="0.1"/></robot>')
+    head = ('<robot name="cart" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+            '<xacro:include filename="$(find cart_description)/urdf/sizes.xacro"/>')
+    text = URDF.strip().replace('<robot name="cart">', head).replace('cylinder radius="0.1"',
+                                                                     'cylinder radius="${radius}"')
+    path.write_text(text)
+    assert load_robot(path).wheel_radius == pytest.approx(0.1)
+    path.write_text(text.replace("find cart_description", "find nowhere"))
+    with pytest.raises(ValueError, match="cart.urdf.xacro: xacro cannot expand it: .*'nowhere'.* expand it where"):
+        load_robot(path)
+
+
+@pytest.mark.quick
+def test_without_xacro_the_error_has_the_command_that_installs_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    path = tmp_path / "cart.xacro"
+    path.write_text(URDF.strip())
+    with pytest.raises(ValueError, match="cart.xacro: xacro files need the package xacro.* pip install xacro"):
         load_robot(path)
 
 
