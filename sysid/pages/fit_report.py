@@ -39,7 +39,8 @@ def make_report(
     return {
         "schema": SCHEMA, "kind": KIND,
         "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
-                    "notes": list(log.notes), "training": [trial.name for trial in log.training],
+                    "notes": [*log.notes, *(fit.model.notes if fit.model is not None else ())],
+                    "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out], **(source or {})},
         "code": code_hashes(),
         "settings": {**asdict(config), "storage": without_secrets(config.storage),

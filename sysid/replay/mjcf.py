@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import SERVO_GAIN, Entry, Robot, default_paths, load_robot, resolve, write_mjcf
+from sysid.replay.mjcf_file import Entry, Robot, default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
 from sysid.replay.rollout import quaternion_product
 
@@ -72,7 +72,8 @@ def mjcf_model(
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry] = {}
     if robot.motors:
-        bounds["drive.kp"] = (SERVO_GAIN, SERVO_GAIN / 100, SERVO_GAIN * 100, "N m s/rad")
+        gain, high = robot.drive_gain
+        bounds["drive.kp"] = (gain, gain / 100, high, "N m s/rad")
     for name in names:
         given = parameters[name] if isinstance(parameters, Mapping) else None
         if name == "drive.kp" and robot.motors:
@@ -99,7 +100,7 @@ def mjcf_model(
         return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
                                   if name in entries}, Path(folder) / "model.xml")
 
-    return Model(robot.path.name, plant, params, write).with_effects(effects)
+    return Model(robot.path.name, plant, params, write, robot.notes).with_effects(effects)
 
 
 def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, Any, Any]:
@@ -107,7 +108,10 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
     from mujoco import mjx
 
     host, root, speed = robot.host, robot.root, robot.speed
-    nominal = mjx.put_model(host)
+    try:
+        nominal = mjx.put_model(host)
+    except NotImplementedError as error:
+        raise ValueError(f"{robot.path}: MJX cannot step it: {error} Change or remove this in the file.") from None
     blank = mjx.make_data(nominal)
     float_type = jnp.result_type(float)
     point, ahead = jnp.asarray(robot.point, float_type), jnp.asarray(robot.forward, float_type)

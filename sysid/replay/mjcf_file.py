@@ -13,14 +13,16 @@ import jax
 import mujoco
 import numpy as np
 
+from sysid.replay.robot_files import read_robot
 from whill_mjx.fields import Field, check
 from whill_mjx.logs.dataset import write_text
-from whill_mjx.reading import MB, decoded, read_bytes
 
-MODEL_BYTES = 20 * MB
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
-SERVO_GAIN = 1.0  # N m s/rad of the velocity servos that a model without actuators gets
+SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
+ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
+SERVO_STEPS = 2  # the least number of timesteps in that time
+REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 FIELDS = {  # KIND, FIELD -> array of the model, column, unit
     ("body", "mass"): ("body_mass", None, "kg"),
     **{("body", f"com_{axis}"): ("body_ipos", i, "m") for i, axis in enumerate("xyz")},
@@ -100,11 +102,15 @@ class Robot:
     """1 where a positive speed of the joint drives forwards."""
     motors: bool
     """The actuators take a torque, and not a speed."""
+    drive_gain: tuple[float, float]
+    """Gain of a speed controller before motors, and the highest stable one [N m s/rad over the motor's gain]."""
     point: np.ndarray  # (3,) middle between the driven wheels, root's frame
     forward: np.ndarray  # (3,) root's frame
     wheel_radius: float
     track: float
     rest: np.ndarray  # qpos after SETTLE
+    notes: tuple[str, ...] = ()
+    """What was left out of the file."""
 
 
 def load_robot(
@@ -112,9 +118,8 @@ def load_robot(
     timestep: float | None = None,
 ) -> Robot:
     """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
-    decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF or URDF file."))
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec, replaced = read_robot(path, wheels, wheel_radius)
         joints = _wheel_joints(path, spec, wheels)
         _complete(path, spec, joints)
         if timestep is not None:
@@ -126,9 +131,19 @@ def load_robot(
         ids = [host.joint(name).id for name in joints]
         bodies = [int(host.jnt_bodyid[one]) for one in ids]
         radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
+        inertias = [_wheel_inertias(host, one, radius) for one in ids]
+        if _add_servos(spec, joints, inertias):
+            host = spec.compile()
+            data = mujoco.MjData(host)
+            mujoco.mj_kinematics(host, data)
         if not (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
             bottom = float(data.xpos[bodies[0], 2]) - _wheel_radius(path, host, bodies[0], radius)
             spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom])
+            host = spec.compile()
+            data = mujoco.MjData(host)
+            mujoco.mj_kinematics(host, data)
+        notes = _leave_out_contacts(path, spec, host)
+        if notes:
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
@@ -145,14 +160,32 @@ def load_robot(
     middle = (data.xanchor[ids[0]] + data.xanchor[ids[1]]) / 2 - data.xpos[host.body_rootid[bodies[0]]]
     sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
     actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
-    for _ in range(round(SETTLE / host.opt.timestep)):
+    root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids])
+    _settle(path, host, data, speed, turning, float(radius))
+    return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
+                 _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
+                 rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(),
+                 (*replaced, *notes))
+
+
+def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:
+    """Let the model come to rest on its floor, without a command; ValueError where it does not."""
+    remedy = "Check its contacts, the gains and inertias of its wheels, and its timestep."
+    faults = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    steps = round(SETTLE / host.opt.timestep)
+    fastest = 0.0
+    for step in range(steps):
         mujoco.mj_step(host, data)
-    if not np.isfinite(data.qpos).all():
-        raise ValueError(f"{path}: at rest on its floor the model becomes non-finite. Check its contacts and timestep.")
-    root = int(host.jnt_qposadr[free])
-    return Robot(path, spec, host, root, int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids]), _pair(actuators),
-                 (sign[0], sign[1]), _are_motors(path, host, actuators), rotation.T @ middle, rotation.T @ forward,
-                 float(radius), distance if track is None else track, data.qpos.copy())
+        if any(data.warning[int(fault)].number for fault in faults) or not np.isfinite(data.qpos).all():
+            raise ValueError(f"{path}: the model explodes while it settles on its floor, after "
+                             f"{(step + 1) * host.opt.timestep:.3f} s (a position, speed or acceleration is not "
+                             f"finite or huge). {remedy}")
+        if step >= 0.8 * steps:  # a wheel that shakes passes through 0
+            rims = np.abs(data.qvel[list(wheels)]) * radius
+            fastest = max(fastest, float(np.linalg.norm(data.qvel[speed : speed + 3])), *map(float, rims))
+    if fastest > REST_SPEED:
+        raise ValueError(f"{path}: after {SETTLE:g} s on its floor, without a command, the model still moves at "
+                         f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
 
 
 def resolve(robot: Robot, path: str) -> Entry:
@@ -265,8 +298,12 @@ def _wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, st
 
 
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
-    """Give the model a free joint, servos on its wheels and names to its geoms, where it has none."""
+    """Give the model a free joint and names to its bodies and geoms, where it has none."""
     spec.compiler.fusestatic = False
+    named = {body.name for body in spec.bodies}
+    for k, body in enumerate(spec.bodies):
+        if not body.name:
+            body.name = next(name for name in (f"body_{k}", f"body_{k}_unnamed") if name not in named)
     top = next(body for body in spec.bodies if any(joint.name == joints[0] for joint in body.joints))
     while top.parent.name != "world":
         top = top.parent
@@ -275,10 +312,6 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
     elif top.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError(f"{path}: body {top.name!r} hangs on joint {top.joints[0].name!r}; a vehicle moves freely. "
                          "Give it a freejoint, or no joint.")
-    for joint in joints:
-        if not any(actuator.target == joint for actuator in spec.actuators):
-            actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.set_to_velocity(kv=SERVO_GAIN)
     for body in spec.bodies:
         taken = {geom.name for geom in spec.geoms}
         for k, geom in enumerate(body.geoms):
@@ -287,15 +320,97 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
                 geom.name = plain
 
 
+def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
+    """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
+
+    left_out: dict[tuple[str, str], str] = {}
+    for one, other, declared in geom_pairs(host):
+        kinds = [int(host.geom_type[geom]) for geom in (one, other)]
+        if has_collision_fn(*kinds):  # type: ignore[arg-type]
+            continue
+        shapes = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds]
+        geoms = " and ".join(f"geom {mujoco.mj_id2name(host, KINDS['geom'], int(geom)) or geom!r} ({shape})"
+                             for geom, shape in zip((one, other), shapes, strict=True))
+        bodies = [int(host.geom_bodyid[geom]) for geom in (one, other)]
+        if declared >= 0 or 0 in bodies or host.body_rootid[bodies[0]] != host.body_rootid[bodies[1]]:
+            raise ValueError(f"{path}: MJX has no contact between {geoms}. Replace one by a sphere, capsule or box, or "
+                             "let their contype and conaffinity keep them apart.")
+        names = sorted(mujoco.mj_id2name(host, KINDS["body"], body) for body in bodies)
+        left_out.setdefault((names[0], names[1]), f"{path.name}: MJX has no contact between {geoms}; contacts between "
+                            f"their bodies {names[0]} and {names[1]} are left out")
+    for first, second in left_out:
+        spec.add_exclude(name=f"{first}_{second}_left_out", bodyname1=first, bodyname2=second)
+    return tuple(left_out.values())
+
+
+def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
+    """Give velocity servos to wheels without actuators; whether there were any.
+
+    Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
+    vehicles follow within the same time. A wheel that slips is far lighter, so the integration is implicit in speed.
+    MuJoCo softens a contact with the inverse inertia of what touches: a wheel without a motor's rotor would creep.
+    """
+    bare = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)]
+    time = max(SERVO_TIME, SERVO_STEPS * spec.option.timestep)
+    for k in bare:
+        actuator = spec.add_actuator(name=joints[k], target=joints[k], trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        wheel, total = inertias[k]
+        actuator.set_to_velocity(kv=total / time)
+        joint = spec.joint(joints[k])
+        joint.armature += max(ROTOR_SHARE * total - wheel, 0.0)
+    if bare:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return bool(bare)
+
+
+def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float) -> tuple[float, float]:
+    """Inertia about a wheel's axle [kg m^2]: of the wheel alone, and with half of the vehicle that rolls on two."""
+    body = int(host.jnt_bodyid[joint])
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, host.body_iquat[body])
+    axis = turn.reshape(3, 3).T @ host.jnt_axis[joint]
+    wheel = float(axis**2 @ host.body_inertia[body] + host.dof_armature[host.jnt_dofadr[joint]])
+    return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / 2
+
+
+def _drive_gain(
+    host: mujoco.MjModel, actuators: Sequence[int], inertias: Sequence[tuple[float, float]],
+) -> tuple[float, float]:  # fmt: skip
+    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable.
+
+    The controller's torque is computed before a step, so it may take away at most a wheel's whole speed in one.
+    """
+    wheel, total = (min(one) for one in zip(*inertias, strict=True))
+    motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
+    time = max(SERVO_TIME, SERVO_STEPS * host.opt.timestep)
+    high = wheel / host.opt.timestep
+    return min(total / time, high / 2) / motor, high / motor
+
+
 def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
-    """Radius of the largest round geom of a wheel."""
+    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
     kinds = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
-    round_ones = [int(kind) for kind in kinds]
-    sizes = [float(size[0]) for size, kind, owner in zip(host.geom_size, host.geom_type, host.geom_bodyid, strict=True)
-             if owner == body and int(kind) in round_ones]
+    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, kinds)]
+    touching = [one for one in round_ones if _touches_ground(host, one)]
+    sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
     if not sizes and known is None:
         raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to give its radius. Give wheel_radius.")
     return max(sizes) if sizes else float(known or 0.0)
+
+
+def _parts(host: mujoco.MjModel, body: int) -> np.ndarray:
+    """Geoms of a body and of all that is fixed to it."""
+    return np.flatnonzero(host.body_weldid[host.geom_bodyid] == host.body_weldid[body])
+
+
+def _touches_ground(host: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom may touch a plane of the world, or any geom where there is none: a visual one does not."""
+    ground = np.flatnonzero((host.geom_bodyid == 0) & (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    if not len(ground):
+        return bool(host.geom_contype[geom] | host.geom_conaffinity[geom])
+    masks = host.geom_contype[geom] & host.geom_conaffinity[ground]
+    return bool((masks | host.geom_contype[ground] & host.geom_conaffinity[geom]).any())
 
 
 def _are_motors(path: Path, host: mujoco.MjModel, actuators: Sequence[int]) -> bool:
@@ -315,7 +430,11 @@ def default_paths(robot: Robot) -> tuple[str, ...]:
     host = robot.host
     joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
     bodies = host.jnt_bodyid[joints]
-    geoms = [int(np.flatnonzero(host.geom_bodyid == body)[0]) for body in bodies]
+    geoms = [max((int(one) for one in _parts(host, body) if _touches_ground(host, int(one))),
+                 key=lambda one: host.geom_rbound[one], default=None) for body in bodies]
+    if any(one is None for one in geoms):
+        raise ValueError(f"{robot.path}: a driven wheel has no geom that touches the ground (contype and conaffinity). "
+                         "Give it one.")
     found = []
     for kind, ids, field in (("actuator", robot.actuators, "gain"), ("joint", joints, "damping"),
                              ("geom", geoms, "friction")):

@@ -1,4 +1,4 @@
-"""Models by name: an MJCF or URDF file, or a Python file that defines one."""
+"""Models by name: an MJCF, URDF or xacro file, or a Python file that defines one."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sysid.replay.models import Model
 from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.specs import VehicleSpec
 
-SUFFIXES = (".xml", ".mjcf", ".urdf")
+SUFFIXES = (".xml", ".mjcf", ".urdf", ".xacro")
 
 
 def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:
     """The model that `--model` names.
 
     Args:
-        text: an MJCF or URDF file, or FILE.py, or FILE.py:NAME. NAME (by default `model`) is a `Model`, or a function
-            that makes one from the log's `VehicleSpec`.
-        wheels: of an MJCF or URDF file, joints or actuators of the driven wheels, left and right.
+        text: an MJCF, URDF or xacro file, or FILE.py, or FILE.py:NAME. NAME (by default `model`) is a `Model`, or a
+            function that makes one from the log's `VehicleSpec`.
+        wheels: of a robot file, joints or actuators of the driven wheels, left and right.
         parameters: of such a file, dotted paths of what to fit.
 
     Raises:
@@ -28,7 +28,8 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
     file, _, attribute = text.rpartition(":") if ".py:" in text else (text, "", "model")
     path = Path(file)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such model. Give an MJCF or URDF file, or a Python file that defines one.")
+        raise FileNotFoundError(f"{path}: no such model. Give an MJCF, URDF or xacro file, or a Python file "
+                                "that defines one.")
     if path.suffix in SUFFIXES:
         from sysid.replay.mjcf import mjcf_model
 

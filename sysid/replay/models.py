@@ -59,6 +59,8 @@ class Model:
     """Where the search starts."""
     write: Callable[[Path, Parameters], Path] | None = None
     """Writes the fitted model into a folder in its own format; returns the file."""
+    notes: tuple[str, ...] = ()
+    """What of its file was left out or replaced."""
 
     def with_effects(self, names: Sequence[str]) -> Model:
         """The same model with effects of the catalogue around it; ValueError for those that act inside one."""

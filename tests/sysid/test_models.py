@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import struct
+import sys
 import threading
 import tomllib
 
@@ -20,7 +23,7 @@ from sysid.logs.synthetic import write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import load_robot, resolve, write_mjcf
+from sysid.replay.mjcf_file import default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
 from sysid.search.fitting import fit_log
@@ -191,6 +194,48 @@ def test_a_urdf_gets_floor_freedom_and_servos_and_stands_still_on_its_wheels(tmp
     assert set(mjcf_model(path).params.values) == {"actuator.*_wheel_joint.gain", "geom.*_wheel.friction"}
 
 
+def driven_straight(robot, v, seconds=2.0):
+    """Speed over the second half of a drive in C MuJoCo from rest, with a constant command."""
+    host, data, way = robot.host, mujoco.MjData(robot.host), []
+    data.qpos[:] = robot.rest
+    data.ctrl[list(robot.actuators)] = np.array(robot.sign) * v / robot.wheel_radius
+    for _ in range(2):
+        for _ in range(round(seconds / 2 / host.opt.timestep)):
+            mujoco.mj_step(host, data)
+        way.append(data.qpos[robot.root : robot.root + 2].copy())
+    return np.linalg.norm(way[1] - way[0]) / (seconds / 2)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("timestep", [0.0005, 0.002])
+@pytest.mark.parametrize("wheel", [1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("vehicle", [0.05, 1.0, 10.0])
+def test_added_servos_drive_light_and_heavy_robots_at_the_commanded_speed(tmp_path, vehicle, wheel, timestep):
+    """Masses and inertias are times these numbers; the cart drags a ball of rubber."""
+    text = URDF
+    for old, name, scale in (("8", "mass value", vehicle), ("0.5", "mass value", vehicle * wheel),
+                             *((old, axis, vehicle) for old in ("0.1", "0.2") for axis in ("ixx", "iyy", "izz")),
+                             *(("0.002", axis, vehicle * wheel) for axis in ("ixx", "iyy", "izz"))):
+        text = text.replace(f'{name}="{old}"', f'{name}="{float(old) * scale}"')
+    path = tmp_path / "cart.urdf"
+    path.write_text(text)
+    assert driven_straight(load_robot(path, timestep=timestep), 0.6) == pytest.approx(0.6, rel=0.1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (('kv="1"', 'implicitfast', 'armature="0.01"'), ('kv="500"', 'Euler', ''), "explodes while it settles"),
+    (('size="10 10 0.1"',), ('size="10 10 0.1" contype="0" conaffinity="0"',), "still moves at .* it falls")])
+def test_a_model_that_does_not_come_to_rest_is_refused_with_the_reason(tmp_path, old, new, message):
+    text = ROBOT
+    for one, other in zip(old, new, strict=True):
+        text = text.replace(one, other)
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"robot.xml: .*{message}.*Check its contacts, the gains"):
+        load_robot(path)
+
+
 @pytest.mark.quick
 def test_a_robot_is_placed_with_its_axle_at_the_start_and_wheels_that_turn_forwards(robot_file):
     plant, params = mjcf_model(robot_file).plant, mjcf_model(robot_file).params
@@ -218,6 +263,154 @@ def test_a_wrong_path_says_what_is_known(robot_file, parameters, message):
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize(("first", "second"), [
+    ("cylinder", "box"), ("box", "cylinder"), ("ellipsoid", "box"), ("capsule", "cylinder"), ("box", "box")])
+def test_contacts_that_mjx_lacks_between_parts_of_a_robot_are_left_out_with_a_note(tmp_path, first, second):
+    """A caster on a swivel of its own, beside a bumper: two shapes that may meet."""
+    path = tmp_path / "robot.xml"
+    caster = ROBOT.index('<geom name="caster"')
+    path.write_text(ROBOT[:caster] + f'''
+      <body name="bumper" pos="-0.3 0 0.3"><joint axis="1 0 0"/>
+        <geom name="rubber" type="{first}" size="0.02 0.02 0.02" mass="0.1"/></body>
+      <body name="swivel" pos="0.3 0 0.3"><joint axis="0 0 1"/>
+        <geom name="fork" type="{second}" size="0.02 0.02 0.02" mass="0.1"/></body>''' + ROBOT[caster:])
+    robot = load_robot(path)
+    lacking = {first, second} in ({"cylinder", "box"}, {"ellipsoid", "box"})
+    between = [note for note in robot.notes if "rubber" in note and "fork" in note]
+    assert len(between) == lacking
+    assert all("bodies bumper and swivel are left out" in note for note in between)
+    model = mjcf_model(path)  # MJX takes it
+    written = mujoco.MjModel.from_xml_path(str(model.write(tmp_path, model.params)))
+    assert model.notes == robot.notes and written.nexclude == len(robot.notes)
+
+
+@pytest.mark.quick
+def test_a_contact_with_the_room_that_mjx_lacks_is_one_line_with_both_geoms(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace('<body name="base"', '<geom name="pillar" type="cylinder" size="0.1 1" pos="3 0 1"/>'
+                                  '<body name="base"').replace('contype="0" conaffinity="0"', ''))
+    with pytest.raises(ValueError, match=r"no contact between geom 'pillar' .cylinder. and geom 'box' .box.. Replace"):
+        load_robot(path)
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory):
+    """Bytes of a cube of 0.2 m in binary STL."""
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [-0.1, 0.1])).reshape(3, 8).T
+    triangles = [corner for corner in itertools.combinations(range(8), 3)
+                 if any(len(set(corners[list(corner), axis])) == 1 for axis in range(3))]
+    rows = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[list(one)].ravel(), 0) for one in triangles)
+    return b" " * 80 + struct.pack("<I", len(triangles)) + rows
+
+
+BODY = '<collision><origin xyz="0 0 0.45"/><geometry><mesh filename="{}"/></geometry></collision>'
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("named", "lies"), [
+    ("package://cart_description/meshes/body.stl", "cart_description/meshes/body.stl"),
+    ("package://cart_description/meshes/body.stl", "cart_description/urdf/meshes/body.stl"),
+    ("package://cart_description/body.stl", "cart_description/urdf/body.stl"),
+    ("../meshes/body.stl", "cart_description/meshes/body.stl"), ("body.stl", "cart_description/urdf/body.stl"),
+    ("package://other_package/meshes/body.dae", "other_package/meshes/body.stl"),
+    ("file:///elsewhere/body.stl", "cart_description/meshes/deep/body.stl")])
+def test_meshes_are_found_where_packages_usually_have_them(tmp_path, cube, named, lies):
+    path, mesh = tmp_path / "cart_description" / "urdf" / "cart.urdf", tmp_path / lies
+    path.parent.mkdir(parents=True)
+    mesh.parent.mkdir(parents=True, exist_ok=True)
+    mesh.write_bytes(cube)
+    path.write_text(URDF.replace("</inertial>", "</inertial>" + BODY.format(named), 1))
+    robot = load_robot(path)
+    assert robot.host.nmesh == 1 and robot.notes == ()
+    assert np.ptp(robot.host.mesh_vert, axis=0) == pytest.approx([0.2, 0.2, 0.2], abs=1e-5)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("content", [None, b"solid body\n facet normal 0 0 1\n", b"", b"not a mesh"])
+def test_a_mesh_that_is_missing_or_unreadable_becomes_a_box_of_its_links_inertia_with_a_note(tmp_path, content):
+    path = tmp_path / "cart.urdf"
+    text = URDF.replace("</inertial>", "</inertial>" + BODY.format("package://cart/body.stl"), 1)
+    text = text.replace("<inertial>", '<inertial><origin xyz="0 0 0.35"/>', 1)  # where the box is, above the floor
+    path.write_text(text.replace('<geometry><cylinder radius="0.1" length="0.04"/></geometry>',
+                                 '<geometry><mesh filename="wheel.stl"/></geometry>'))
+    for name in ("body", "wheel") if content is not None else ():
+        (tmp_path / f"{name}.stl").write_bytes(content)
+    robot = load_robot(path, wheel_radius=0.1)
+    assert len(robot.notes) == 3 and "mesh package://cart/body.stl of link base is not found" in robot.notes[0]
+    assert "a cylinder of 0.1 m radius stands in" in robot.notes[1]
+    box = robot.host.geom_size[robot.host.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)]
+    sides = 2 * box[0]
+    np.testing.assert_allclose(8 / 12 * (np.sum(sides**2) - sides**2), [0.1, 0.1, 0.2], rtol=1e-4)
+    assert driven_straight(robot, 0.6) == pytest.approx(0.6, rel=0.1)
+
+
+@pytest.mark.quick
+def test_a_mesh_that_an_mjcf_file_lacks_becomes_a_box(tmp_path, cube):
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace("<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>', 1)
+                    .replace('name="box" type="box" size="0.2 0.15 0.05"', 'name="box" type="mesh" mesh="hull"')
+                    .replace('mass="8" contype="0" conaffinity="0"', 'mass="8" pos="0 0 0.2"'))
+    note = load_robot(path).notes[0]
+    assert "mesh hull.stl of body base is not found, or MuJoCo cannot read it; a box of 0.1 x" in note
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "hull.stl").write_bytes(cube)
+    robot = load_robot(path)
+    written = write_mjcf(robot, {}, tmp_path / "elsewhere.xml")
+    assert robot.notes == () and mujoco.MjModel.from_xml_path(str(written)).nmesh == 1
+
+
+@pytest.mark.quick
+def test_a_xacro_file_is_expanded_with_packages_from_the_folders_around_it(tmp_path):
+    pytest.importorskip("xacro")
+    path = tmp_path / "cart_description" / "urdf" / "cart.urdf.xacro"
+    path.parent.mkdir(parents=True)
+    (path.parent / "sizes.xacro").write_text('<robot xmlns:xacro="http://www.ros.org/wiki/xacro">'
+                                             '<xacro:property name="radius" value="0.1"/></robot>')
+    head = ('<robot name="cart" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+            '<xacro:include filename="$(find cart_description)/urdf/sizes.xacro"/>')
+    text = URDF.strip().replace('<robot name="cart">', head).replace('cylinder radius="0.1"',
+                                                                     'cylinder radius="${radius}"')
+    path.write_text(text)
+    assert load_robot(path).wheel_radius == pytest.approx(0.1)
+    path.write_text(text.replace("find cart_description", "find nowhere"))
+    with pytest.raises(ValueError, match="cart.urdf.xacro: xacro cannot expand it: .*'nowhere'.* expand it where"):
+        load_robot(path)
+
+
+@pytest.mark.quick
+def test_without_xacro_the_error_has_the_command_that_installs_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    path = tmp_path / "cart.xacro"
+    path.write_text(URDF.strip())
+    with pytest.raises(ValueError, match="cart.xacro: xacro files need the package xacro.* pip install xacro"):
+        load_robot(path)
+
+
+VISUAL = '<geom type="sphere" size="0.14" contype="0" conaffinity="0" group="2" density="0"/>'
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("old", "new"), [
+    ('<geom name="{}_tyre"', VISUAL + '<geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', '<geom name="{}_hub" type="cylinder" size="0.04 0.02" mass="0.1"/><geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', '<geom name="{}_cap" type="box" size="0.12 0.01 0.12" contype="2" conaffinity="4" mass="0"'
+                             '/><geom name="{}_tyre"'),
+    ('<geom name="{}_tyre"', VISUAL + '<body name="{}_rim"><geom name="{}_tyre"')])
+def test_friction_is_fitted_on_what_touches_the_ground(tmp_path, old, new):
+    """A visual geom first, a hub, a cap that meets only other things, and a tyre on a body fixed to the wheel's."""
+    text = ROBOT
+    for side in ("left", "right"):
+        text = text.replace(old.format(side), new.replace("{}", side))
+        if "_rim" in new:
+            head, tail = text.split(f'name="{side}_tyre"')
+            text = f'{head}name="{side}_tyre"{tail.replace("</body>", "</body></body>", 1)}'
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    robot = load_robot(path)
+    assert "geom.*_tyre.friction" in default_paths(robot) and robot.wheel_radius == pytest.approx(0.1)
+
+
+@pytest.mark.quick
 def test_wheels_that_cannot_be_told_are_asked_for(robot_file, tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(ROBOT.replace('name="left"', 'name="a"').replace('name="right"', 'name="b"')
@@ -239,6 +432,8 @@ def test_motors_get_a_speed_controller_of_their_own(tmp_path):
     model = mjcf_model(path, ["body.base.mass"])
     assert set(model.params.values) == {"drive.kp", "body.base.mass"}
     assert model_space(model.params).log.all()
+    wheel = 0.4 * 0.5 * 0.1**2 + 0.01
+    assert dict(model.params.about)["drive.kp"].high == pytest.approx(wheel / 0.01)  # at most the speed in one step
 
 
 @pytest.mark.quick

@@ -1,0 +1,226 @@
+"""Robot files as MuJoCo can read them: xacro expanded, meshes found beside the file, missing ones replaced by boxes."""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from whill_mjx.reading import MB, decoded, read_bytes
+
+MODEL_BYTES = 20 * MB
+MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
+PARENTS = 4  # folders above the file in which packages are looked for
+BOX = 0.1  # m, of a mesh whose body says nothing of its size
+XACRO = "pip install xacro"
+
+
+def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> tuple[Any, list[str]]:
+    """The editable model of an MJCF, URDF or xacro file, and a note for each mesh that was replaced.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
+    """
+    text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
+    text = expand_xacro(path) if path.suffix == ".xacro" else text
+    try:
+        top = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return mujoco.MjSpec.from_file(str(path)), []  # MuJoCo says where the mistake is
+    if top.tag != "robot":
+        spec = mujoco.MjSpec.from_string(text) if path.suffix == ".xacro" else mujoco.MjSpec.from_file(str(path))
+        return spec, _place_meshes(path, spec)
+    notes = _place_urdf_meshes(path, top, wheels, wheel_radius)
+    return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes
+
+
+def expand_xacro(path: Path) -> str:
+    """Text of a xacro file with all macros expanded; `$(find PACKAGE)` is looked for in the folders around it."""
+    try:
+        import xacro
+    except ImportError:
+        raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
+                         "you have ROS: xacro FILE > robot.urdf.") from None
+    try:
+        with _packages_around(path.resolve().parent):
+            return str(xacro.process_file(str(path)).toxml())
+    except Exception as error:  # xacro's errors have no common class
+        raise ValueError(f"{path}: xacro cannot expand it: {' '.join(str(error).split()) or type(error).__name__}. "
+                         "Correct the file, or expand it where you have ROS: xacro FILE > robot.urdf.") from None
+
+
+@contextmanager
+def _packages_around(folder: Path) -> Iterator[None]:
+    """Let xacro find packages in the folders around a file where no ROS is installed."""
+    from xacro import substitution_args
+
+    before = substitution_args._eval_find
+
+    def find(package: str) -> str:
+        try:
+            return str(before(package))
+        except Exception:  # of ROS where it is not sourced, or lacks the package
+            for place in _package_folders(folder, package):
+                return str(place)
+            raise ValueError(f"package {package!r} is neither installed nor a folder around the file") from None
+
+    substitution_args._eval_find = find
+    try:
+        yield
+    finally:
+        substitution_args._eval_find = before
+
+
+def _around(folder: Path) -> list[Path]:
+    return [folder, *list(folder.parents)[:PARENTS]]
+
+
+def _package_folders(folder: Path, package: str) -> list[Path]:
+    """Folders of that name, among those around a file, the nearest first."""
+    found = []
+    for place in _around(folder):
+        found += [one for one in (place / package, place) if one.name == package and one.is_dir()]
+    return found
+
+
+def find_mesh(folder: Path, name: str) -> Path | None:
+    """The file of a mesh that MuJoCo can read, or None.
+
+    Args:
+        folder: of the robot file.
+        name: as in it: package://PACKAGE/PATH, model://..., file://PATH, an absolute or a relative path.
+    """
+    scheme, _, rest = name.partition("://") if "://" in name else ("", "", name)
+    rest = rest.replace("\\", "/")
+    places = [Path(rest), folder / rest] if scheme in ("", "file") else []
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        places += [place / inside for place in (*_package_folders(folder, package), *_around(folder))]
+    else:
+        places += [place / rest.lstrip("/") for place in _around(folder)]
+    file = Path(rest).name
+    places += [folder / file, *sorted((folder / "meshes").rglob(file)), *sorted((folder.parent / "meshes").rglob(file))]
+    for place in places:  # a mesh for pictures often lies beside one that MuJoCo can read
+        for one in (place, *(place.with_suffix(suffix) for suffix in MESHES)):
+            if one.suffix.lower() in MESHES and one.is_file() and _is_readable(one):
+                return one.resolve()
+    return None
+
+
+def _is_readable(path: Path) -> bool:
+    """Whether MuJoCo can make a solid of a mesh: it does not know the text form of STL, for example."""
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="mesh", file=str(path.resolve()), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    try:
+        spec.compile()
+    except (ValueError, mujoco.FatalError):
+        return False
+    return True
+
+
+def _place_urdf_meshes(
+    path: Path, top: ElementTree.Element, wheels: Sequence[str], wheel_radius: float | None,
+) -> list[str]:  # fmt: skip
+    """Give meshes their whole paths; those that are not found become boxes, and cylinders on wheels."""
+    notes: list[str] = []
+    axles = {child.get("link"): joint for joint in top.iter("joint") if joint.get("type") == "continuous"
+             and (child := joint.find("child")) is not None
+             and (joint.get("name") in wheels or re.search("wheel", f"{joint.get('name')} {child.get('link')}", re.I))}
+    for link in top.iter("link"):
+        for kind in ("visual", "collision"):
+            for element in link.findall(kind):
+                geometry = element.find("geometry")
+                mesh = None if geometry is None else geometry.find("mesh")
+                if geometry is None or mesh is None:
+                    continue
+                name = mesh.get("filename", "")
+                found = find_mesh(path.resolve().parent, name)
+                if found is not None:
+                    mesh.set("filename", str(found))
+                elif kind == "visual":
+                    link.remove(element)  # it does nothing
+                else:
+                    geometry.remove(mesh)
+                    shape = _stand_in(link, element, geometry, axles.get(link.get("name")), wheel_radius)
+                    notes.append(f"{path.name}: mesh {name} of link {link.get('name')} is not found, or MuJoCo cannot "
+                                 f"read it; {shape} stands in for it")
+    options = top.find("mujoco")
+    options = ElementTree.SubElement(top, "mujoco") if options is None else options
+    compiler = options.find("compiler")
+    compiler = ElementTree.SubElement(options, "compiler") if compiler is None else compiler
+    compiler.set("strippath", "false")
+    return notes
+
+
+def _stand_in(
+    link: ElementTree.Element, element: ElementTree.Element, geometry: ElementTree.Element,
+    axle: ElementTree.Element | None, wheel_radius: float | None,
+) -> str:  # fmt: skip
+    """Put a box of the link's inertia, or a wheel's cylinder, into a collision element; its name and size."""
+    inertial = link.find("inertial")
+    mass, inertia = 0.0, np.zeros(3)
+    if inertial is not None:
+        numbers, weight = inertial.find("inertia"), inertial.find("mass")
+        mass = float(weight.get("value", 0)) if weight is not None else 0.0
+        if numbers is not None:
+            inertia = np.array([float(numbers.get(name, 0)) for name in ("ixx", "iyy", "izz")])
+    for origin in element.findall("origin"):
+        element.remove(origin)
+    if axle is not None:
+        direction = axle.find("axis")
+        axis = np.array((direction.get("xyz", "1 0 0") if direction is not None else "1 0 0").split(), float)
+        axis = axis / (np.linalg.norm(axis) or 1.0)
+        about = float(axis**2 @ inertia)
+        radius = wheel_radius or (math.sqrt(2 * about / mass) if mass > 0 and about > 0 else BOX / 2)
+        pitch, yaw = math.atan2(math.hypot(axis[0], axis[1]), axis[2]), math.atan2(axis[1], axis[0])
+        ElementTree.SubElement(element, "origin", xyz="0 0 0", rpy=f"0 {pitch!r} {yaw!r}")
+        ElementTree.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(float(radius / 2)))
+        return f"a cylinder of {radius:.3g} m radius"
+    size = _box(mass, inertia)
+    place = None if inertial is None else inertial.find("origin")
+    if place is not None:
+        ElementTree.SubElement(element, "origin", place.attrib)
+    ElementTree.SubElement(geometry, "box", size=" ".join(repr(float(one)) for one in size))
+    return f"a box of {' x '.join(f'{one:.3g}' for one in size)} m"
+
+
+def _box(mass: float, inertia: np.ndarray) -> np.ndarray:
+    """Sides (3,) of the even box with this mass and these moments of inertia (3,), at least a millimetre each."""
+    if mass <= 0 or not (inertia > 0).any():
+        return np.full(3, BOX)
+    return np.sqrt(np.maximum(6 / mass * (inertia.sum() - 2 * inertia), 1e-6))
+
+
+def _place_meshes(path: Path, spec: Any) -> list[str]:
+    """Give meshes of an MJCF model their whole paths; those that are not found become boxes."""
+    folder = Path(spec.modelfiledir or path.parent)
+    notes: list[str] = []
+    for mesh in list(spec.meshes):
+        if not mesh.file:
+            continue
+        name, place = mesh.name or Path(mesh.file).stem, folder / (spec.meshdir or "") / mesh.file
+        found = place if place.is_file() and _is_readable(place) else find_mesh(folder.resolve(), mesh.file)
+        if found is not None:
+            mesh.file = str(found.resolve())
+            continue
+        for geom in [one for one in spec.geoms if one.meshname == name]:
+            if not geom.contype and not geom.conaffinity:
+                spec.delete(geom)  # it does nothing
+                continue
+            body = geom.parent
+            size = _box(float(body.mass), np.array(body.inertia)) if body.explicitinertial else np.full(3, BOX)
+            geom.type, geom.size, geom.meshname = mujoco.mjtGeom.mjGEOM_BOX, size / 2, ""
+            if body.explicitinertial:
+                geom.pos = body.ipos
+            notes.append(f"{path.name}: mesh {mesh.file} of body {body.name} is not found, or MuJoCo cannot "
+                         f"read it; a box of {' x '.join(f'{one:.3g}' for one in size)} m stands in for it")
+        spec.delete(mesh)
+    return notes
