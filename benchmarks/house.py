@@ -172,7 +172,8 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, help="another checkout of the project")
     parser.add_argument("--lowered", action="store_true", help="compare lowered programs with it")
-    parser.add_argument("--times", nargs="*", choices=TIMED, default=[], help="programs whose seconds are compared with it")
+    parser.add_argument("--times", nargs="*", choices=TIMED, default=[],
+                        help="programs whose seconds are compared with it")
     parser.add_argument("--rounds", type=int, default=1, help="of timing both trees, five calls a program each")
     options = parser.parse_args()
     if (options.lowered or options.times) and options.against is None:

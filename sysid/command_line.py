@@ -1,4 +1,4 @@
-"""What the commands of this package share beyond `whill_mjx.command_line`: kept programs, progress of long work."""
+"""What the commands of this package share beyond `whill_mjx.io.command_line`: kept programs, progress of long work."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from sysid.search.result import Progress
-from whill_mjx import command_line
-from whill_mjx.heartbeat import Heartbeat
+from whill_mjx.io import command_line
+from whill_mjx.io.heartbeat import Heartbeat
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
-    """`whill_mjx.command_line.run` with compiled programs kept for later runs."""
+    """`whill_mjx.io.command_line.run` with compiled programs kept for later runs."""
 
     def cached(chosen: Any) -> None:
         keep_compiled()

@@ -20,7 +20,7 @@ from sysid import command_line
 from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import DEFAULT, Criterion, propose
 from sysid.logs.manoeuvre_library import Limits
-from whill_mjx.fields import Field, check_table
+from whill_mjx.io.fields import Field, check_table
 from whill_mjx.vehicle.specs import VehicleSpec
 
 

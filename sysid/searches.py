@@ -27,7 +27,7 @@ from sysid.search.comparison import METHODS, NEAR, Judge, arrivals, trace
 from sysid.search.fitting import make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
-from whill_mjx.html import Section, html_page, paragraph, png, table
+from whill_mjx.io.html import Section, html_page, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 
 KIND = "sysid-searches"

@@ -55,8 +55,9 @@ def test_pages_identify_and_report_instead_of_telling():
     assert count <= 10
 
 
-def test_readme_fits_150_lines_and_the_page_of_figures_60_kB():
+def test_readme_fits_150_lines_the_changes_80_and_the_page_of_figures_60_kB():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    assert len((ROOT / "CHANGELOG.md").read_text().splitlines()) <= 80
     assert FIGURES.stat().st_size <= 60_000
 
 

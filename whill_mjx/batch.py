@@ -22,7 +22,7 @@ from whill_mjx.env import (
     step_state,
     time_step,
 )
-from whill_mjx.fields import BATCH, check_fields
+from whill_mjx.io.fields import BATCH, check_fields
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
 from whill_mjx.world.randomize import randomize_params
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.command_line import SEED, OptionError, Range, listen, refusing, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, listen, refusing, run
 
 if __name__ == "__main__":
     listen()
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.folders import check_place, new_folder
+from whill_mjx.io.folders import check_place, new_folder
 from whill_mjx.logs.dataset import (
     COMMAND_HEADER,
     write_csv,

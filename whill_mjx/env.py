@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.fields import ENV, check_fields
+from whill_mjx.io.fields import ENV, check_fields
 from whill_mjx.tasks.starts import draw_start
 from whill_mjx.tasks.tasks import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
 from whill_mjx.vehicle.dynamics import drive, place

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
-from whill_mjx.heartbeat import Heartbeat, say, say_loading
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
+from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
@@ -32,7 +32,7 @@ from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys
 from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
-from whill_mjx.folders import RUN_FILE, claim_folder
+from whill_mjx.io.folders import RUN_FILE, claim_folder
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.tasks import TASKS, Task, make_task
 

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.command_line import Range, listen, refusing, run
+from whill_mjx.io.command_line import Range, listen, refusing, run
 
 if __name__ == "__main__":
     listen()
@@ -39,7 +39,7 @@ import mujoco
 import numpy as np
 
 from whill_mjx.effects.base import apply_chain
-from whill_mjx.folders import new_folder
+from whill_mjx.io.folders import new_folder
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import advance_odometry, forces, mass_distribution, nominal_world, place, substep
 from whill_mjx.vehicle.kinematics import reference_pose

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.command_line import SEED, OptionError, Range, check_known, listen, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
 
 if __name__ == "__main__":
     listen()
@@ -25,11 +25,11 @@ import numpy as np
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
-from whill_mjx.folders import check_place, whole_file, write_whole
+from whill_mjx.io.folders import check_place, whole_file, write_whole
+from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
-from whill_mjx.video import write_h264
 from whill_mjx.world.gallery import gallery, walk
 from whill_mjx.world.render import Intrinsics, Quality, pinhole, render, render_frame
 from whill_mjx.world.render.film import Film, develop, motion_blur

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.command_line import (
+from whill_mjx.io.command_line import (
     COUNT,
     NOT_NEGATIVE,
     POSITIVE,
@@ -29,7 +29,7 @@ from whill_mjx.command_line import (
     refusing,
     run,
 )
-from whill_mjx.heartbeat import Heartbeat, say, say_loading
+from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
     listen()
@@ -46,7 +46,7 @@ from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
-from whill_mjx.folders import Claim, claim_folder, write_whole
+from whill_mjx.io.folders import Claim, claim_folder, write_whole
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label

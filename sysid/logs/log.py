@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx import fields as tables
-from whill_mjx.reading import read_csv as read_table
-from whill_mjx.reading import read_toml
+from whill_mjx.io import fields as tables
+from whill_mjx.io.reading import read_csv as read_table
+from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
 SCHEMA = 1

@@ -22,8 +22,8 @@ import numpy as np
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.streams import without_held
-from whill_mjx.fields import shown
-from whill_mjx.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
+from whill_mjx.io.fields import shown
+from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.reading import LONGEST_REASON
+from whill_mjx.io.reading import LONGEST_REASON
 
 TOPICS = {
     "command": ("/whill/controller/cmd_vel", "/cmd_vel", "/whill/cmd_vel"),

@@ -13,7 +13,7 @@ from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
 from sysid.pages.svg import PALETTE, Line, line_chart
-from whill_mjx.html import Cell, Section, charts, html_page, paragraph, table
+from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
 from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.series import Channel, TrialSeries
 from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
-from whill_mjx.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
 
 REPLAYS = ("ideal", "initial", "fitted")
 CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}

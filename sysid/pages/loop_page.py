@@ -12,7 +12,7 @@ from sysid.logs.log import Command, Start
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.metrics import METRICS, UNITS, integrate
 from sysid.pages.svg import PALETTE, Line, bar_chart, line_chart
-from whill_mjx.html import Section, bullets, charts, html_page, paragraph, table
+from whill_mjx.io.html import Section, bullets, charts, html_page, paragraph, table
 from whill_mjx.logs.dataset import write_text
 
 

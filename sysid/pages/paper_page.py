@@ -15,7 +15,7 @@ from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
 from sysid.pages.svg import COLOURS, line_chart, replay_line
-from whill_mjx.html import Cell, Section, charts, html_page, legend, paragraph, png, table
+from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 

@@ -13,10 +13,10 @@ import numpy as np
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.pages.series import TrialSeries
-from whill_mjx.fields import Field, check_table, shown
-from whill_mjx.html import Section
+from whill_mjx.io.fields import Field, check_table, shown
+from whill_mjx.io.html import Section
+from whill_mjx.io.reading import read_json
 from whill_mjx.logs.dataset import write_text
-from whill_mjx.reading import read_json
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -102,7 +102,7 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
     """
     from sysid.pages.fit_page import fit_sections
     from sysid.pages.series import FILE, load, replay
-    from whill_mjx.html import html_page
+    from whill_mjx.io.html import html_page
 
     run = Path(run)
     report = read_report(run)

@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import CHANNELS, ideal_replay
-from whill_mjx.reading import read_arrays
+from whill_mjx.io.reading import read_arrays
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")
 FILE = "series.npz"

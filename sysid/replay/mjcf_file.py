@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot_files import read_robot
-from whill_mjx.fields import Field, check
+from whill_mjx.io.fields import Field, check
 from whill_mjx.logs.dataset import write_text
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from whill_mjx.reading import MB, decoded, read_bytes
+from whill_mjx.io.reading import MB, decoded, read_bytes
 
 MODEL_BYTES = 20 * MB
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads

@@ -20,7 +20,7 @@ from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_repor
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
 from sysid.pages.svg import Line, bar_chart, interval_bar, line_chart
 from sysid.replay.rollout import make_batch, predictions, simulate
-from whill_mjx.html import Cell, Section, html_page, number, png, table
+from whill_mjx.io.html import Cell, Section, html_page, number, png, table
 
 pytestmark = pytest.mark.quick
 

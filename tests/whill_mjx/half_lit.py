@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from whill_mjx.command_line import listen, run
+from whill_mjx.io.command_line import listen, run
 
 if __name__ == "__main__":
     listen()
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer.export import flatten_weights, save_arrays
-from whill_mjx.folders import claim_folder, whole_file
+from whill_mjx.io.folders import claim_folder, whole_file
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.ppo_training import train_ppo
 

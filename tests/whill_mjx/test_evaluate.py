@@ -25,11 +25,11 @@ from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.rollouts import CHANNELS, rollout
 from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
-from whill_mjx.html import STYLE
+from whill_mjx.io.html import STYLE
+from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.tasks import make_task
 from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
 from whill_mjx.vehicle.presets import preset
-from whill_mjx.video import write_h264
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from whill_mjx.folders import FolderRefused, check_place, claim_folder, new_folder, write_whole
+from whill_mjx.io.folders import FolderRefused, check_place, claim_folder, new_folder, write_whole
 
 pytestmark = pytest.mark.quick
 KIND = "whill_mjx.test"
@@ -70,7 +70,7 @@ def test_a_folder_of_another_command_or_without_a_readable_identity_is_refused(t
 HOLD = """
 import sys, time
 from pathlib import Path
-from whill_mjx.folders import claim_folder
+from whill_mjx.io.folders import claim_folder
 with claim_folder(Path(sys.argv[1]), "whill_mjx.test"):
     print("held", flush=True)
     time.sleep(60)
@@ -113,7 +113,7 @@ def test_a_file_is_whole_or_absent_and_no_part_of_it_stays(tmp_path):
     limited = f"""
 import resource
 from pathlib import Path
-from whill_mjx.folders import write_whole
+from whill_mjx.io.folders import write_whole
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
     write_whole(Path({str(tmp_path / "new" / "a.json")!r}), "x" * 5000)

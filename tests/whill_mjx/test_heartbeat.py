@@ -11,7 +11,7 @@ import pytest
 from tqdm import tqdm
 
 from whill_mjx import train
-from whill_mjx.heartbeat import Heartbeat, say
+from whill_mjx.io.heartbeat import Heartbeat, say
 
 pytestmark = pytest.mark.quick
 

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from whill_mjx.evaluation.pictures import reward_curve
-from whill_mjx.html import STYLE
+from whill_mjx.io.html import STYLE
 from whill_mjx.learning.index_page import list_results, write_index
 
 pytestmark = pytest.mark.quick

@@ -7,7 +7,8 @@ import shlex
 import marker_seeker
 import pytest
 
-from whill_mjx import command_line, drive, evaluate, export_mjcf, look
+from whill_mjx import drive, evaluate, export_mjcf, look
+from whill_mjx.io import command_line
 
 pytestmark = pytest.mark.quick
 COMMANDS = {

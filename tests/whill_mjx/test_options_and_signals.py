@@ -12,8 +12,8 @@ from typing import Annotated
 
 import pytest
 
-from whill_mjx import command_line
-from whill_mjx.command_line import COUNT, SHARE, OptionError, Range, check_known, check_options, run
+from whill_mjx.io import command_line
+from whill_mjx.io.command_line import COUNT, SHARE, OptionError, Range, check_known, check_options, run
 
 pytestmark = pytest.mark.quick
 
@@ -120,7 +120,7 @@ def started(body, **options):
     text = textwrap.dedent("""
         import sys, time
         from dataclasses import dataclass
-        from whill_mjx.command_line import run
+        from whill_mjx.io.command_line import run
         @dataclass
         class Options:
             pass

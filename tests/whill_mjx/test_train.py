@@ -14,15 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx import command_line
 from whill_mjx.batch import make_batch
-from whill_mjx.command_line import OptionError
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.evaluation.intervals import wilson_interval
 from whill_mjx.evaluation.policy_file import load_policy
-from whill_mjx.folders import FolderRefused
+from whill_mjx.io import command_line
+from whill_mjx.io.command_line import OptionError
+from whill_mjx.io.folders import FolderRefused
 from whill_mjx.learning.checks import Stopper, keep_best, read_best
 from whill_mjx.learning.setup import find_preset, functional_env, make_training_env, with_repeat
 from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty

@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from whill_mjx import html
 from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes
 from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
-from whill_mjx.folders import write_whole
-from whill_mjx.video import write_h264
+from whill_mjx.io import html
+from whill_mjx.io.folders import write_whole
+from whill_mjx.io.video import write_h264
 
 ENDINGS = {"success": "tab:green", "collision": "tab:red", "timeout": "tab:orange", "diverged": "black"}
 

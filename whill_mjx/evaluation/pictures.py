@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from whill_mjx.folders import whole_file
+from whill_mjx.io.folders import whole_file
 
 
 def reward_curve(

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from bridge.policy import Contract, read_policy
-from whill_mjx.command_line import OptionError
 from whill_mjx.evaluation.policy_file import vehicle_file
-from whill_mjx.fields import PRESET, RUN, TASK, check, check_table
-from whill_mjx.folders import RUN_FILE
-from whill_mjx.reading import read_json
+from whill_mjx.io.command_line import OptionError
+from whill_mjx.io.fields import PRESET, RUN, TASK, check, check_table
+from whill_mjx.io.folders import RUN_FILE
+from whill_mjx.io.reading import read_json
 from whill_mjx.tasks.tasks import TASKS
 
 POLICY = "policy"

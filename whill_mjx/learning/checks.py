@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dreamer import checkpoint, parallel
-from whill_mjx.heartbeat import say
+from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import write_json
 

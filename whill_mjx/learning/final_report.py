@@ -11,8 +11,8 @@ import numpy as np
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.rollouts import CHANNELS
-from whill_mjx.folders import whole_file
-from whill_mjx.video import find_ffmpeg
+from whill_mjx.io.folders import whole_file
+from whill_mjx.io.video import find_ffmpeg
 
 
 def evaluate_drivers(

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from whill_mjx import html
-from whill_mjx.folders import write_whole
+from whill_mjx.io import html
+from whill_mjx.io.folders import write_whole
 
 INDEX = "index.html"
 PICTURES = {

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from dreamer import checkpoint
 from dreamer.progress import Progress
-from whill_mjx.folders import write_whole
+from whill_mjx.io.folders import write_whole
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
 
 SHOWN = ("success", "return")

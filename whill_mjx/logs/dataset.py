@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.folders import write_whole
+from whill_mjx.io.folders import write_whole
 from whill_mjx.logs.simulated_sensors import SensorNoise, encoder_table, wrapped
 from whill_mjx.vehicle.specs import VehicleSpec
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from whill_mjx.command_line import OptionError, Range, check_options
+from whill_mjx.io.command_line import OptionError, Range, check_options
 
 STANDSTILL = 1.0  # s before and after the drive
 Pieces = list[tuple[float, float, float]]

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from whill_mjx.command_line import Range, check_options
+from whill_mjx.io.command_line import Range, check_options
 
 ENCODER_STEP = 0.001  # rad, of the chair's state message
 LENGTH, ANGLE, SPEED = Range(0, 10), Range(0, 4), Range(0, 10)  # m, rad, m/s or rad/s

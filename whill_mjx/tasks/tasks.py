@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.fields import TASK, check_fields
+from whill_mjx.io.fields import TASK, check_fields
 from whill_mjx.world.scene import Boxes, Marker, Scene, box, default_looks, stack_boxes
 
 LAYOUTS = ("randomised", "fixed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from whill_mjx.fields import TIMES, check_fields
+from whill_mjx.io.fields import TIMES, check_fields
 
 
 @dataclass(frozen=True)

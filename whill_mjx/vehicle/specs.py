@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from whill_mjx import fields
+from whill_mjx.io import fields
 
 GRAVITY = 9.81
 """Standard gravity [m/s^2]."""

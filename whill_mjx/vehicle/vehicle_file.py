@@ -22,9 +22,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from whill_mjx import fields
 from whill_mjx.effects import EFFECTS
-from whill_mjx.reading import read_toml
+from whill_mjx.io import fields
+from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of

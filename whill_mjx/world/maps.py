@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from whill_mjx.fields import MAP, check_table
-from whill_mjx.reading import MB, read_bytes, read_text
+from whill_mjx.io.fields import MAP, check_table
+from whill_mjx.io.reading import MB, read_bytes, read_text
 from whill_mjx.world.scene import Boxes, Footprint
 
 FREE, UNKNOWN, OCCUPIED = 0, 1, 2

@@ -1,6 +1,6 @@
 """The fields of all files that people write or that come from elsewhere: unit, kind, range, and the check of a value.
 
-One table per kind of file. A reader gets its file's content from `whill_mjx.reading` and puts every value through
+One table per kind of file. A reader gets its file's content from `whill_mjx.io.reading` and puts every value through
 `check_table` or `check`; classes that are made in code too (`VehicleSpec`, `Task`, `Env`) call `check_fields`. An error
 names file, field, value, rule and remedy. This module imports nothing of the package.
 """

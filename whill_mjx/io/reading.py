@@ -1,7 +1,7 @@
 """Reads files that may be damaged or somebody else's: text, TOML, JSON, CSV, .npz and .gz, each up to a stated size.
 
 Whatever bytes a file has, a function returns a value or raises FileNotFoundError or ValueError with the file's name,
-the rule and the remedy. What the values mean is checked by `whill_mjx.fields`.
+the rule and the remedy. What the values mean is checked by `whill_mjx.io.fields`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.fields import Field, check, shown
+from whill_mjx.io.fields import Field, check, shown
 
 MB = 1_000_000
 TOML_BYTES = MB // 2  # a vehicle file has 5 kB

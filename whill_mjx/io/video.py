@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from whill_mjx.folders import whole_file
+from whill_mjx.io.folders import whole_file
 
 EVEN = 2
 """Width and height of an H.264 video are multiples of it; other frames are cut."""

@@ -19,7 +19,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from whill_mjx.command_line import WRITING, OptionError
+from whill_mjx.io.command_line import WRITING, OptionError
 
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
