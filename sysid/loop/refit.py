@@ -91,6 +91,9 @@ class Start:
 class Refitter:
     """Refits on one set of drives. The base Jacobian is kept from the reference: a day moves it by percents."""
 
+    renews = True
+    """Whether the base Jacobian is renewed where a step did not bring what it promised."""
+
     def __init__(self, drives: Drives, reference: Reference, values: np.ndarray, slopes: np.ndarray):
         """`values` (all parameters) at the reference; `slopes` (B, K, C, P) there."""
         self.drives, self.reference, self.values = drives, reference, values
@@ -184,7 +187,7 @@ class Refitter:
                 break
             if kept and not small:
                 fresh = False
-            elif iteration < iterations - 1:
+            elif self.renews and iteration < iterations - 1:
                 stale = True
         return Refit(found, u, q, cost, residual, jacobian, self.values_at(found, u, q))
 

@@ -1,0 +1,1 @@
+"""What a vehicle is missing: evidence, its posterior, and the verdict."""
