@@ -187,13 +187,7 @@ def close_loop(
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
     if reference is None:
-        known = bool(references) or vehicle is not None
-        start = preset_params(log.spec, config.preset) if start is None else start
-        start = with_effects(start, config.with_effects) if vehicle is None else vehicle
-        free = _free(start, config)
-        iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-        reference = make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations,
-                                   free, progress, vehicle is not None)
+        reference = reference_for(log, references, config, vehicle, progress, start)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     ready = ready.without(config.without)
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
@@ -230,6 +224,18 @@ def close_loop(
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
+
+
+def reference_for(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None,
+                  progress: Progress | None = None, start: Any = None) -> Reference:
+    """The vehicle as its reference drives show it; of the log itself where there are none."""
+    known = bool(references) or vehicle is not None
+    start = preset_params(log.spec, config.preset) if start is None else start
+    start = with_effects(start, config.with_effects) if vehicle is None else vehicle
+    free = _free(start, config)
+    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+    return make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations, free,
+                          progress, vehicle is not None)
 
 
 def prepare(
@@ -377,6 +383,8 @@ class Arguments:
     """Iterations of the base fit."""
     without: tuple[str, ...] = ()
     """Effects of the catalogue that are not looked for, because the vehicle cannot have them."""
+    decision: Literal["search", "posterior"] = "search"
+    """What decides: the search, or posterior weights (writes posterior.json instead of the report)."""
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -395,6 +403,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
         _, vehicle, _ = load_vehicle(arguments.vehicle)
     config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                         without=arguments.without, refit_nulls=arguments.refit_nulls)
+    if arguments.decision == "posterior":
+        from sysid.missing.decision import run as weigh
+
+        return weigh(log, references, arguments.out, config, vehicle)
     return run(log, references, arguments.out, config, vehicle)
 
 

@@ -76,6 +76,11 @@ class Maker:
                                                                for one in trials]),
             pool, manoeuvre, day, course, spec.track, about={"log": name})
 
+    def values(self, key: str, q: np.ndarray) -> dict[str, float]:
+        """Parameter values of an effect at coordinates q (k,)."""
+        base = dict(zip(self.refitter.names, self.refitter.values.tolist(), strict=True))
+        return next(one for one in self.hypotheses if one.key == key).values(q, base)
+
     def refine(self, proposals: Sequence[Proposal], iterations: int = ITERATIONS) -> None:
         """Refit sets of effects, and add the linearisation at each to the evidence."""
         known = {one.key: one for one in self.hypotheses}

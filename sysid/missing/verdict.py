@@ -1,19 +1,18 @@
 """The verdict: what the posterior weights say, and whether it is more than days with nothing missing say.
 
-Two numbers decide. `alpha` is the share of days with nothing missing that may be called otherwise: the score of a log is
-ranked among the scores of such days, so the p-value is a rank. `trust` is the share of a log evidence that is believed:
-the model is linear and Gaussian, vehicles are not, so differences of a few percent of the evidence are a tie.
+Two numbers decide. `alpha` is the share of days with nothing missing that may be called otherwise: the score of a log
+is ranked among the scores of such days, so the p-value is a rank. `trust` says how far a log evidence is believed: the
+model is linear and Gaussian, vehicles are not, so differences of a few percent of the evidence are a tie.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
-
-import json
 
 import numpy as np
 
@@ -114,7 +113,8 @@ def _class_of(evidence: Evidence, found: Posterior, best: Weighed, place: int, w
             rivals[name] = rivals.get(name, 0.0) + weights[" + ".join(one.keys)]
     first = evidence.effect(best.keys[place]).name
     order = [first, *sorted((name for name in rivals if name != first), key=lambda name: -rivals[name])]
-    total, held, members = sum(rivals.values()), 0.0, []
+    members: list[str] = []
+    total, held = sum(rivals.values()), 0.0
     for name in order:
         if members and held >= SURE * total:
             break
