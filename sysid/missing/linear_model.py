@@ -95,9 +95,10 @@ class Products:
 class Model:
     """The drives of one log with everything that does not depend on the set of effects."""
 
-    def __init__(self, evidence: Evidence, priors: Priors, noise: np.ndarray):
-        """`noise` (C,): standard deviation of each channel's white rows."""
-        self.evidence, self.priors, self.noise = evidence, priors, noise
+    def __init__(self, evidence: Evidence, priors: Priors, noise: np.ndarray, shared: np.ndarray | None = None):
+        """`noise`, `shared` (C,): standard deviations of each drive's own white noise, and of what replicates share."""
+        self.evidence, self.priors = evidence, priors
+        self.turn, self.size = replicate_rows(evidence.course, noise, 0 * noise if shared is None else shared)
         self.count = float(evidence.mask.sum())
         self.groups = [np.flatnonzero(evidence.manoeuvre == g) for g in range(int(evidence.manoeuvre.max()) + 1)]
         base = self.rows_of(evidence.base)
@@ -114,22 +115,28 @@ class Model:
     def rows_of(self, columns: np.ndarray, channel: int | None = None) -> Rows:
         """(C, B, K, m) of columns (B, K, C, m) or of one column (B, K, C), in units of the channels' noise.
 
-        With a `channel`: (B, K, m) of columns (B, K, m) there.
+        Replicates are turned into their mean and differences. With a `channel`: (B, K, m) of columns (B, K, m) there.
         """
         if channel is not None:
-            return columns * (self.evidence.mask[..., channel] / self.noise[channel])[..., None]
+            scaled = columns * self.evidence.mask[..., channel, None]
+            return np.tensordot(self.turn / self.size[channel][:, None], scaled, 1)
         columns = columns[..., None] if columns.ndim == 3 else columns
-        scaled = columns * (self.evidence.mask / self.noise)[..., None]
-        return np.ascontiguousarray(np.moveaxis(scaled, 2, 0))
+        scaled = np.moveaxis(columns * self.evidence.mask[..., None], 2, 0)  # (C, B, K, m)
+        flat = scaled.reshape(*scaled.shape[:2], -1)
+        return np.matmul(self.turn / self.size[..., None], flat).reshape(scaled.shape)
 
     def block(self, rows: Rows, colour: float, channel: int | None = None) -> Block:
         """Rows under a noise colour; of one channel only, if given."""
         chosen = slice(None) if channel is None else slice(channel, channel + 1)
-        coloured = rows if colour == 0 else np.matmul(self._filter(colour), rows)
+        coloured = self.coloured(rows, colour)
         bumps, turn = (one[chosen] for one in self._bumps_of(colour)[:2])
         cross = np.matmul(bumps.swapaxes(-1, -2), coloured)  # (C, B, D, m)
         summed = np.stack([cross[:, group].sum(1) for group in self.groups], axis=1)
         return Block(coloured, np.matmul(turn.swapaxes(-1, -2), summed))
+
+    def coloured(self, rows: Rows, colour: float) -> Rows:
+        """Rows (..., K, m) filtered for a noise colour."""
+        return rows if colour == 0 else np.matmul(self._filter(colour), rows)
 
     def base_block(self, colour: float) -> Block:
         """Of the base and the wander."""
@@ -233,11 +240,23 @@ class Model:
             bins = self.evidence.mask.shape[1]
             shape = bumps(np.arange(bins, dtype=float), 0.0, bins - 1.0, self.priors.day_bumps)
             rows = self.rows_of(np.broadcast_to(shape[None, :, None], (*self.evidence.mask.shape, shape.shape[1])))
-            rows = rows if colour == 0 else np.matmul(self._filter(colour), rows)
+            rows = self.coloured(rows, colour)
             each = np.matmul(rows.swapaxes(-1, -2), rows)
             values, turn = np.linalg.eigh(np.stack([each[:, group].sum(1) for group in self.groups], axis=1))
             self._bumps[colour] = rows, turn, np.maximum(values, 0.0)
         return self._bumps[colour]
+
+
+def replicate_rows(course: np.ndarray, noise: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal (B, B) turn of replicates into their mean and differences, and the noise (C, B) of these rows."""
+    turn, size = np.zeros((len(course),) * 2), np.tile(noise[:, None], (1, len(course)))
+    for number in np.unique(course):
+        mine = np.flatnonzero(course == number)
+        count = len(mine)
+        basis = np.linalg.qr(np.concatenate([np.ones((count, 1)), np.eye(count)[:, 1:]], axis=1))[0]
+        turn[np.ix_(mine, mine)] = basis.T
+        size[:, mine[0]] = np.sqrt(noise**2 + count * shared**2)
+    return turn, size
 
 
 def wander_columns(evidence: Evidence, priors: Priors) -> np.ndarray:

@@ -98,7 +98,7 @@ class Posterior:
 def posterior(evidence: Evidence, priors: Priors = DEFAULT) -> Posterior:
     """Weights over what is missing."""
     noise, low, high = noise_factors(evidence, priors)
-    model = Model(evidence, priors, noise)
+    model = Model(evidence, priors, *noise_levels(evidence, noise))
     none = model.fit(np.zeros((*evidence.mask.shape, 0)), np.zeros((0, 0)), evidence.residual)
     sets = weighed_sets(model, none)
     smooth = unknown(model, evidence.residual)
@@ -116,7 +116,7 @@ def weighed_sets(model: Model, none: Fit) -> list[Weighed]:
     sets = [at_point(model, point) for point in points.values()]
     for key, (line, _, z) in list(chosen.items())[:FULL]:
         if (key,) not in points:
-            sets.append(along_line(model, line, z))
+            sets.append(at_point(model, along_line(model, line, z), refitted=False))
     return sets
 
 
@@ -178,32 +178,35 @@ def screen(model: Model, residual: np.ndarray, likely: Setting, fixed: np.ndarra
     return sorted(found, key=lambda one: -one[0])
 
 
-def along_line(model: Model, line: Line, z: np.ndarray) -> Weighed:
-    """A single effect along a line, with errors of its form."""
+def along_line(model: Model, line: Line, z: np.ndarray) -> Point:
+    """The linearisation of a single effect on a line, at its coordinates z (k,), in place of a refit."""
     columns, offset = line_columns(model.evidence, line)
-    fit = with_forms(model, columns, np.diag(line.deviation**-2.0), model.evidence.residual - offset,
-                     (offset + columns @ z)[..., None])
-    size = len(z)
-    deviation = np.sqrt(np.diag(fit.covariance)[:size])
-    price = line.price + _set_price(model, 1) - line.on_side(fit.mean[:size], deviation)
-    return Weighed((line.key,), fit.log_evidence - price, line.start + line.slope * fit.mean[:size],
-                   np.abs(line.slope) * deviation, False)
+    by_q = columns / line.slope
+    return Point((line.key,), line.start + line.slope * z, model.evidence.residual - offset + by_q @ line.start, by_q,
+                 (offset + columns @ z)[..., None])
 
 
-def at_point(model: Model, point: Point) -> Weighed:
-    """A set at its nonlinear refit, with errors of the form of each effect."""
-    precision, size = point_precision(model, point), len(point.q)
-    fit = with_forms(model, point.columns, np.diag(precision), point.residual, point.responses)
-    deviation = np.sqrt(np.diag(fit.covariance)[:size])
-    positive = np.array([not axis.signed for key in point.keys for axis in model.evidence.effect(key).axes])
-    value = fit.log_evidence + right_sign(fit.mean[:size], deviation, np.zeros(size), precision**-0.5, positive)
-    return Weighed(point.keys, value - _set_price(model, len(point.keys)), fit.mean[:size], deviation, True)
+def at_point(model: Model, point: Point, refitted: bool = True) -> Weighed:
+    """A set near the sizes where it was linearised, with errors of the form of each effect.
 
-
-def point_precision(model: Model, point: Point) -> np.ndarray:
-    """(k,) prior precision of a set's coordinates."""
+    Sizes are integrated over within `priors.reach` of them, with the prior density there: a linearisation says nothing
+    of other sizes, and errors of form are shares of the response at these.
+    """
+    priors = model.priors
     axes = [axis for key in point.keys for axis in model.evidence.effect(key).axes]
-    return np.array([model.priors.dependent if axis.dependent else model.priors.size for axis in axes]) ** -2.0
+    main = np.array([not axis.dependent for axis in axes])
+    owner = np.array([place for place, key in enumerate(point.keys) for _ in model.evidence.effect(key).axes])
+    size = np.sqrt(np.array([np.square(point.q[main & (owner == o)]).sum() for o in owner]))
+    radius = np.where(main, np.maximum(priors.reach * size, 0.05), priors.dependent)
+    centre = np.where(main, point.q, 0.0)
+    density = -np.log(np.pi * priors.size * (1 + np.square(point.q / priors.size)) / (np.sqrt(2 * np.pi) * radius))
+    density += np.log([1.0 if axis.signed else 2.0 for axis in axes])
+    fit = with_forms(model, point.columns, np.diag(radius**-2.0), point.residual - point.columns @ centre,
+                     point.responses)
+    mean, deviation = centre + fit.mean[: len(axes)], np.sqrt(np.diag(fit.covariance)[: len(axes)])
+    shaped = ~main & np.array([not axis.signed for axis in axes])
+    value = fit.log_evidence + float(np.minimum(density, 0.0)[main].sum()) - _set_price(model, len(point.keys))
+    return Weighed(point.keys, value + right_sign(mean, deviation, 0 * mean, radius, shaped), mean, deviation, refitted)
 
 
 def with_forms(model: Model, columns: np.ndarray, precision: np.ndarray, residual: np.ndarray, responses: np.ndarray
@@ -246,8 +249,7 @@ def proposals(evidence: Evidence, priors: Priors = DEFAULT, singles: int = 4, pa
 
     Empty where everything worth it is in the evidence.
     """
-    noise, _, _ = noise_factors(evidence, priors)
-    model = Model(evidence, priors, noise)
+    model = Model(evidence, priors, *noise_levels(evidence, noise_factors(evidence, priors)[0]))
     none = model.fit(np.zeros((*evidence.mask.shape, 0)), np.zeros((0, 0)), evidence.residual)
     done = {point.keys for point in evidence.points}
     if not done:
@@ -264,7 +266,7 @@ def proposals(evidence: Evidence, priors: Priors = DEFAULT, singles: int = 4, pa
         point = next(one for one in evidence.points if one.keys == first.keys)
         bent = form_errors(evidence, point.responses)
         fixed = np.concatenate([point.columns, bent], -1)
-        precision = np.diag(np.concatenate([point_precision(model, point), np.full(bent.shape[-1], 0.3**-2)]))
+        precision = np.diag(np.concatenate([np.full(len(point.q), priors.size**-2), np.full(bent.shape[-1], 0.3**-2)]))
         ranked = _by_effect(evidence, screen(model, point.residual, none.setting, fixed, precision),
                             {evidence.effect(first.keys[0]).name})
         for line, z in ranked[:most]:
@@ -279,15 +281,27 @@ def noise_factors(evidence: Evidence, priors: Priors) -> tuple[np.ndarray, np.nd
     From what replicates do not share, where both have replicates: no model is needed. Otherwise from second
     differences in time, which what is missing hardly changes.
     """
-    mine, theirs = _levels(evidence.residual, evidence.mask, evidence.course), _levels(
-        evidence.pool, np.ones(evidence.pool.shape), evidence.pool_course)
+    mine, theirs = own_noise(evidence.residual, evidence.mask, evidence.course), reference_noise(evidence)
     log_factor = np.log(mine[0] / theirs[0])
     deviation = np.sqrt(mine[1] ** 2 + theirs[1] ** 2)
     low, high = (np.exp(log_factor + sign * 1.96 * deviation) for sign in (-1, 1))
     return np.clip(np.exp(log_factor), *priors.noise_range), low, high
 
 
-def _levels(rows: np.ndarray, mask: np.ndarray, course: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def noise_levels(evidence: Evidence, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviation (C,) of what each drive has by itself, and of what replicates share: the model's error, which
+    does not grow with the sensors' noise and is that of the reference days."""
+    own = reference_noise(evidence)[0]
+    whole = np.square(evidence.pool).sum((0, 1)) / np.maximum((evidence.pool != 0).sum((0, 1)), 1)
+    return factors * own, np.sqrt(np.maximum(whole - own**2, 0.0))
+
+
+def reference_noise(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """`own_noise` of the reference days."""
+    return own_noise(evidence.pool, (evidence.pool != 0).astype(float), evidence.pool_course)
+
+
+def own_noise(rows: np.ndarray, mask: np.ndarray, course: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Noise (C,) of rows (B, K, C), and the standard deviation of its logarithm."""
     squares = []
     for number in np.unique(course):

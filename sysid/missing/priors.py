@@ -38,7 +38,9 @@ class Priors:
     wander_most: float = 25.0
     """Largest variance of a combination."""
     size: float = 3.0
-    """Standard deviation of an effect's coordinates."""
+    """Scale of an effect's coordinates."""
+    reach: float = 0.3
+    """How far sizes may be from where a set was linearised, as a share of them."""
     dependent: float = 1.5
     """The same of coordinates that only shape an effect."""
     form: Weighted = ((0.1, 0.5), (0.3, 0.5))

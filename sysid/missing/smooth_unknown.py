@@ -21,8 +21,8 @@ HARMONICS = (1, 2, 3, 4, 6)  # of a wheel's angle
 RINGING = (0.5, 0.8, 1.2, 1.6)  # Hz
 DECAY = 1.5  # s, of a ringing
 SETTINGS = 2  # of noise and day, the likeliest, at which families are compared
-Own = tuple[np.ndarray, Sequence[np.ndarray]]
-"""Columns (B, K, F), and the drives that have one set of coefficients each."""
+Own = tuple[np.ndarray, Sequence[Sequence[np.ndarray]]]
+"""Columns (B, K, F), and in blocks of whole courses the drives that have one set of coefficients."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ def families(evidence: Evidence) -> tuple[dict[str, np.ndarray], dict[str, Own]]
     shared = {name: each if name in ("place", "ringing after commands") else _with_lags(each)
               for name, each in shared.items()}
     shared = {name: each * inside for name, each in shared.items()}
-    drives = [np.array([number]) for number in range(len(v))]
-    groups = [np.flatnonzero(evidence.manoeuvre == g) for g in range(int(evidence.manoeuvre.max()) + 1)]
+    drives = [[np.array([b]) for b in np.flatnonzero(evidence.course == c)] for c in np.unique(evidence.course)]
+    groups = [[np.flatnonzero(evidence.manoeuvre == g)] for g in range(int(evidence.manoeuvre.max()) + 1)]
     own: dict[str, Own] = {f"{side} wheel's angle": (_waves(motion[f"{side}_angle"]) * moving * inside, drives)
                            for side in ("left", "right")}
     own["each drive"] = bumps(t, 0.0, float(t.max()), 20) * inside, drives
@@ -111,11 +111,16 @@ def _at(model: Model, rows: Rows, setting: Setting, shared: Mapping[str, np.ndar
         yield name, _over_amplitudes(model, products.after_bumps(setting.day), smooth, setting)
     for name, (columns, groups) in own.items():  # these take the place of the day's bumps
         inside, right = [], []
-        for channel in range(len(rows)):
-            each = model.block(model.rows_of(columns, channel)[None], setting.colour, channel).rows[0]
-            for group in groups:
-                inside.append(times(each[group], each[group]))
-                right.append(times(each[group], target.rows[channel, group]))
+        for block in groups:
+            together = np.isin(np.arange(len(columns)), np.concatenate(block))  # their rows are turned together
+            mine = np.zeros((*columns.shape[:2], len(block), columns.shape[-1]))
+            for place, drives in enumerate(block):
+                mine[drives, :, place] = columns[drives]
+            mine = mine.reshape(*columns.shape[:2], -1)
+            for channel in range(len(rows)):
+                each = model.coloured(model.rows_of(mine, channel)[together], setting.colour)
+                inside.append(times(each, each))
+                right.append(times(each, target.rows[channel, together]))
         yield name, _over_amplitudes(model, (products.matrix, products.log_det), _turned(inside, right), setting)
 
 
@@ -131,9 +136,9 @@ def _after_bumps(model: Model, block: Block, channel: int, target: Block, settin
 
 def _turned(inside: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> Smooth:
     """Independent sets of columns along the eigenvectors of their products."""
-    values, turn = np.linalg.eigh(np.stack(inside))
-    cross = np.matmul(turn.swapaxes(-1, -2), np.stack(right))
-    return Smooth(np.maximum(values, 0.0).reshape(-1), cross.reshape(-1, cross.shape[-1]))
+    along = [np.linalg.eigh(one) for one in inside]
+    return Smooth(np.concatenate([np.maximum(values, 0.0) for values, _ in along]),
+                  np.concatenate([turn.T @ one for (_, turn), one in zip(along, right, strict=True)]))
 
 
 def _over_amplitudes(model: Model, products: tuple[np.ndarray, float], smooth: Smooth, setting: Setting) -> float:
