@@ -4,8 +4,8 @@
     python -m benchmarks.decision --stage tuning --calibrate      null scores into sysid/data/null_scores.json
     python -m benchmarks.decision --stage test --record           figures into benchmarks/results/decision.json
 
-The evidence is that of `benchmarks.evidence`. What the search said of a log is its row in
-benchmarks/results/undeclared.json: same seed, same effect, same size.
+The evidence is that of `benchmarks.evidence`; posteriors are kept in WORK/posterior, so that verdicts cost nothing.
+What the search said of a log is its row in benchmarks/results/undeclared.json: same seed, same effect, same size.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,9 @@ from benchmarks.evidence import Stage
 from benchmarks.harness import RESULTS, figure, provenance, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_figures import upper_rate
-from sysid.missing.posterior import Posterior, posterior
-from sysid.missing.saved_evidence import Evidence, load
+from sysid.loop.features import CHANNELS
+from sysid.missing.posterior import Posterior, Weighed, posterior
+from sysid.missing.saved_evidence import load
 from sysid.missing.verdict import Verdict, calibration_scores, decide
 from sysid.report import write_report
 
@@ -74,43 +75,50 @@ def main(settings: Benchmark) -> None:
     """Judge all logs of a stage."""
     judged = judge(settings)
     if settings.calibrate:
-        scores = sorted(found.score for _, truth, _, found, _ in judged if not truth["effects"])
+        scores = sorted(found.score for _, truth, found, _ in judged if not truth["effects"])
         write_report(SCORES, {"scores": scores, "logs": len(scores), **provenance()})
     nulls = calibration_scores(SCORES)
-    cases = [Case(label, truth, decide(evidence, found, nulls), found, seconds)
-             for label, truth, evidence, found, seconds in judged]
+    cases = [Case(label, truth, decide(found, CHANNELS, nulls), found, seconds)
+             for label, truth, found, seconds in judged]
     if settings.verbose:
         for case in cases:
             print(line(case))
-    found = figures(cases) | of_search(cases)
+    found = figures(cases) | (of_search(cases) if settings.stage == "test" else {})
     for name, one in found.items():
         print(f"{name:40s} {one['value']:.3f}  {one['unit']}")
     if settings.record:
         record("decision", "Verdicts by posterior weight, beside those of the search on the same logs", found)
 
 
-Judged = tuple[str, dict[str, Any], Evidence, Posterior, float]
+Judged = tuple[str, dict[str, Any], Posterior, float]
 
 
 def judge(settings: Benchmark) -> list[Judged]:
-    """Label, truth, evidence, posterior and seconds of each log."""
+    """Label, truth, posterior and seconds of each log; what was weighed before is read."""
     paths = sorted((settings.work / settings.stage).glob("*.npz.xz"))
     paths = [path for path in paths if not settings.only or path.name.startswith(settings.only)]
     if settings.processes > 1:
         with ProcessPoolExecutor(settings.processes) as pool:
-            return list(pool.map(_judge, paths, chunksize=4))
+            return list(pool.map(_judge, paths))
     return [_judge(path) for path in paths]
 
 
 def _judge(path: Path) -> Judged:
-    label = path.name.removesuffix(".npz.xz")
-    truth = json.loads((path.parent.parent / "truth" / path.parent.name / f"{label}.json").read_text())
-    evidence = load(path)
-    began = time.process_time()
-    found = posterior(evidence)
-    seconds = time.process_time() - began
-    small = {name: np.zeros((0, 0, 0)) for name in ("residual", "base", "columns", "motion", "pool", "wander")}
-    return label, truth, type(evidence)(**{**vars(evidence), **small, "points": ()}), found, seconds
+    label, work, stage = path.name.removesuffix(".npz.xz"), path.parent.parent, path.parent.name
+    truth = json.loads((work / "truth" / stage / f"{label}.json").read_text())
+    kept = work / "posterior" / stage / f"{label}.json"
+    if not kept.exists():
+        evidence = load(path)
+        began = time.process_time()
+        found = posterior(evidence)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_report(kept, {**asdict(found), "seconds": time.process_time() - began})
+    content = json.loads(kept.read_text())
+    seconds = content.pop("seconds")
+    sets = tuple(Weighed(tuple(one["keys"]), one["log_evidence"], np.array(one["q"]), np.array(one["deviation"]),
+                         tuple(one["parts"]), one["refitted"]) for one in content.pop("sets"))
+    noise = {name: np.array(content.pop(name)) for name in ("noise", "noise_low", "noise_high")}
+    return label, truth, Posterior(sets=sets, **content, **noise), seconds
 
 
 def line(case: Case) -> str:

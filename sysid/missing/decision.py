@@ -48,7 +48,7 @@ def run(log: Any, references: Sequence[Any], out: Path, config: Any, vehicle: An
     finally:
         close()
     found = posterior(maker.evidence)
-    said = decide(maker.evidence, found, calibration_scores())
+    said = decide(found, maker.evidence.channels, calibration_scores())
     report = as_report(maker.evidence, found, said, maker.values)
     out.mkdir(parents=True, exist_ok=True)
     save(out / "evidence.npz.xz", maker.evidence)

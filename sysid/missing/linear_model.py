@@ -18,6 +18,8 @@ import numpy as np
 from sysid.missing.priors import Priors
 from sysid.missing.saved_evidence import Evidence
 
+WANDERS = 2
+"""Simulated sizes, from the smallest, whose responses wander: what is there on other days is small."""
 Rows = np.ndarray
 """Columns (C, B, K, m) of all rows, one channel after the other."""
 
@@ -194,10 +196,6 @@ class Model:
         return Solved(self.student(square) - 0.5 * log_det + setting.weight, np.linalg.solve(factor.T, half), factor,
                       max(square / self.count, 1e-9))
 
-    def log_evidence(self, matrix: np.ndarray, log_det: float, setting: Setting) -> float:
-        """The same of nothing but base and wander."""
-        return self.solve(matrix, log_det, setting, np.zeros((0, 0))).log_evidence
-
     def prior(self, kappa: float, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Prior precision of the kept columns of [base, wander, own], and which are kept."""
         total, wander, size = self.base.shape[-1], self.base.shape[-1] - self.base_size, len(own)
@@ -263,12 +261,12 @@ def wander_columns(evidence: Evidence, priors: Priors) -> np.ndarray:
     """(B, K, C, w) columns by which every effect at once seems to be there on days without it; their size is 1."""
     parts = []
     for effect in evidence.effects:
-        level = int(np.argmin(np.abs(np.log(np.array(effect.levels)))))
-        place = list(effect.columns[level])
-        value, vector = np.linalg.eigh(evidence.wander[np.ix_(place, place)])
-        keep = value > 1e-6
-        turn = vector[:, keep] * np.sqrt(np.minimum(value[keep], priors.wander_most))
-        parts.append(evidence.columns[..., place] @ turn)
+        for columns in effect.columns[:WANDERS]:
+            place = list(columns)
+            value, vector = np.linalg.eigh(evidence.wander[np.ix_(place, place)])
+            keep = value > 1e-6
+            turn = vector[:, keep] * np.sqrt(np.minimum(value[keep], priors.wander_most))
+            parts.append(evidence.columns[..., place] @ turn)
     return np.concatenate([np.zeros((*evidence.mask.shape, 0)), *parts], axis=-1)
 
 

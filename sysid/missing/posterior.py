@@ -64,7 +64,14 @@ class Weighed:
     q: np.ndarray
     deviation: np.ndarray
     """Standard deviation of q."""
+    parts: tuple[int, ...]
+    """Number of coordinates of each effect."""
     refitted: bool
+
+    def of(self, place: int) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates of one effect and their standard deviations."""
+        part = slice(sum(self.parts[:place]), sum(self.parts[: place + 1]))
+        return self.q[part], self.deviation[part]
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,8 @@ class Posterior:
     sets: tuple[Weighed, ...]
     """Best first."""
     unknown: float
+    beside: float
+    """Of the best set and the smooth unknown together."""
     families: dict[str, float]
     """Log evidence of the smooth unknown by what it is a function of."""
     noise: np.ndarray  # (C,) noise of each channel over that of the reference
@@ -82,17 +91,15 @@ class Posterior:
     noise_high: np.ndarray
 
     @property
+    def quiet(self) -> float:
+        """Factor on nats over nothing. Quieter sensors show more of what days differ by, but that is no larger."""
+        return float(min(1.0, np.exp(np.log(self.noise_high).mean())) ** 2)
+
+    @property
     def score(self) -> float:
         """How much better than nothing the best explanation is [nats]: the one number that a threshold decides on."""
         best = self.sets[0].log_evidence if self.sets else -np.inf
-        return max(best, self.unknown) - self.none
-
-    def weights(self) -> dict[str, float]:
-        """Posterior weights of none, each set (its keys joined by " + ") and unknown."""
-        names = ["none", *(" + ".join(one.keys) for one in self.sets), "unknown"]
-        logs = np.array([self.none, *(one.log_evidence for one in self.sets), self.unknown])
-        weights = np.exp(logs - logs.max())
-        return dict(zip(names, (weights / weights.sum()).tolist(), strict=True))
+        return self.quiet * (max(best, self.unknown) - self.none)
 
 
 def posterior(evidence: Evidence, priors: Priors = DEFAULT) -> Posterior:
@@ -101,9 +108,18 @@ def posterior(evidence: Evidence, priors: Priors = DEFAULT) -> Posterior:
     model = Model(evidence, priors, *noise_levels(evidence, noise))
     none = model.fit(np.zeros((*evidence.mask.shape, 0)), np.zeros((0, 0)), evidence.residual)
     sets = weighed_sets(model, none)
-    smooth = unknown(model, evidence.residual)
-    return Posterior(none.log_evidence, tuple(sorted(sets, key=lambda one: -one.log_evidence)), smooth.log_evidence,
-                     dict(smooth.families), noise, low, high)
+    sets.sort(key=lambda one: -one.log_evidence)
+    nothing = np.zeros((*evidence.mask.shape, 0))
+    smooth = unknown(model, evidence.residual, nothing, np.zeros((0, 0)))
+    beside = sets[0].log_evidence if sets else none.log_evidence
+    point = next((one for one in evidence.points if sets and one.keys == sets[0].keys), None)
+    if point is not None and sets[0].log_evidence > max(smooth.log_evidence, none.log_evidence + GATE):
+        columns, precision, residual, price = near(model, point)
+        bent = form_errors(evidence, point.responses)
+        whole = np.diag(np.concatenate([precision, np.full(bent.shape[-1], 0.3**-2)]))
+        beside = price + unknown(model, residual, np.concatenate([columns, bent], -1), whole).log_evidence
+    return Posterior(none.log_evidence, tuple(sets), smooth.log_evidence, beside, dict(smooth.families), noise, low,
+                     high)
 
 
 def weighed_sets(model: Model, none: Fit) -> list[Weighed]:
@@ -192,6 +208,21 @@ def at_point(model: Model, point: Point, refitted: bool = True) -> Weighed:
     Sizes are integrated over within `priors.reach` of them, with the prior density there: a linearisation says nothing
     of other sizes, and errors of form are shares of the response at these.
     """
+    columns, precision, residual, price = near(model, point)
+    axes = [axis for key in point.keys for axis in model.evidence.effect(key).axes]
+    main = np.array([not axis.dependent for axis in axes])
+    fit = with_forms(model, columns, np.diag(precision), residual, point.responses)
+    mean = np.where(main, point.q, 0.0) + fit.mean[: len(axes)]
+    deviation = np.sqrt(np.diag(fit.covariance)[: len(axes)])
+    shaped = ~main & np.array([not axis.signed for axis in axes])
+    value = fit.log_evidence + price + right_sign(mean, deviation, 0 * mean, precision**-0.5, shaped)
+    parts = tuple(len(model.evidence.effect(key).axes) for key in point.keys)
+    return Weighed(point.keys, value, mean, deviation, parts, refitted)
+
+
+def near(model: Model, point: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Columns (B, K, C, k) of a set, their prior precision (k,), the residual (B, K, C) at their prior mean, and the
+    log of the prior there."""
     priors = model.priors
     axes = [axis for key in point.keys for axis in model.evidence.effect(key).axes]
     main = np.array([not axis.dependent for axis in axes])
@@ -201,12 +232,8 @@ def at_point(model: Model, point: Point, refitted: bool = True) -> Weighed:
     centre = np.where(main, point.q, 0.0)
     density = -np.log(np.pi * priors.size * (1 + np.square(point.q / priors.size)) / (np.sqrt(2 * np.pi) * radius))
     density += np.log([1.0 if axis.signed else 2.0 for axis in axes])
-    fit = with_forms(model, point.columns, np.diag(radius**-2.0), point.residual - point.columns @ centre,
-                     point.responses)
-    mean, deviation = centre + fit.mean[: len(axes)], np.sqrt(np.diag(fit.covariance)[: len(axes)])
-    shaped = ~main & np.array([not axis.signed for axis in axes])
-    value = fit.log_evidence + float(np.minimum(density, 0.0)[main].sum()) - _set_price(model, len(point.keys))
-    return Weighed(point.keys, value + right_sign(mean, deviation, 0 * mean, radius, shaped), mean, deviation, refitted)
+    price = float(np.minimum(density, 0.0)[main].sum()) - _set_price(model, len(point.keys))
+    return point.columns, radius**-2.0, point.residual - point.columns @ centre, price
 
 
 def with_forms(model: Model, columns: np.ndarray, precision: np.ndarray, residual: np.ndarray, responses: np.ndarray

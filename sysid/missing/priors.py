@@ -29,7 +29,7 @@ class Priors:
     """Correlation time of that noise [s]."""
     calm: float = 0.1
     """Most of it that may go with a named set: more is something unexplained."""
-    day: Weighted = ((0.0, 0.5), (0.15, 0.3), (0.3, 0.15), (0.6, 0.04), (1.2, 0.01))
+    day: Weighted = ((0.0, 0.5), (0.15, 0.35), (0.5, 0.15))
     """Amplitude of what a day adds to all drives of a manoeuvre."""
     day_bumps: int = 10
     """Smooth functions of time for it."""

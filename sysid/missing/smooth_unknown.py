@@ -15,7 +15,7 @@ import numpy as np
 from sysid.missing.linear_model import Block, Model, Rows, Setting, Smooth, bumps, by_colour, log_sum, times
 from sysid.missing.saved_evidence import MOTION, Evidence
 
-REST = 0.02  # m/s of a wheel below which a vehicle rests
+REST = 0.05  # m/s below which a vehicle rests: the sign of a speed must not be that of its noise
 LAGS = 3  # bins over which the motion answers
 HARMONICS = (1, 2, 3, 4, 6)  # of a wheel's angle
 RINGING = (0.5, 0.8, 1.2, 1.6)  # Hz
@@ -37,11 +37,11 @@ def families(evidence: Evidence) -> tuple[dict[str, np.ndarray], dict[str, Own]]
     """Columns (B, K, F) of the families that all drives share, and those with coefficients of their own."""
     motion = dict(zip(MOTION, np.moveaxis(evidence.motion, -1, 0), strict=True))
     inside = motion["inside"][..., None]
-    v, omega = motion["v"], motion["omega"]
+    v, omega = (_of_courses(motion[name], evidence.course) for name in ("v", "omega"))
     bins = v.shape[1]
     t = np.broadcast_to((np.arange(bins) + 0.5) * evidence.width, v.shape)
     still = np.hypot(v, omega * evidence.track / 2) < REST
-    moving, sign = (~still)[..., None], np.sign(v)[..., None]
+    moving, sign = (~still)[..., None], (np.sign(v) * (np.abs(v) > REST))[..., None]
     command = np.stack([motion["command_v"], motion["command_omega"]], -1)
     change = np.diff(command, axis=1, prepend=command[:, :1])
     speed = bumps(v, -1.0, 1.0, 8)
@@ -52,7 +52,7 @@ def families(evidence: Evidence) -> tuple[dict[str, np.ndarray], dict[str, Own]]
         "speed and yaw rate": _outer(bumps(v, -1.0, 1.0, 5), bumps(omega, -1.0, 1.0, 5)),
         "speed and time": np.concatenate([speed, speed * late, speed * late**2], -1),
         "command": np.concatenate([command, change, np.abs(command), command[..., :1] * command[..., 1:]], -1),
-        "time since rest": bumps(_since(v, still, evidence.width), 0.0, 4.0, 8) * sign,
+        "time since rest": bumps(_since(sign[..., 0], still, evidence.width), 0.0, 4.0, 8) * sign,
         "ringing after commands": _ringing(change, evidence.width)}
     if np.isfinite(motion["x"]).all():
         heading = motion["yaw"]
@@ -72,13 +72,13 @@ def families(evidence: Evidence) -> tuple[dict[str, np.ndarray], dict[str, Own]]
     return shared, own
 
 
-def unknown(model: Model, residual: np.ndarray) -> Unknown:
-    """Evidence of the smooth unknown for a residual (B, K, C)."""
-    rows = model.rows_of(residual)
+def unknown(model: Model, residual: np.ndarray, beside: np.ndarray, precision: np.ndarray) -> Unknown:
+    """Evidence of the smooth unknown beside columns (B, K, C, k) of prior precision (k, k)."""
+    rows = np.concatenate([model.rows_of(beside), model.rows_of(residual)], axis=-1)
     plain: list[tuple[float, Setting]] = []
     for colour, group in by_colour(model.priors.settings(calm=False)):
         products = model.products(colour, rows)
-        plain += [(model.log_evidence(*products.after_bumps(one.day), one), one) for one in group]
+        plain += [(model.solve(*products.after_bumps(one.day), one, precision).log_evidence, one) for one in group]
     plain.sort(key=lambda one: -one[0])
     found = {"correlated noise": [value for value, _ in plain]}
     chosen: dict[tuple[float, float], Setting] = {}
@@ -88,14 +88,14 @@ def unknown(model: Model, residual: np.ndarray) -> Unknown:
     chosen.setdefault((0.0, 0.0), next(one for _, one in plain if (one.colour, one.day) == (0.0, 0.0)))
     shared, own = families(model.evidence)
     for setting in chosen.values():
-        for name, value in _at(model, rows, setting, shared, own):
+        for name, value in _at(model, rows, precision, setting, shared, own):
             found.setdefault(name, []).append(value)
     each = {name: log_sum(values) for name, values in found.items()}
     return Unknown(log_sum(list(each.values())) - float(np.log(len(each))), each)
 
 
-def _at(model: Model, rows: Rows, setting: Setting, shared: Mapping[str, np.ndarray], own: Mapping[str, Own]
-        ) -> Iterator[tuple[str, float]]:
+def _at(model: Model, rows: Rows, precision: np.ndarray, setting: Setting, shared: Mapping[str, np.ndarray],
+        own: Mapping[str, Own]) -> Iterator[tuple[str, float]]:
     """Log evidence of each family at one setting of noise and day."""
     products = model.products(setting.colour, rows)
     target = model.whole_block(setting.colour, rows)
@@ -108,7 +108,7 @@ def _at(model: Model, rows: Rows, setting: Setting, shared: Mapping[str, np.ndar
         part = slice(start, start + columns.shape[-1])
         start = part.stop
         smooth = _turned([inside[part, part] for inside, _ in cross], [right[part] for _, right in cross])
-        yield name, _over_amplitudes(model, products.after_bumps(setting.day), smooth, setting)
+        yield name, _over_amplitudes(model, products.after_bumps(setting.day), smooth, setting, precision)
     for name, (columns, groups) in own.items():  # these take the place of the day's bumps
         inside, right = [], []
         for block in groups:
@@ -121,7 +121,8 @@ def _at(model: Model, rows: Rows, setting: Setting, shared: Mapping[str, np.ndar
                 each = model.coloured(model.rows_of(mine, channel)[together], setting.colour)
                 inside.append(times(each, each))
                 right.append(times(each, target.rows[channel, together]))
-        yield name, _over_amplitudes(model, (products.matrix, products.log_det), _turned(inside, right), setting)
+        yield name, _over_amplitudes(model, (products.matrix, products.log_det), _turned(inside, right), setting,
+                                    precision)
 
 
 def _after_bumps(model: Model, block: Block, channel: int, target: Block, setting: Setting
@@ -141,12 +142,14 @@ def _turned(inside: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> Smooth
                   np.concatenate([turn.T @ one for (_, turn), one in zip(along, right, strict=True)]))
 
 
-def _over_amplitudes(model: Model, products: tuple[np.ndarray, float], smooth: Smooth, setting: Setting) -> float:
+def _over_amplitudes(model: Model, products: tuple[np.ndarray, float], smooth: Smooth, setting: Setting,
+                     precision: np.ndarray) -> float:
     matrix, log_bumps = products
     values = []
     for amplitude, weight in model.priors.kernel:
         less, log_det = smooth.integrated(amplitude)
-        values.append(model.log_evidence(matrix - less, log_bumps + log_det, setting) + float(np.log(weight)))
+        solved = model.solve(matrix - less, log_bumps + log_det, setting, precision)
+        values.append(solved.log_evidence + float(np.log(weight)))
     return log_sum(values)
 
 
@@ -164,11 +167,19 @@ def _waves(angle: np.ndarray) -> np.ndarray:
     return np.stack([wave(k * angle) for k in HARMONICS for wave in (np.sin, np.cos)], -1)
 
 
-def _since(v: np.ndarray, still: np.ndarray, width: float) -> np.ndarray:
+def _of_courses(series: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """(B, K) mean over the replicates of each drive: less of a drive's own noise."""
+    out = np.empty_like(series)
+    for number in np.unique(course):
+        out[course == number] = series[course == number].mean(0)
+    return out
+
+
+def _since(sign: np.ndarray, still: np.ndarray, width: float) -> np.ndarray:
     """(B, K) time since rest or reversal [s]."""
-    turned = np.sign(v) != np.sign(np.concatenate([v[:, :1], v[:, :-1]], axis=1))
-    out = np.zeros_like(v)
-    for k in range(1, v.shape[1]):
+    turned = sign != np.concatenate([sign[:, :1], sign[:, :-1]], axis=1)
+    out = np.zeros(sign.shape)
+    for k in range(1, sign.shape[1]):
         out[:, k] = np.where(still[:, k] | turned[:, k], 0.0, out[:, k - 1] + width)
     return out
 

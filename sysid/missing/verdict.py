@@ -1,8 +1,9 @@
 """The verdict: what the posterior weights say, and whether it is more than days with nothing missing say.
 
-Two numbers decide. `alpha` is the share of days with nothing missing that may be called otherwise: the score of a log
-is ranked among the scores of such days, so the p-value is a rank. `trust` says how far a log evidence is believed: the
-model is linear and Gaussian, vehicles are not, so differences of a few percent of the evidence are a tie.
+Three numbers decide. `alpha` is the share of days with nothing missing that may be called otherwise: a score is ranked
+among the scores of such days, so its p-value is a rank. A second effect must stand out beside the first as far as that.
+`trust` says how far a log evidence is believed: the model is linear and Gaussian, vehicles are not, so differences of a
+few percent of the evidence are a tie. `share` is what named effects must explain of all that can be explained.
 """
 
 from __future__ import annotations
@@ -17,21 +18,20 @@ from typing import Literal
 import numpy as np
 
 from sysid.missing.posterior import Posterior, Weighed
-from sysid.missing.saved_evidence import Evidence
 
 NULLS = "null_scores.json"
-SURE = 0.95
-"""Posterior weight that a class holds."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """The two numbers."""
+    """The three numbers."""
 
-    alpha: float = 0.01
+    alpha: float = 0.02
     """Largest share of false alarms."""
-    trust: float = 0.02
+    trust: float = 0.1
     """Nats of doubt for each nat of evidence over nothing."""
+    share: float = 0.75
+    """Least evidence of named effects over that of them and a smooth unknown together."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Named:
     """Its class: effects that these drives cannot distinguish from it, itself first."""
     q: np.ndarray
     deviation: np.ndarray
+    """Standard deviation of q."""
 
 
 @dataclass(frozen=True)
@@ -62,36 +63,55 @@ class Verdict:
     """What the best smooth unknown is a function of."""
 
 
-def decide(evidence: Evidence, found: Posterior, null_scores: Sequence[float], rules: Rules | None = None) -> Verdict:
+def decide(found: Posterior, channels: Sequence[str], null_scores: Sequence[float], rules: Rules | None = None
+           ) -> Verdict:
     """The verdict on one log."""
     rules = rules or Rules()
-    nulls = np.asarray(null_scores, float)
-    p_value = float((1 + (nulls >= found.score).sum()) / (1 + len(nulls)))
-    weights = tempered(found, rules.trust)
     noise = {channel: (float(found.noise[c]), float(found.noise_low[c]), float(found.noise_high[c]))
-             for c, channel in enumerate(evidence.channels)}
-    lives_in = max(found.families, key=lambda name: found.families[name]) if found.families else ""
-
-    def verdict(kind: Literal["none", "named", "unexplained"], effects: tuple[Named, ...] = ()) -> Verdict:
-        return Verdict(kind, effects, p_value, found.score, weights, noise, lives_in)
-
+             for c, channel in enumerate(channels)}
+    p_value, best = rank(found.score, null_scores), chosen(found, null_scores, rules)
+    kind: Literal["none", "named", "unexplained"] = "named"
     if p_value > rules.alpha:
-        return verdict("none")
-    if not found.sets or found.unknown > found.sets[0].log_evidence:
-        return verdict("unexplained")
-    best = found.sets[0]
+        kind = "none"
+    elif best is None or _gain(found, best) < rules.share * max(found.beside, found.unknown) - rules.share * found.none:
+        kind = "unexplained"
     effects = []
-    for place, key in enumerate(best.keys):
-        axes = [len(evidence.effect(one).axes) for one in best.keys]
-        part = slice(sum(axes[:place]), sum(axes[: place + 1]))
-        members = _class_of(evidence, found, best, place, weights)
-        effects.append(Named(members[0], key, members, best.q[part], best.deviation[part]))
-    return verdict("named", tuple(effects))
+    if kind == "named" and best is not None:
+        for place, key in enumerate(best.keys):
+            effects.append(Named(name_of(key), key, _class_of(found, best, place, rules.trust), *best.of(place)))
+    lives_in = max(found.families, key=lambda name: found.families[name]) if found.families else ""
+    return Verdict(kind, tuple(effects), p_value, found.score, tempered(found, rules.trust), noise, lives_in)
+
+
+def rank(score: float, null_scores: Sequence[float]) -> float:
+    """p-value of a score among those of days with nothing missing."""
+    return float((1 + (np.asarray(null_scores, float) >= score).sum()) / (1 + len(null_scores)))
+
+
+def chosen(found: Posterior, null_scores: Sequence[float], rules: Rules) -> Weighed | None:
+    """The smallest set that no larger one beats by what a further effect must bring."""
+    best: Weighed | None = None
+    for size in sorted({len(one.keys) for one in found.sets}):
+        one = next(each for each in found.sets if len(each.keys) == size)
+        before = _gain(found, best) if best is not None else 0.0
+        more = _gain(found, one) - before
+        if best is None or rank(found.quiet * more, null_scores) <= rules.alpha and more > rules.trust * before:
+            best = one
+    return best
+
+
+def name_of(key: str) -> str:
+    """The effect of a hypothesis."""
+    return key.partition("/")[0]
+
+
+def _gain(found: Posterior, one: Weighed) -> float:
+    return one.log_evidence - found.none
 
 
 def tempered(found: Posterior, trust: float) -> dict[str, float]:
     """Posterior weights with log evidence over nothing divided by what the model is not to be believed of it."""
-    temperature = max(1.0, trust * found.score)
+    temperature = max(1.0, trust * found.score / found.quiet)
     names = ["none", *(" + ".join(one.keys) for one in found.sets), "unknown"]
     logs = np.array([found.none, *(one.log_evidence for one in found.sets), found.unknown])
     weights = np.exp((logs - logs.max()) / temperature)
@@ -100,26 +120,16 @@ def tempered(found: Posterior, trust: float) -> dict[str, float]:
     return {names[i]: float(weights[i]) for i in order}
 
 
-def _class_of(evidence: Evidence, found: Posterior, best: Weighed, place: int, weights: Mapping[str, float]
-              ) -> tuple[str, ...]:
-    """Effects that could stand for one of the best set: they hold `SURE` of the weight among sets that only differ
-    there."""
-    others = best.keys[:place] + best.keys[place + 1 :]
-    rivals: dict[str, float] = {}
+def _class_of(found: Posterior, best: Weighed, place: int, trust: float) -> tuple[str, ...]:
+    """Effects that could stand for one of a set: in its place they leave less than three times the doubt (95 %)."""
+    others = set(best.keys) - {best.keys[place]}
+    least = best.log_evidence - 3.0 * max(1.0, trust * _gain(found, best))
+    members = [name_of(best.keys[place])]
     for one in found.sets:
-        if len(one.keys) == len(best.keys) and set(others) <= set(one.keys):
-            [mine] = [key for key in one.keys if key not in others] or [best.keys[place]]
-            name = evidence.effect(mine).name
-            rivals[name] = rivals.get(name, 0.0) + weights[" + ".join(one.keys)]
-    first = evidence.effect(best.keys[place]).name
-    order = [first, *sorted((name for name in rivals if name != first), key=lambda name: -rivals[name])]
-    members: list[str] = []
-    total, held = sum(rivals.values()), 0.0
-    for name in order:
-        if members and held >= SURE * total:
-            break
-        members.append(name)
-        held += rivals[name]
+        if len(one.keys) == len(best.keys) and others < set(one.keys) and one.log_evidence > least:
+            [mine] = set(one.keys) - others
+            if name_of(mine) not in members:
+                members.append(name_of(mine))
     return tuple(members)
 
 

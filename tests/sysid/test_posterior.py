@@ -92,7 +92,7 @@ def test_a_planted_effect_has_the_weight_and_its_size_lies_in_its_interval(name)
     best = found.sets[0]
     assert best.keys == (name,) and found.unknown < best.log_evidence - 10
     assert abs(best.q[0] - 3.0) < 3 * best.deviation[0]
-    assert found.weights()[name] > 0.95
+    assert tempered(found, 0.0)[name] > 0.95
 
 
 def test_an_effect_is_found_under_noisier_sensors():
@@ -190,9 +190,9 @@ def test_the_verdict_ranks_the_score_among_days_with_nothing_missing():
     made = problem(15, planted=lambda e: 2.0 * response(e, "drag"))
     found = posterior(made)
     nulls = list(np.linspace(-3.0, 12.0, 199))
-    said = decide(made, found, nulls)
+    said = decide(found, made.channels, nulls)
     assert said.verdict == "named" and said.effects[0].name == "drag" and said.p_value == pytest.approx(1 / 200)
-    assert decide(made, found, [*nulls, *np.full(20, found.score + 1.0)]).verdict == "none"
+    assert decide(found, made.channels, [*nulls, *np.full(20, found.score + 1.0)]).verdict == "none"
 
 
 def test_effects_that_drives_cannot_distinguish_are_one_class():
@@ -200,11 +200,11 @@ def test_effects_that_drives_cannot_distinguish_are_one_class():
     twin = made.columns.copy()
     twin[..., 2:4] = twin[..., 0:2]
     made = replace(made, columns=twin, residual=made.residual + 3.0 * response(made, "lag"))
-    said = decide(made, posterior(made), np.zeros(199))
+    said = decide(posterior(made), made.channels, np.zeros(199))
     assert said.verdict == "named" and set(said.effects[0].members) == {"lag", "drag"}
 
 
 def test_tempered_weights_sum_to_one_and_leave_a_tie_a_tie():
-    found = Posterior(0.0, (), 1000.0, {}, np.ones(C), np.ones(C), np.ones(C))
+    found = Posterior(0.0, (), 1000.0, 1000.0, {}, np.ones(C), np.ones(C), np.ones(C))
     weights = tempered(found, 0.02)
     assert sum(weights.values()) == pytest.approx(1.0) and weights["unknown"] > 0.99
