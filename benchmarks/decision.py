@@ -14,7 +14,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,13 @@ from benchmarks.undeclared_figures import upper_rate
 from sysid.loop.features import CHANNELS
 from sysid.missing.posterior import Posterior, Weighed, posterior
 from sysid.missing.saved_evidence import load
-from sysid.missing.verdict import Verdict, calibration_scores, decide
+from sysid.missing.verdict import Rules, Verdict, calibration_scores, decide
 from sysid.report import write_report
 
 SCORES = Path("sysid/data/null_scores.json")
+MISSING = RESULTS.parents[1] / "sysid" / "missing"
+REACHED = ("saved_evidence", "priors", "linear_model", "smooth_unknown", "posterior", "verdict")
+"""Modules between a file of evidence and a verdict."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +120,8 @@ def _judge(path: Path) -> Judged:
     seconds = content.pop("seconds")
     sets = tuple(Weighed(tuple(one["keys"]), one["log_evidence"], np.array(one["q"]), np.array(one["deviation"]),
                          tuple(one["parts"]), one["refitted"]) for one in content.pop("sets"))
-    noise = {name: np.array(content.pop(name)) for name in ("noise", "noise_low", "noise_high")}
-    return label, truth, Posterior(sets=sets, **content, **noise), seconds
+    content |= {name: np.array(content[name]) for name in ("noise", "noise_low", "noise_high")}
+    return label, truth, Posterior(sets=sets, **content), seconds
 
 
 def line(case: Case) -> str:
@@ -175,6 +178,9 @@ def figures(cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
     out |= of_pairs([(list(case.effects), case.verdict.verdict, classes_of(case))
                      for case in cases if case.kind == "pair"], "")
     if cases:
+        out["decision_lines"] = figure([float(sum(len((MISSING / f"{name}.py").read_text().splitlines())
+                                                  for name in REACHED))], "lines reached between evidence and verdict")
+        out["decision_thresholds"] = figure([float(len(fields(Rules)))], "thresholds")
         out["verdict_s"] = figure([case.seconds for case in cases], f"s of one core, median of {len(cases)} logs")
     return out
 

@@ -45,8 +45,8 @@ def problem(seed=0, noise=1.0, planted=None):
     made = Evidence(
         tuple(f"drive_{b}" for b in range(B)), np.arange(B) // 2, np.arange(B) // 2, ("v", "omega", "yaw"), np.ones(C),
         0.25, np.ones((B, K, C)), residual, ("kp", "mass", "drag"), base, np.eye(3), effects, columns,
-        np.diag(np.full(columns.shape[-1], 0.01)), motion, random.standard_normal((B, K, C)), np.arange(B) // 2,
-        np.arange(B) % 2, np.arange(B) // 2, 0.6)
+        np.diag([0.01 / size**2 for _ in NAMES for size in LEVELS]), motion, random.standard_normal((B, K, C)),
+        np.arange(B) // 2, np.arange(B) % 2, np.arange(B) // 2, 0.6)
     return made if planted is None else replace(made, residual=residual + planted(made))
 
 
@@ -182,7 +182,7 @@ def test_a_saved_file_gives_the_same_posterior(tmp_path):
     assert again.effects == made.effects and again.trials == made.trials
     assert np.abs(again.residual - made.residual).max() < 0.05
     first, second = posterior(made), posterior(again)
-    assert second.score == pytest.approx(first.score, abs=1.0)
+    assert second.score == pytest.approx(first.score, rel=0.01)  # values are stored in steps
     assert [one.keys for one in second.sets[:1]] == [one.keys for one in first.sets[:1]]
 
 
