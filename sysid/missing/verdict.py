@@ -73,8 +73,9 @@ def decide(found: Posterior, channels: Sequence[str], null_scores: Sequence[floa
     kind: Literal["none", "named", "unexplained"] = "named"
     if p_value > rules.alpha:
         kind = "none"
-    elif best is None or _gain(found, best) < rules.share * max(found.beside, found.unknown) - rules.share * found.none:
-        kind = "unexplained"
+    elif best is None or found.sets[0].log_evidence < found.none + rules.share * (
+            max(found.beside, found.unknown) - found.none):
+        kind = "unexplained"  # whether or not all of the best set's effects are named
     effects = []
     if kind == "named" and best is not None:
         for place, key in enumerate(best.keys):
