@@ -30,9 +30,10 @@ from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
+from sysid.missing.catalogue import PARAMETER
 from sysid.pages.loop_report import effects, replay
 from sysid.replay.models import with_effects
-from sysid.verdict.late_pose import NAME, PARAMETER
+from sysid.verdict.late_pose import NAME
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, refit_poses

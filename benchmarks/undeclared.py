@@ -30,7 +30,8 @@ from benchmarks.undeclared_reference import Driven, prepared, reference_days, re
 from sysid.logs.log import load_log
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.rollout import vehicle_plant
-from sysid.verdict.pipeline import find_missing, prepare
+from sysid.verdict.pipeline import find_missing
+from sysid.verdict.preparation import prepare
 from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 

@@ -20,7 +20,7 @@ from sysid.missing.days import Reference
 from sysid.missing.reference import make_reference
 from sysid.pages.report import code_hashes
 from sysid.replay.rollout import vehicle_plant
-from sysid.verdict.pipeline import prepare
+from sysid.verdict.preparation import prepare
 from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sysid.search.settings import FitConfig as FitConfig
     from sysid.verdict.found import Thresholds as Thresholds
     from sysid.verdict.pipeline import find_missing as find_missing
-    from sysid.verdict.pipeline import prepare as prepare
+    from sysid.verdict.preparation import prepare as prepare
     from sysid.verdict.result import LoopConfig as LoopConfig
 
 _HOMES = {

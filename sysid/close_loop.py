@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sysid import command_line
 from sysid.verdict.pipeline import watched
@@ -47,6 +47,8 @@ class Arguments:
     """Iterations of the base fit."""
     without: tuple[str, ...] = ()
     """Effects of the catalogue that are not looked for, because the vehicle cannot have them."""
+    decision: Literal["search", "posterior"] = "search"
+    """What decides: the search, or, as a trial, posterior weights (writes posterior.json instead of the report)."""
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -66,6 +68,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
         _, vehicle, _ = load_vehicle(arguments.vehicle)
     config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                         without=arguments.without, refit_nulls=arguments.refit_nulls)
+    if arguments.decision == "posterior":
+        from sysid.weighing.decision import run as weigh
+
+        return weigh(log, references, arguments.out, config, vehicle)
     return write_result(arguments.out, watched(log, references, config, vehicle))
 
 

@@ -19,6 +19,8 @@ from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
+PARAMETER = "pose_delay.delay"
+
 OUTSIDE = "outside"
 """Place of the effects on a pose that is measured from outside."""
 LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)

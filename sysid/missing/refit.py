@@ -43,6 +43,9 @@ def own_sizes(q: np.ndarray) -> np.ndarray:
 class Refitter:
     """Refits on one set of drives. The base Jacobian is kept from the reference: a day moves it by percents."""
 
+    renews = True
+    """Whether the base Jacobian is renewed where a step did not bring what it promised."""
+
     def __init__(self, drives: Drives, reference: Reference, values: np.ndarray, slopes: np.ndarray):
         """`values` (all parameters) at the reference; `slopes` (B, K, C, P) there."""
         self.drives, self.reference, self.values = drives, reference, values
@@ -118,7 +121,7 @@ class Refitter:
             if gained > PROMISE * tried.promised[0, best] and gained >= small:
                 fresh = False
             else:
-                stale = iteration < iterations - 1
+                stale = self.renews and iteration < iterations - 1
         u, q = state.u[0, :size], state.u[0, size:]
         return Refit(found, u, q, float(state.cost[0]), residual, jacobian, self.values_at(found, u, q))
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from sysid.errors.space import make_space
 from sysid.logs.pose_lag import pose_lag
+from sysid.missing.catalogue import PARAMETER
 from sysid.missing.evidence import with_values
 from sysid.missing.pose_fit import fit_poses
 from sysid.verdict.found import Candidate
@@ -25,7 +26,6 @@ from sysid.verdict.vehicles import drives_of, fitted_before
 from whill_mjx.vehicle.parameters import set_values
 
 NAME = "pose_delay"
-PARAMETER = "pose_delay.delay"
 ITERATIONS = 20
 
 

@@ -10,31 +10,22 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.errors.space import FIXED
 from sysid.logs.log import Log
-from sysid.missing.catalogue import base_values, hypotheses, outside_hypotheses, with_catalogue
+from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import Reference
-from sysid.missing.drives import make_drives, rows_of_call
-from sysid.missing.reference import make_reference
+from sysid.missing.drives import make_drives
 from sysid.missing.refit import Refitter
-from sysid.missing.signatures import PARTS, gather
+from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
-from sysid.missing.wander import estimate
-from sysid.replay.models import with_effects
-from sysid.replay.records import Plant
-from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
 from sysid.verdict.alone import judged, stands_alone
 from sysid.verdict.guards import guarded, stand
-from sysid.verdict.late_pose import PARAMETER, told_late
+from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
+from sysid.verdict.preparation import expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
 from sysid.verdict.search import search
-from whill_mjx.vehicle.config import VehicleConfig
-from whill_mjx.vehicle.parameters import describe, get_values, set_values
-from whill_mjx.vehicle.presets import preset_params
-from whill_mjx.vehicle.specs import VehicleSpec
 
 
 def find_missing(
@@ -56,13 +47,7 @@ def find_missing(
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
     if reference is None:
-        known = bool(references) or vehicle is not None
-        start = preset_params(log.spec, config.preset) if start is None else start
-        start = with_effects(start, config.with_effects) if vehicle is None else vehicle
-        free = _free(start, config)
-        iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-        reference = make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations,
-                                   free, progress, vehicle is not None)
+        reference = reference_for(log, references, config, vehicle, progress, start)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     ready = ready.without(config.without)
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
@@ -111,35 +96,6 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
         close()
 
 
-def prepare(
-    reference: Reference, spec: VehicleSpec, config: LoopConfig | None = None, progress: Progress | None = None
-) -> Prepared:
-    """A vehicle with the catalogue, ready for `find_missing` on one log after the other."""
-    config = config or LoopConfig()
-    plant = _plant(spec, config)
-    found = hypotheses(spec, reference.params)
-    if config.pose_delay and PARAMETER not in config.held:
-        found += outside_hypotheses(spec, reference.params, reference.space.names)
-    full = with_catalogue(reference.params, found)
-    base = base_values(full)
-    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
-    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
-                         paths)
-    drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
-    wander = estimate(drives, reference, found, full, spec, progress)
-    return Prepared(reference, plant, found, full, tuple(base), paths, wander)
-
-
-def _free(vehicle: Any, config: LoopConfig) -> list[str]:
-    """Parameters of the base model that are fitted: limits that are not there stay away."""
-    names = [name for name in describe(vehicle) if name not in FIXED and name not in config.held]
-    return [name for name, value in zip(names, get_values(vehicle, names), strict=True) if np.isfinite(float(value))]
-
-
-def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
-    return vehicle_plant(spec, VehicleConfig(physics_dt=config.physics_dt))
-
-
 def _check(log: Log, references: Sequence[Log]) -> None:
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
@@ -155,9 +111,3 @@ def _check(log: Log, references: Sequence[Log]) -> None:
                 raise ValueError(f"reference {other.name!r}: {name} is {theirs}, but {mine} in {log.name!r}. A "
                                  "reference must be a drive of the same vehicle; correct dataset.toml or leave it out.")
 
-
-def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
-    """How far the progress bar goes at most, with so many reference days."""
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-    base = 0 if fitted else iterations + max(iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 4 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls

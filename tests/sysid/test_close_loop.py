@@ -29,7 +29,8 @@ from sysid.verdict.falsification import course_of, put_to_test
 from sysid.verdict.found import NullRefits
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.pipeline import expected_steps, find_missing
+from sysid.verdict.pipeline import find_missing
+from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.vehicles import drives_of, refit_poses, refitter_of, vehicle_after, vehicle_before
 from whill_mjx.effects import make_effect

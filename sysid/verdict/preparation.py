@@ -1,0 +1,77 @@
+"""A vehicle ready for verdicts: its reference days, the catalogue, and what effects seem to be on days without them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sysid.errors.space import FIXED
+from sysid.logs.log import Log
+from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_hypotheses, with_catalogue
+from sysid.missing.days import Reference
+from sysid.missing.drives import make_drives, rows_of_call
+from sysid.missing.reference import make_reference
+from sysid.missing.signatures import PARTS
+from sysid.missing.wander import estimate
+from sysid.replay.models import with_effects
+from sysid.replay.records import Plant
+from sysid.replay.rollout import PathReplay, vehicle_plant
+from sysid.search.result import Progress
+from sysid.verdict.result import LoopConfig, Prepared
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
+
+
+def prepare(
+    reference: Reference, spec: VehicleSpec, config: LoopConfig | None = None, progress: Progress | None = None
+) -> Prepared:
+    """A vehicle with the catalogue, ready for `find_missing` on one log after the other."""
+    config = config or LoopConfig()
+    plant = _plant(spec, config)
+    found = hypotheses(spec, reference.params)
+    if config.pose_delay and PARAMETER not in config.held:
+        found += outside_hypotheses(spec, reference.params, reference.space.names)
+    full = with_catalogue(reference.params, found)
+    base = base_values(full)
+    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
+    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
+                         paths)
+    drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
+    wander = estimate(drives, reference, found, full, spec, progress)
+    return Prepared(reference, plant, found, full, tuple(base), paths, wander)
+
+
+def _free(vehicle: Any, config: LoopConfig) -> list[str]:
+    """Parameters of the base model that are fitted: limits that are not there stay away."""
+    names = [name for name in describe(vehicle) if name not in FIXED and name not in config.held]
+    return [name for name, value in zip(names, get_values(vehicle, names), strict=True) if np.isfinite(float(value))]
+
+
+def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
+    return vehicle_plant(spec, VehicleConfig(physics_dt=config.physics_dt))
+
+
+def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
+    """How far the progress bar goes at most, with so many reference days."""
+    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+    base = 0 if fitted else iterations + max(iterations // 2, 3)
+    return base + 6 * days + 2 * PARTS + 4 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
+
+
+def reference_for(
+    log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None, progress: Progress | None = None,
+    start: Any = None,
+) -> Reference:
+    """The vehicle as its reference drives show it; of the log itself where there are none."""
+    known = bool(references) or vehicle is not None
+    start = preset_params(log.spec, config.preset) if start is None else start
+    start = with_effects(start, config.with_effects) if vehicle is None else vehicle
+    free = _free(start, config)
+    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
+    return make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations, free,
+                          progress, vehicle is not None)
