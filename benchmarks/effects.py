@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from whill_mjx import share_results
 from whill_mjx.effects import EFFECTS, equation, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Alike, Axis, Scale
@@ -258,6 +259,7 @@ def draw(path: Path) -> None:
 
 
 if __name__ == "__main__":
+    share_results()
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.effects", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

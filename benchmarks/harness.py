@@ -17,7 +17,9 @@ from typing import Any
 
 import jax
 
-from whill_mjx import __version__
+from whill_mjx import __version__, share_results
+
+share_results()  # every benchmark imports this before JAX starts
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -209,4 +209,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    from whill_mjx import share_results
+
+    share_results()
     main()

@@ -366,6 +366,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the node until its episodes are over, SIGTERM or Ctrl-C."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
+    if options.simulator.startswith("bridge.simulate:"):  # others may abort with it
+        from whill_mjx.processor import share_results
+
+        share_results()
     vehicle = make_vehicle(options)
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)

@@ -9,20 +9,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sysid.replay.model_files import steps_mjx
 from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
-    """`whill_mjx.io.command_line.run` with compiled programs kept for later runs."""
+    """`whill_mjx.io.command_line.run` with compiled programs kept for later runs.
+
+    XLA shares results unless the command steps a user's robot (`--model`), on which it may abort then.
+    """
 
     def cached(chosen: Any) -> None:
         keep_compiled()
         with Heartbeat():  # progress bars tick while something long is computed
             main(chosen)
 
-    command_line.run(options, cached, description, **more)
+    command_line.run(options, cached, description, **more,
+                     shares=lambda chosen: not steps_mjx(getattr(chosen, "model", None)))
 
 
 def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Progress, Callable[[], None]]:

@@ -7,6 +7,9 @@ import jax
 import jaxlib
 import pytest
 
+from whill_mjx import share_results
+
+share_results()
 if jaxlib.__version__.startswith("0.10."):
     # Half the time to compile; later versions of XLA do not know this flag, and end over one that they do not know.
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()

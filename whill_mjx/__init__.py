@@ -8,8 +8,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from whill_mjx.processor import share_results
-
 if TYPE_CHECKING:
     from whill_mjx.batch import make_batch as make_batch
     from whill_mjx.effects import EFFECTS as EFFECTS
@@ -20,6 +18,7 @@ if TYPE_CHECKING:
     from whill_mjx.env import step as step
     from whill_mjx.evaluation.policy_file import load_policy as load_policy
     from whill_mjx.gym import WhillEnv as WhillEnv
+    from whill_mjx.processor import share_results as share_results
     from whill_mjx.tasks.tasks import Corridor as Corridor
     from whill_mjx.tasks.tasks import ObstacleCourse as ObstacleCourse
     from whill_mjx.vehicle.config import VehicleConfig as VehicleConfig
@@ -55,10 +54,9 @@ _HOMES = {
     "make_effect": "whill_mjx.effects",
     "register": "whill_mjx.effects",
     "load_policy": "whill_mjx.evaluation.policy_file",
+    "share_results": "whill_mjx.processor",
 }
 __all__ = list(_HOMES)
-
-share_results()
 
 
 def __getattr__(name: str) -> Any:

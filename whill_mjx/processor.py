@@ -4,6 +4,9 @@ A physics step has some four thousand operations and sixty results. XLA's fusion
 of its own, in which everything that leads to it is computed again: 24,000 operations a step. Its fusion of several
 results into one loop is off by default, and no option of a single `jax.jit` turns it on; with it a step has 2,500.
 
+The option is one of the whole process, and XLA aborts with it on programs of other people: `mjx.step` of two cylinders
+or two boxes on a plane. So no import asks for it. Our commands do before JAX starts, unless they step a user's robot.
+
 What is left are two hundred loops a step, each a task that a scheduler starts: for a few vehicles that takes longer
 than their arithmetic. `as_one_function` has a part of a program compiled as a single function.
 """
@@ -19,14 +22,27 @@ FLAG = "--xla_backend_extra_options"
 
 
 def share_results() -> None:
-    """Ask for it in XLA_FLAGS, unless these name other such options already.
+    """Ask for it in XLA_FLAGS, for this process and those that it starts, unless these flags name such options already.
 
-    XLA reads them when a process compiles its first program: afterwards this changes nothing. Accelerators and versions
-    that do not know the option ignore it.
+    For processes that step our vehicles on a processor. Call it first: XLA reads the flags when a process compiles its
+    first program, and afterwards this changes nothing. Results are the same without it. Accelerators and versions that
+    do not know the option ignore it. XLA aborts with it on some programs of plain MJX.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {FLAG}={OPTION}".strip()
+
+
+def shares_results() -> bool:
+    """Whether XLA_FLAGS ask for it."""
+    return f"{FLAG}={OPTION}" in os.environ.get("XLA_FLAGS", "").split()
+
+
+def keep_results_apart() -> None:
+    """Take back `share_results`, which a process that started this one may have called."""
+    if shares_results():
+        words = os.environ["XLA_FLAGS"].split()
+        os.environ["XLA_FLAGS"] = " ".join(word for word in words if word != f"{FLAG}={OPTION}")
 
 
 def as_one_function(function: Callable[..., Any]) -> Callable[..., Any]:

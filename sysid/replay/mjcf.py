@@ -30,6 +30,7 @@ from flax import struct
 from sysid.replay.mjcf_file import Entry, Robot, default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
 from sysid.replay.rollout import quaternion_product
+from whill_mjx.processor import shares_results
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
 @struct.dataclass
@@ -158,6 +159,9 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
         return Motion(qpos, qvel, jnp.zeros(host.na, float_type), jnp.zeros(host.nv, float_type))
 
     def substep(params: Parameters, state: Motion, command: jax.Array) -> Motion:
+        if shares_results() and _may_abort(host):
+            raise ValueError(f"{robot.path}: XLA aborts on contacts of cylinders, boxes and meshes after "
+                             "whill_mjx.share_results(). Leave this call out where an own robot is stepped.")
         target = sign * wheel_speeds(command[0], command[1])
         if robot.motors:
             target = params.values["drive.kp"] * (target - state.qvel[wheels])
@@ -176,6 +180,13 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
         return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
 
     return place, substep, observe, move
+
+
+def _may_abort(host: mujoco.MjModel) -> bool:
+    """Whether XLA aborts on a model's contacts where it shares results: those of cylinders, boxes and meshes."""
+    kinds = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH
+    touching = (host.geom_contype | host.geom_conaffinity) > 0
+    return bool(np.isin(host.geom_type[touching], [int(kind) for kind in kinds]).any())
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,18 @@ from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.specs import VehicleSpec
 
 SUFFIXES = (".xml", ".mjcf", ".urdf", ".xacro")
+
+
+def steps_mjx(text: str | None) -> bool:
+    """Whether `--model TEXT` steps a user's robot by MJX: a robot file, or a Python file that mentions it."""
+    path = Path(text.partition(".py:")[0] + ".py" if text and ".py:" in text else text or "")
+    if path.suffix != ".py":
+        return path.suffix in SUFFIXES
+    try:
+        source = path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False  # `load_model` says so
+    return re.search(r"mjcf_model|\bmjx\b", source) is not None
 
 
 def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:

@@ -29,6 +29,7 @@ from sysid.replay.models import function_model, make_parameters, model_space, se
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import Scenario, command_table
+from whill_mjx.processor import FLAG, OPTION
 from whill_mjx.vehicle.specs import WHILL_CR
 
 DT = 0.02
@@ -384,6 +385,17 @@ def test_without_xacro_the_error_has_the_command_that_installs_it(tmp_path, monk
     path.write_text(URDF.strip())
     with pytest.raises(ValueError, match="cart.xacro: xacro files need the package xacro.* pip install xacro"):
         load_robot(path)
+
+
+@pytest.mark.quick
+def test_a_robot_of_cylinders_is_not_stepped_where_results_are_shared(tmp_path, monkeypatch):
+    """XLA would end the process."""
+    path = tmp_path / "cart.urdf"
+    path.write_text(URDF)
+    model = mjcf_model(path)
+    monkeypatch.setenv("XLA_FLAGS", f"{FLAG}={OPTION}")
+    with pytest.raises(ValueError, match="cart.urdf: XLA aborts .* Leave this call out"):
+        model.plant.substep(model.params, model.plant.place(model.params, jnp.zeros(5)), jnp.zeros(2))
 
 
 VISUAL = '<geom type="sphere" size="0.14" contype="0" conaffinity="0" group="2" density="0"/>'

@@ -1,5 +1,6 @@
 """Work that results share is done once on a processor: what the package asks of XLA."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -9,12 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.processor import FLAG, OPTION, as_one_function, share_results
+from sysid import command_line as commands
+from whill_mjx.io import command_line
+from whill_mjx.processor import FLAG, OPTION, as_one_function, share_results, shares_results
 
 pytestmark = pytest.mark.quick
 
 PROGRAM = """
 import whill_mjx
+whill_mjx.share_results()
 import jax, jax.numpy as jnp
 
 def results(x, y):
@@ -24,6 +28,46 @@ def results(x, y):
 
 compiled = jax.jit(results).lower(jnp.ones(64), jnp.ones(64)).compile().as_text()
 print("multiplications", compiled.count(" multiply("))
+"""
+
+PLAIN = """
+import os
+before = dict(os.environ)
+import whill_mjx, sysid, dreamer, bridge
+import sysid.fit, whill_mjx.env, whill_mjx.train, bridge.simulate
+assert dict(os.environ) == before
+import jax, mujoco
+from mujoco import mjx
+
+def speed(shape):
+    bodies = "".join(f'<body pos="{x} 0 0.1"><freejoint/><geom type="{shape}" size="0.1 0.1 0.1"/></body>'
+                     for x in (0, 0.5))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="5 5 0.1"/>{bodies}</worldbody></mujoco>')
+    placed = mjx.put_model(model)
+    return abs(jax.jit(mjx.step)(placed, mjx.make_data(placed)).qvel).max()
+
+print("speed", max(speed("cylinder"), speed("box")))
+"""
+
+DRIVE = """
+
+import whill_mjx
+if SHARED:
+    whill_mjx.share_results()
+import jax, jax.numpy as jnp
+from whill_mjx.vehicle.dynamics import place, substep
+from whill_mjx.vehicle.model import build_model
+
+spec, params = whill_mjx.preset("whill_cr")
+model = build_model(spec)
+
+@jax.jit
+def driven(command):
+    state = place(model, params, 0.0, 0.0, 0.0)
+    return jax.lax.scan(lambda state, _: (substep(model, params, state, command), None), state, length=200)[0].qpos
+
+print("distance", driven(jnp.array([0.5, 0.3]))[0])
 """
 
 
@@ -62,6 +106,46 @@ def test_twenty_results_of_one_chain_do_not_compute_it_twenty_times():
 
 def test_without_the_option_they_do():
     assert run(f"{FLAG}=xla_another_option") > 10 * 60
+
+
+def test_importing_the_packages_changes_nothing_for_plain_mjx_programs():
+    """Two cylinders and two boxes on a plane: XLA aborts on either with the option."""
+    assert printed(PLAIN, "") < 1.0
+
+
+def test_the_vehicle_drives_the_same_way_with_and_without_the_option():
+    one, other = (printed(f"SHARED = {shared}" + DRIVE, "") for shared in (True, False))
+    assert one == pytest.approx(other, rel=1e-4) and one > 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Of a command that may step another model."""
+
+    model: str = ""
+
+
+@pytest.mark.parametrize("flags", ["", f"{FLAG}={OPTION}", "--xla_cpu_max_isa=AVX2"])
+@pytest.mark.parametrize(("model", "shared"), [
+    ("", True), ("robot.urdf", False), ("a/robot.xml", False), ("robot.urdf.xacro", False), ("plain.py", True),
+    ("wrapped.py", False), ("wrapped.py:cart", False)])
+def test_commands_share_results_unless_they_step_a_users_robot(monkeypatch, tmp_path, model, shared, flags):
+    (tmp_path / "plain.py").write_text("import whill_mjx\nmodel = function_model(...)\n")
+    (tmp_path / "wrapped.py").write_text("from sysid import mjcf_model\nmodel = mjcf_model('robot.xml')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    seen = []
+    commands.run(Options, lambda chosen: seen.append(shares_results()), "A command.",
+                 args=["--model", model] if model else [])
+    assert seen == [shared]
+    assert ("--xla_cpu_max_isa=AVX2" in os.environ["XLA_FLAGS"]) == ("AVX2" in flags)
+
+
+def test_commands_of_the_simulator_share_results(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    seen = []
+    command_line.run(Options, lambda chosen: seen.append(shares_results()), "A command.", args=[])
+    assert seen == [True]
 
 
 def test_options_that_were_given_are_kept(monkeypatch):

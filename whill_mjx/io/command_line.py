@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
+from whill_mjx.processor import keep_results_apart, share_results
+
 GRACE_S = 1.2
 """Time from a signal to the end of the process, whatever it computes meanwhile."""
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -128,7 +130,7 @@ def check_options(options: Any, prefix: str = "") -> None:
 
 def run(
     options: type, main: Callable[[Any], Any], description: str | None, *, stopped: str = STOPPED,
-    positional: bool = True, args: list[str] | None = None,
+    positional: bool = True, args: list[str] | None = None, shares: Callable[[Any], bool] = lambda chosen: True,
 ) -> None:  # fmt: skip
     """Read `options` from the command line, check them and call `main`; what goes wrong ends with one line.
 
@@ -139,12 +141,14 @@ def run(
         stopped: the line after a signal, which says how to go on.
         positional: options without a default are given without their names.
         args: words instead of those of the command line.
+        shares: whether a command with these options may use `share_results`; JAX must not have started before.
     """
     listen()
     _State.working, _State.stopped = True, stopped
     try:
         chosen = _parsed(options, description, positional, args)
         check_options(chosen)
+        (share_results if shares(chosen) else keep_results_apart)()
         main(chosen)
         sys.stdout.flush()
     except KeyboardInterrupt:
