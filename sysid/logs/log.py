@@ -225,8 +225,11 @@ def make_trial(
 
 
 def manoeuvre_of(trial_name: str) -> str:
-    """Name without its replicate number: circle_2 -> circle."""
-    return re.sub(r"_\d+$", "", trial_name)
+    """Name without its replicate number, the number of a drive within a recording, or a recorder's date: circle_2,
+    circle_2-03 and circle_2024_05_31-10_20_30 -> circle."""
+    recording = re.sub(r"(?<=\w)-\d{2,3}$", "", trial_name)
+    undated = re.sub(r"(?<=\w)_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d(_\d+)?$", "", recording)
+    return re.sub(r"_\d+$", "", recording) if undated == recording else undated
 
 
 def standstill_end(command: Command) -> float:
