@@ -157,7 +157,7 @@ def load_log(folder: str | Path) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder. Give the folder that holds dataset.toml and trials/.")
-    fields = _read_fields(folder / "dataset.toml")
+    fields = read_fields(folder / "dataset.toml")
     spec, notes = spec_from_fields(folder / "dataset.toml", fields)
     held_out = fields.get("held_out", [])
     trial_folders = sorted(path for path in (folder / "trials").glob("*") if path.is_dir())
@@ -289,7 +289,8 @@ def hash_files(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _read_fields(path: Path) -> dict[str, Any]:
+def read_fields(path: Path) -> dict[str, Any]:
+    """Checked fields of a dataset.toml."""
     content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
                               "see docs/log_format.md.", "Strings need quotes, decimals a point.")
     schema = next(field for field in tables.DATASET if field.name == "schema")

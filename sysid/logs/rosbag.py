@@ -94,7 +94,7 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stream = names[connection.topic]
                 rows[stream].append((received * 1e-9, header_time(message), read_message(
-                    path, connection.topic, stream, short_type(connection.msgtype), message)))
+                    stream, short_type(connection.msgtype), message)))
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
             raise
@@ -104,9 +104,15 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
     streams = {}
     for stream, topic in chosen.items():
         table = np.array([values for _, _, values in rows[stream]], float).reshape(-1, len(COLUMNS[stream]))
+        unset = np.isinf(table).any(axis=1)
         finite = np.isfinite(table).all(axis=1)
-        if not finite.all():
-            notes.append(f"{topic}: {(~finite).sum()} messages with numbers that are not finite are left out")
+        if unset.all() and len(unset):
+            raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
+                             f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
+        if unset.any():
+            notes.append(f"{topic}: {unset.sum()} messages with an orientation that is all zero are left out")
+        if not (finite | unset).all():
+            notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
         received, stamped = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
         if len(received) < 2:
             raise ValueError(f"{path}: topic {topic} has {len(received)} usable messages; at least 2 are needed. Name "
@@ -151,8 +157,14 @@ def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], note
     return chosen
 
 
-def read_message(path: Path, topic: str, stream: str, kind: str, message: Any) -> tuple[float, ...]:
-    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw."""
+def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw; all of them nan where a number is not
+    finite, and infinite where the orientation was never set."""
+    row = _columns(stream, kind, message)
+    return row if np.isfinite(row).all() or np.isinf(row).all() else (float("nan"),) * len(row)
+
+
+def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
     if stream == "command":
         twist = message.twist if kind == "TwistStamped" else message
         return float(twist.linear.x), float(twist.angular.z)
@@ -160,8 +172,7 @@ def read_message(path: Path, topic: str, stream: str, kind: str, message: Any) -
     position = getattr(pose, "position", None) or pose.translation
     q = getattr(pose, "orientation", None) or pose.rotation
     if abs(q.w) + abs(q.x) + abs(q.y) + abs(q.z) < 1e-6:
-        raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a topic "
-                         "with an orientation, or leave this one out.")
+        return (float("inf"),) * len(COLUMNS[stream])
     planar = float(position.x), float(position.y), yaw_of(q.w, q.x, q.y, q.z)
     if stream == "ground_truth":
         return planar

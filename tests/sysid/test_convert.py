@@ -319,3 +319,52 @@ def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
     log, _ = convert(ConvertConfig(bag, folder))
     assert [trial.name for trial in log.trials] == ["figure_1", "straight_1"]
     assert log.spec.name == "WHILL Model CR"
+
+
+def test_messages_before_the_first_orientation_are_left_out_and_counted(tmp_path):
+    def edit(rows):
+        first = next(k for k, row in enumerate(rows) if row[1] == ODOMETRY)
+        blank = odometry(T0, 0.0, 0.0, 0.0, 0.0, 0.0, scale=0.0)
+        return [*rows[:first], (*rows[first][:3], blank), *rows[first + 1:]]
+
+    write_bag(tmp_path / "bag", edit=edit)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert "/whill/odom: 1 messages with an orientation that is all zero are left out" in notes[0]
+    assert len(log.trials[0].odometry.t) >= 415
+
+
+def test_one_bag_that_cannot_be_used_does_not_keep_the_others_out(bag, tmp_path):
+    source = tmp_path / "bags"
+    shutil.copytree(bag, source / "figure_1")
+    write_bag(source / "parked_1", edit=drop(COMMAND))
+    (source / "torn_1.mcap").write_bytes(b"no bag")
+    log, notes = convert(ConvertConfig(source, tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["figure_1"]
+    left_out = [note for note in notes if note.startswith("left out: ")]
+    assert len(left_out) == 2 and "no command topic" in left_out[0] and "torn_1.mcap" in left_out[1]
+
+
+def too_far(rows):
+    return [(t, topic, kind, odometry(T0 + t, 1e3 * t, 0.0, 0.0, 0.0, 0.0) if topic == ODOMETRY else one)
+            for t, topic, kind, one in rows]
+
+
+def test_a_refused_trial_is_not_written_and_a_second_call_works(bag, tmp_path):
+    write_bag(tmp_path / "bags" / "far_1", edit=too_far)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"log/trials/far_1/odometry.csv: x spans .*Nothing was written"):
+            convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+        assert not (tmp_path / "log").exists() and not list(tmp_path.glob(".*partial*"))
+    shutil.copytree(bag, tmp_path / "bags" / "figure_1")
+    with pytest.raises(ValueError, match="far_1 is held out, but .* spans"):
+        convert(ConvertConfig(tmp_path / "bags", tmp_path / "log", held_out=("far_1",)))
+    log, notes = convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["figure_1"]
+    assert any("left out" in note and "far_1" in note for note in notes)
+
+
+def test_fields_that_the_loader_refuses_are_never_written(bag, tmp_path):
+    with pytest.raises(ValueError, match="wheel_radius"):
+        convert(ConvertConfig(bag, tmp_path / "log", wheel_radius=-0.1))
+    assert not (tmp_path / "log").exists()
+    convert(ConvertConfig(bag, tmp_path / "log"))
