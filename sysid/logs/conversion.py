@@ -133,7 +133,7 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         if dropped:
             notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
         tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
-    stem = re.sub(r"[^\w.-]+", "_", path.stem if path.is_file() else path.name)
+    stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
     if config.split == "bag":
         spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),
                   min(table[-1, 0] for name, table in tables.items() if name != "command"))]
@@ -145,6 +145,14 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
         drives.append(cut(name, tables, span, config.truth_ahead, bag))
     return drives, notes
+
+
+def _recording_name(path: Path) -> str:
+    """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
+    if not path.is_file():
+        return path.name
+    alone = path.stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
+    return path.absolute().parent.name if alone else path.stem
 
 
 def cut(

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.sources import about
 from whill_mjx import fields as tables
 from whill_mjx.reading import read_csv as read_table
 from whill_mjx.reading import read_toml
@@ -155,8 +156,8 @@ def load_log(folder: str | Path) -> Log:
         FileNotFoundError, ValueError: naming the file, the value, the rule and the remedy.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder. Give the folder that holds dataset.toml and trials/.")
+    if not (folder / "dataset.toml").exists() and not (folder / "trials").is_dir():
+        raise (ValueError if folder.exists() else FileNotFoundError)(f"{folder}: {about(folder)}")
     fields = read_fields(folder / "dataset.toml")
     spec, notes = spec_from_fields(folder / "dataset.toml", fields)
     held_out = fields.get("held_out", [])

@@ -14,9 +14,11 @@ from rosbags.typesys import Stores, get_typestore
 
 import sysid.convert as convert_module
 from sysid.logs.conversion import ConvertConfig, convert
+from sysid.logs.inspection import load_whole
 from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_trial
-from sysid.logs.measured import load_drive
+from sysid.logs.measured import load_any, load_drive
 from sysid.logs.rosbag import yaw_of
+from sysid.logs.sources import refuse_recording
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -368,3 +370,62 @@ def test_fields_that_the_loader_refuses_are_never_written(bag, tmp_path):
         convert(ConvertConfig(bag, tmp_path / "log", wheel_radius=-0.1))
     assert not (tmp_path / "log").exists()
     convert(ConvertConfig(bag, tmp_path / "log"))
+
+
+def test_a_bag_whose_recorder_was_killed_is_read_by_the_name_of_its_folder(bag, tmp_path):
+    (file,) = bag.glob("*.db3")
+    (tmp_path / "circle_1").mkdir()
+    shutil.copy(file, tmp_path / "circle_1" / "circle_1_0.db3")
+    log, _ = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1"]
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / "packed_0.db3.zstd").write_bytes(b"(")
+    with pytest.raises(ValueError, match=r"metadata.yaml is missing.*packed_0.db3.zstd is .* \(zstd -d\)"):
+        convert(ConvertConfig(tmp_path / "packed", tmp_path / "log"))
+
+
+TUM = "# timestamp tx ty tz qx qy qz qw\n" + "1.0 0.1 0.2 0 0 0 0 1\n" * 3
+
+
+@pytest.fixture
+def given(bag, tmp_path):
+    """Files and folders that people have, by name."""
+    (tmp_path / "bags").mkdir()
+    shutil.copytree(bag, tmp_path / "bags" / "figure_1")
+    (file,) = bag.glob("*.db3")
+    shutil.copy(file, tmp_path / "drive.db3")
+    (tmp_path / "poses.txt").write_text(TUM)
+    (tmp_path / "wheels.csv").write_text("\ufefftime,left,right\n1,2,3\n")
+    (tmp_path / "texts").mkdir()
+    (tmp_path / "texts" / "poses.txt").write_text(TUM)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    (tmp_path / "run" / "series.npz").write_bytes(b"")
+    convert(ConvertConfig(bag, tmp_path / "log"))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("bags", r"a folder of ROS bags \(figure_1\). Convert it first: python -m sysid.convert"),
+    ("bags/figure_1", "a ROS bag. Convert it first: python -m sysid.convert"),
+    ("drive.db3", "a ROS bag. Convert it first: python -m sysid.convert"),
+    ("poses.txt", "a trajectory in TUM form .* ground_truth.csv"),
+    ("texts", "a folder of text files, not a dataset. poses.txt is a trajectory in TUM form"),
+    ("wheels.csv", "a text file with the columns time, left, right. A trial is a folder"),
+    ("run", "the folder of a fit. Give the folder of the dataset"),
+    ("log/trials/figure_1", "one trial, not a dataset. Give the folder that holds dataset.toml"),
+    ("log/dataset.toml", "a file of a dataset. Give its folder"),
+    ("log/trials/figure_1/command.csv", "one file of a trial. Give the folder of the dataset"),
+    ("nowhere", "no such folder or file"),
+])
+def test_a_command_given_something_else_than_a_dataset_says_what_it_is_and_what_to_do(given, name, said):
+    for load in (load_any, load_whole, load_log):
+        with pytest.raises((ValueError, FileNotFoundError), match=f"{name}: {said}"):
+            load(given / name)
+
+
+@pytest.mark.parametrize("name", ["bags", "drive.db3", "poses.txt", "wheels.csv", "log", "log/trials/figure_1"])
+def test_a_command_that_takes_a_vehicle_refuses_drives_by_saying_what_they_are(given, name):
+    with pytest.raises(ValueError, match=f"{name}: .*Needed here: a vehicle file"):
+        refuse_recording(given / name, "a vehicle file.")
+    refuse_recording(given / "run", "a vehicle file.")
