@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import Bag, find_bags, read_bag, stream_times
+from sysid.logs.rosbag import Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
@@ -121,10 +121,10 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
 def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str]]:
     """Trials of one bag, and notes."""
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
-    bag = read_bag(path, {name: topic for name, topic in asked.items() if topic is not None})
+    bag = in_order(read_bag(path, {name: topic for name, topic in asked.items() if topic is not None}), config.stamp)
     times = stream_times(bag, config.stamp)
     notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
-                           for name, stream in bag.streams.items())]
+                           for name, stream in bag.streams.items()), *clock_notes(bag, config.stamp)]
     if config.stamp == "header" and not np.isfinite(bag.streams["command"].stamped).all():
         notes.append("commands have no header: their time is that of receipt, the other streams' that of their header")
     tables = {}

@@ -11,6 +11,7 @@ from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.streams import speeds, standstill
+from sysid.logs.time_faults import time_faults
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
@@ -126,6 +127,7 @@ def sanity(log: Log) -> list[str]:
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
+    found += time_faults(trials)
     gone = lost(log)
     if gone:
         found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "
@@ -151,8 +153,8 @@ def _length(trial: Trial, channel: str) -> float:
     stream = trial.ground_truth if channel == "ground_truth" else trial.odometry
     if stream is None or stream.x is None or stream.y is None:
         return float("nan")
-    every = max(round(0.5 / max(float(np.median(np.diff(stream.t))), 1e-3)), 1) if len(stream.t) > 1 else 1
-    return float(np.hypot(np.diff(stream.x[::every]), np.diff(stream.y[::every])).sum())
+    places = np.searchsorted(stream.t, np.arange(stream.t[0], stream.t[-1], 0.5))  # rows half a second apart
+    return float(np.hypot(np.diff(stream.x[places]), np.diff(stream.y[places])).sum())
 
 
 def _length_told(trial: Trial) -> float:

@@ -8,12 +8,13 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sysid.logs.bag_clocks import find_bursts, find_step
 from whill_mjx.reading import LONGEST_REASON
 
 TOPICS = {
@@ -235,3 +236,48 @@ def stream_times(bag: Bag, stamp: str) -> dict[str, np.ndarray]:
                 raise ValueError(f"{bag.path}: topic {bag.streams[name].topic}: header stamps are {seconds:.3g} s from "
                                  "the time of receipt: another clock. Use --stamp receive.")
     return times
+
+
+def in_order(bag: Bag, stamp: str) -> Bag:
+    """The bag with its messages in the order in which they were sent, where the recorder's clock was set meanwhile."""
+    streams = dict(bag.streams)
+    for name, stream in streams.items():
+        step = find_step(stream.received, stream.stamped) if stamp == "header" and _has_stamps(stream) else None
+        if step is not None and step.clock == "receive":
+            order = np.argsort(stream.stamped, kind="stable")
+            streams[name] = replace(stream, received=stream.received[order], stamped=stream.stamped[order],
+                                    values=stream.values[order])
+    return replace(bag, streams=streams)
+
+
+def clock_notes(bag: Bag, stamp: str) -> list[str]:
+    """Notes on clocks that disagree without harm to the times that are used.
+
+    Raises:
+        ValueError: a clock that is used was set in the middle of the recording.
+    """
+    notes = []
+    all_stamped = all(_has_stamps(stream) for stream in bag.streams.values())
+    for name, stream in bag.streams.items():
+        if not _has_stamps(stream):
+            continue
+        if step := find_step(stream.received, stream.stamped):
+            way = f"{'back' if step.seconds < 0 else 'forward'} by {abs(step.seconds):.3g} s"
+            whose = "the recorder's clock" if step.clock == "receive" else f"the header's clock of {stream.topic}"
+            other = f"the header stamps of {stream.topic}" if step.clock == "receive" else "the times of receipt"
+            said = f"{whose} was set {way}, {step.after:.1f} s into the recording, as {other} show"
+            if step.clock == stamp or step.clock == "receive" and not all_stamped:
+                better = "receive" if step.clock == "header" else "header" if all_stamped else None
+                mixed = "commands and measurements of two moments are mixed" if step.seconds < 0 else (
+                    "the drive seems to pause there")
+                raise ValueError(f"{bag.path}: {said}: {mixed}. " + (
+                    f"Use --stamp {better}." if better else "Cut the bag there, or record again without setting it."))
+            notes.append(f"{said}; --stamp {stamp} does not depend on it")
+        elif stamp == "receive" and (spread := find_bursts(stream.received, stream.stamped)):
+            notes.append(f"{name}: messages of {stream.topic} came in bursts: their times of receipt vary by "
+                         f"{spread:.2g} s, while their header stamps are regular. Convert again with --stamp header")
+    return notes
+
+
+def _has_stamps(stream: BagStream) -> bool:
+    return bool(np.isfinite(stream.stamped).all() and (stream.stamped > 0).all())

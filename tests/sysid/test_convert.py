@@ -429,3 +429,66 @@ def test_a_command_that_takes_a_vehicle_refuses_drives_by_saying_what_they_are(g
     with pytest.raises(ValueError, match=f"{name}: .*Needed here: a vehicle file"):
         refuse_recording(given / name, "a vehicle file.")
     refuse_recording(given / "run", "a vehicle file.")
+
+
+def receive_at(clock, topics=(COMMAND, ODOMETRY, TRUTH)):
+    """Rows received when a clock says: messages of some topics at other times than they were."""
+    def edit(rows):
+        return sorted([(float(clock(row[0])) if row[1] in topics else row[0], *row[1:]) for row in rows],
+                      key=lambda row: row[0])
+    return edit
+
+
+def restamped(clock):
+    """Rows whose odometry has header stamps of another clock."""
+    def edit(rows):
+        def again(t, content):
+            moved = T0 + float(clock(t - 0.03))
+            return replace(content, header=header(moved))
+        return [(t, topic, kind, again(t, one) if topic == ODOMETRY else one) for t, topic, kind, one in rows]
+    return edit
+
+
+def set_at(t, seconds, when=10.0):
+    return t + seconds * (t > when)
+
+
+@pytest.mark.parametrize("seconds", [-2.03, -0.5, 3.0])
+def test_a_recorder_whose_clock_was_set_in_the_drive_is_refused(tmp_path, seconds):
+    write_bag(tmp_path / "bag", edit=receive_at(lambda t: set_at(t, seconds)))
+    way = f"set {'back' if seconds < 0 else 'forward'} by {abs(seconds):.3g} s, (9.9|10).* s into the recording"
+    for stamp in ("receive", "header"):
+        with pytest.raises(ValueError, match=f"recorder's clock was {way}.*Cut the bag there"):
+            convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp=stamp))
+    write_bag(tmp_path / "stamped", stamped=True, edit=receive_at(lambda t: set_at(t, seconds)))
+    with pytest.raises(ValueError, match="Use --stamp header"):
+        convert(ConvertConfig(tmp_path / "stamped", tmp_path / "log"))
+    log, notes = convert(ConvertConfig(tmp_path / "stamped", tmp_path / "log", stamp="header"))
+    assert any("recorder's clock was set" in note for note in notes)
+    np.testing.assert_allclose(log.trials[0].odometry.v, motion(log.trials[0].odometry.t + 0.02)[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("seconds", [-0.45, 3.0])
+def test_header_stamps_of_a_clock_that_was_set_are_not_used(tmp_path, seconds):
+    write_bag(tmp_path / "bag", edit=restamped(lambda t: set_at(t, seconds)))
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert any(f"the header's clock of {ODOMETRY} was set" in note for note in notes)
+    with pytest.raises(ValueError, match="header's clock of /whill/odom was set .* Use --stamp receive"):
+        convert(ConvertConfig(tmp_path / "bag", tmp_path / "again", stamp="header"))
+
+
+def test_receipt_in_bursts_is_named_and_header_stamps_undo_it(tmp_path):
+    write_bag(tmp_path / "bag", edit=receive_at(lambda t: 0.5 * np.ceil(t / 0.5) + 1e-3 * (t % 0.5), (ODOMETRY,)))
+    _, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "a"))
+    assert any("/whill/odom came in bursts" in note and "--stamp header" in note for note in notes)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "b", stamp="header"))
+    assert not any("bursts" in note for note in notes)
+    assert np.diff(log.trials[0].odometry.t).max() == pytest.approx(0.05, abs=1e-3)
+
+
+@pytest.mark.parametrize("clock", [lambda t: t, lambda t: t + 0.02 * np.sin(7 * t), lambda t: 1.0001 * t + 5.0,
+                                   lambda t: t + 2.0 * np.clip(1 - (t - 6) / 2, 0, 1) * (t > 6)])
+def test_clocks_that_only_differ_and_receipt_after_an_outage_are_no_set_clock(tmp_path, clock):
+    write_bag(tmp_path / "bag", edit=receive_at(clock))
+    _, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert not any("was set" in note for note in notes)

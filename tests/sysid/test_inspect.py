@@ -154,6 +154,28 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
 
 
+def test_rows_in_bursts_are_named_and_do_not_shorten_the_path():
+    good = trial_of(smooth_command())
+    late = 0.5 * np.ceil(good.odometry.t / 0.5) + 1e-3 * (good.odometry.t % 0.5)
+    found = sanity(log_of(replace(good, odometry=replace(good.odometry, t=late))))
+    assert len(found) == 1 and "odometry: its rows come in bursts" in found[0] and "--stamp header" in found[0]
+
+
+def test_a_clock_that_was_set_forward_in_the_drive_is_told_from_rows_that_were_lost():
+    good = trial_of(smooth_command())
+
+    def ahead(stream):
+        return replace(stream, t=stream.t + 2.0 * (stream.t > 8))
+
+    jumped = replace(good, command=ahead(good.command), odometry=ahead(good.odometry),
+                     ground_truth=ahead(good.ground_truth))
+    (found,) = sanity(log_of(jumped))
+    assert "t jumps ahead by 2" in found and "clock was set forward" in found
+    kept = (good.odometry.t < 8) | (good.odometry.t > 10)
+    lost = {name: getattr(good.odometry, name)[kept] for name in ("t", "x", "y", "yaw", "v", "omega")}
+    assert sanity(log_of(replace(good, odometry=OdometryStream(**lost)))) == []
+
+
 def causes(log):
     return {one.cause for one in blind_spots(log, {trial.name: excitation(trial) for trial in log.trials})}
 
