@@ -49,6 +49,8 @@ class ConvertConfig:
     """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
     truth_ahead: float = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
+    truth_turned: float = 0.0
+    """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
@@ -133,6 +135,8 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         if dropped:
             notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
         tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
+    if "ground_truth" in tables:
+        tables["ground_truth"][:, 3] -= np.deg2rad(config.truth_turned)
     stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
     if config.split == "bag":
         spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),

@@ -492,3 +492,10 @@ def test_clocks_that_only_differ_and_receipt_after_an_outage_are_no_set_clock(tm
     write_bag(tmp_path / "bag", edit=receive_at(clock))
     _, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
     assert not any("was set" in note for note in notes)
+
+
+def test_a_tracked_body_that_was_turned_is_turned_back(bag, tmp_path):
+    plain, _ = convert(ConvertConfig(bag, tmp_path / "a"))
+    log, _ = convert(ConvertConfig(bag, tmp_path / "b", truth_turned=10.0))
+    turn = log.trials[0].ground_truth.yaw - plain.trials[0].ground_truth.yaw
+    np.testing.assert_allclose(turn, np.deg2rad(-10.0), atol=1e-5)
