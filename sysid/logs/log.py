@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.sources import about
 from whill_mjx import fields as tables
 from whill_mjx.reading import read_csv as read_table
 from whill_mjx.reading import read_toml
@@ -160,8 +159,9 @@ def load_log(folder: str | Path) -> Log:
         FileNotFoundError, ValueError: naming the file, the value, the rule and the remedy.
     """
     folder = Path(folder)
-    if not (folder / "dataset.toml").exists() and not (folder / "trials").is_dir():
-        raise (ValueError if folder.exists() else FileNotFoundError)(f"{folder}: {about(folder)}")
+    if not folder.is_dir():
+        what = "a file" if folder.exists() else "no such folder"
+        raise FileNotFoundError(f"{folder}: {what}. Give the folder that holds dataset.toml and trials/.")
     fields = read_fields(folder / "dataset.toml")
     spec, notes = spec_from_fields(folder / "dataset.toml", fields)
     held_out = fields.get("held_out", [])

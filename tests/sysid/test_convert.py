@@ -419,7 +419,7 @@ def given(bag, tmp_path):
     ("nowhere", "no such folder or file"),
 ])
 def test_a_command_given_something_else_than_a_dataset_says_what_it_is_and_what_to_do(given, name, said):
-    for load in (load_any, load_whole, load_log):
+    for load in (load_any, load_whole):
         with pytest.raises((ValueError, FileNotFoundError), match=f"{name}: {said}"):
             load(given / name)
 
