@@ -25,7 +25,7 @@ def refuse_recording(path: str | Path, needed: str) -> None:
     path = Path(path)
     if path.exists() and (is_bag(path) or find_bags(path) or path.suffix in (".csv", ".txt", ".tum", *PACKED)
                           or (path / "trials").is_dir() or (path / "command.csv").exists()):
-        raise ValueError(f"{path}: {about(path)} Needed here: {needed}")
+        raise ValueError(f"{path}: {about(path).removesuffix('.')}. Needed here: {needed}")
 
 
 def _about_folder(path: Path) -> str:
