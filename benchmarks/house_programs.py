@@ -70,17 +70,17 @@ def drives() -> tuple[Any, Any]:
     """The shipped log and a plant of its vehicle."""
     import sysid
 
-    load_log = found("load_log", "sysid.logs.log", "sysid.logs.log")
-    vehicle_plant = found("vehicle_plant", "sysid.replay.rollout", "sysid.replay.rollout")
+    load_log = found("load_log", "sysid.logs.log", "sysid.log")
+    vehicle_plant = found("vehicle_plant", "sysid.replay.rollout", "sysid.rollout")
     log = load_log(Path(str(sysid.__file__)).parent / "data" / "chair")
     return log, vehicle_plant(log.spec)
 
 
 def replay() -> tuple[Any, tuple]:
     """A replay of two drives with one parameter set, and its argument."""
-    make_batch = found("make_batch", "sysid.replay.rollout", "sysid.replay.rollout")
-    simulate = found("simulate", "sysid.replay.rollout", "sysid.replay.rollout")
-    preset_params = found("preset_params", "whill_mjx.vehicle.presets", "whill_mjx.vehicle.presets")
+    make_batch = found("make_batch", "sysid.replay.rollout", "sysid.rollout")
+    simulate = found("simulate", "sysid.replay.rollout", "sysid.rollout")
+    preset_params = found("preset_params", "whill_mjx.vehicle.presets", "whill_mjx.presets")
     log, plant = drives()
     made = make_batch(log.training[:2], plant.dt)
     batch = made[0] if isinstance(made, tuple) else made
@@ -162,7 +162,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from whill_mjx import share_results
-
-    share_results()
+    found("share_results", "whill_mjx.processor")()
     main()

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sysid import command_line
+from sysid.logs.sources import refuse_recording
 from sysid.verdict.pipeline import watched
 from sysid.verdict.result import LoopConfig
 
@@ -65,6 +66,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         if references:
             raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
                              "them.")
+        refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")
         _, vehicle, _ = load_vehicle(arguments.vehicle)
     config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                         without=arguments.without, refit_nulls=arguments.refit_nulls)

@@ -20,6 +20,7 @@ from sysid import command_line
 from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import DEFAULT, Criterion, propose
 from sysid.logs.manoeuvre_library import Limits
+from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.vehicle.specs import VehicleSpec
 
@@ -85,6 +86,7 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
     """Spec, parameters, known intervals and noise of a built-in vehicle, a vehicle file, or the folder of a fit."""
     from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
+    refuse_recording(name, "a built-in vehicle, a vehicle file, or the folder of a fit.")
     if not Path(name).is_dir():
         spec, params, _ = load_vehicle(name)
         return spec, params, load_intervals(name) if name.endswith(".toml") else {}, DEFAULT

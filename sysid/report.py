@@ -29,6 +29,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from sysid.logs.sources import refuse_recording
 from sysid.pages.report import write_html
 
 
@@ -41,6 +42,7 @@ def cli() -> None:
     parser.add_argument("run", type=Path, help="folder that sysid.fit wrote")
     run = parser.parse_args().run
     try:
+        refuse_recording(run, "the folder that sysid.fit wrote.")
         print(f"wrote {write_html(run)}")
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")

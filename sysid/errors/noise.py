@@ -12,12 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.logs.log import Trial
+from sysid.logs.replicates import same_course
 from sysid.replay.arrays import added, namespace
 
 ORDER = 4  # bins of memory of the filter
 RIDGE = 2e-3  # of the regression, as a share of its data
 USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
 """Noise of the features where there are no replicates [m/s, rad/s]."""
+BIN_SHIFT = 0.05  # s that the commands of two drives may be apart while their bins still correspond
 FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
 
 
@@ -100,24 +102,9 @@ def fit_roughness(series: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np
 
 
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[int]]:
-    """Indices of trials that were given the same commands, in order of first appearance."""
-    groups: list[list[int]] = []
-    for i, trial in enumerate(trials):
-        for group in groups:
-            if same_commands(trials[group[0]], trial):
-                group.append(i)
-                break
-        else:
-            groups.append([i])
-    return groups
-
-
-def same_commands(a: Trial, b: Trial) -> bool:
-    """Whether two trials are replicates."""
-    if a.manoeuvre != b.manoeuvre or len(a.command.t) != len(b.command.t):
-        return False
-    return all(np.allclose(getattr(a.command, name), getattr(b.command, name), atol=1e-6)
-               for name in ("t", "v", "omega"))
+    """Indices of trials that were given the same commands at the same time, so that their bins correspond, in order of
+    first appearance."""
+    return same_course(trials, BIN_SHIFT)
 
 
 def repeated(trials: Sequence[Trial]) -> bool:

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.logs.log import Log, PoseStream, Start, Trial, load_log
+from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import Bag, find_bags, read_bag, stream_times
+from sysid.logs.rosbag import Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
@@ -49,6 +49,8 @@ class ConvertConfig:
     """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
     truth_ahead: float = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
+    truth_turned: float = 0.0
+    """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
@@ -84,13 +86,21 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a folder of bags or a measured set.")
     bags = find_bags(config.source)
     notes: list[str] = []
+    refused: list[ValueError] = []
     if bags:
         spec = _spec(config)
         drives = []
         for path in bags:
-            found, more = bag_drives(path, config)
+            try:
+                found, more = bag_drives(path, config)
+            except ValueError as error:
+                refused.append(error)
+                notes.append(f"left out: {error}")
+                continue
             drives += found
             notes += [f"{path.name}: {note}" for note in more]
+        if len(refused) == len(bags):
+            raise refused[0]
     else:
         from sysid.logs.inspection import load_whole
 
@@ -106,17 +116,17 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    write_dataset(config.out, spec, drives, config.held_out)
+    notes += write_dataset(config.out, spec, drives, config.held_out)
     return load_log(config.out), notes
 
 
 def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str]]:
     """Trials of one bag, and notes."""
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
-    bag = read_bag(path, {name: topic for name, topic in asked.items() if topic is not None})
+    bag = in_order(read_bag(path, {name: topic for name, topic in asked.items() if topic is not None}), config.stamp)
     times = stream_times(bag, config.stamp)
     notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
-                           for name, stream in bag.streams.items())]
+                           for name, stream in bag.streams.items()), *clock_notes(bag, config.stamp)]
     if config.stamp == "header" and not np.isfinite(bag.streams["command"].stamped).all():
         notes.append("commands have no header: their time is that of receipt, the other streams' that of their header")
     tables = {}
@@ -125,7 +135,9 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         if dropped:
             notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
         tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
-    stem = re.sub(r"[^\w.-]+", "_", path.stem if path.is_file() else path.name)
+    if "ground_truth" in tables:
+        tables["ground_truth"][:, 3] -= np.deg2rad(config.truth_turned)
+    stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
     if config.split == "bag":
         spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),
                   min(table[-1, 0] for name, table in tables.items() if name != "command"))]
@@ -137,6 +149,14 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
         drives.append(cut(name, tables, span, config.truth_ahead, bag))
     return drives, notes
+
+
+def _recording_name(path: Path) -> str:
+    """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
+    if not path.is_file():
+        return path.name
+    alone = path.stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
+    return path.absolute().parent.name if alone else path.stem
 
 
 def cut(
@@ -228,11 +248,14 @@ def trial_drive(trial: Trial) -> Drive:
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
 
 
-def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = ()) -> None:
-    """Write trials into a dataset folder, all or none; an existing dataset keeps its fields and trials.
+def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = ()) -> list[str]:
+    """Write the trials that the loader accepts into a dataset folder; an existing dataset keeps its fields and trials.
+
+    Returns:
+        Notes on the trials that were left out.
 
     Raises:
-        ValueError: a trial exists already, or two have one name.
+        ValueError: a trial exists already, two have one name, or none is accepted. Nothing was written then.
     """
     names = [drive.name for drive in drives]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -242,23 +265,47 @@ def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held
         if (folder / "trials" / name).exists():
             raise ValueError(f"{folder / 'trials' / name}: exists already; a conversion never replaces a trial. Choose "
                              "another --out, or remove the trial.")
+    known = (folder / "dataset.toml").exists()
+    if known and held_out:
+        raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
+                         "trials to its held_out by hand.")
+    if known and any((folder / "trials").glob("*")):
+        load_log(folder)  # trials are not added to what cannot be loaded
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
-        for drive in drives:
-            for stream in HEADERS:
-                table = getattr(drive, stream)
-                if table is not None:
-                    write_csv(partial / "trials" / drive.name / f"{stream}.csv", HEADERS[stream], table)
+        accepted, refused = _write_accepted(partial, drives)
+        notes = [f"left out: {str(error).replace(str(partial), str(folder))}" for error in refused.values()]
+        missing = sorted(set(held_out) & set(refused))
+        if not accepted or missing:
+            reason = notes[0] if not missing else f"{missing[0]} is held out, but it is {notes[0]}"
+            raise ValueError(f"{reason.removeprefix('left out: ')} Nothing was written.")
+        if not known:
+            write_fields(partial, spec, held_out)
+            spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
         (folder / "trials").mkdir(parents=True, exist_ok=True)
-        if not (folder / "dataset.toml").exists():
-            write_fields(folder, spec, held_out)
-        elif held_out:
-            raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
-                             "trials to its held_out by hand.")
-        for name in names:
+        if not known:
+            os.replace(partial / "dataset.toml", folder / "dataset.toml")
+        for name in accepted:
             os.replace(partial / "trials" / name, folder / "trials" / name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+    return notes
+
+
+def _write_accepted(folder: Path, drives: Sequence[Drive]) -> tuple[list[str], dict[str, ValueError]]:
+    """Write trials; returns the names of those that load again, and what is said of the others."""
+    accepted, refused = [], {}
+    for drive in drives:
+        for stream in HEADERS:
+            table = getattr(drive, stream)
+            if table is not None:
+                write_csv(folder / "trials" / drive.name / f"{stream}.csv", HEADERS[stream], table)
+        try:
+            load_trial(folder / "trials" / drive.name)
+            accepted.append(drive.name)
+        except ValueError as error:
+            refused[drive.name] = error
+    return accepted, refused
 
 
 def _spec(config: ConvertConfig) -> VehicleSpec:

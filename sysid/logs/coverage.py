@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.logs.contradictions import contradictions
 from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.streams import speeds, standstill
+from sysid.logs.time_faults import time_faults
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
+FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
 SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
 
 
@@ -108,17 +111,23 @@ def sanity(log: Log) -> list[str]:
     """Signs that a column has another unit, sign or origin than it should, as sentences."""
     trials, skid = log.trials, log.spec.drive == "skid"
     found = []
+    contradicted = contradictions(trials)
     for channel in CHANNELS:
+        found += contradicted[channel]
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
-            gains = [gain for trial in trials if (gain := _gain(trial, channel, index)) is not None]
-            if not gains:
+            gains = [found_gain for trial in trials if (found_gain := _gain(trial, channel, index)) is not None]
+            if not gains or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
-            gain = float(np.median(gains))
+            gain, follows = (float(value) for value in np.median(gains, axis=0))
             where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(gains)} trials)"
-            if gain < 0:
+            odd = not (0.1 if skid and name == "omega" else 0.4) < gain < 2.0  # a skid drive scrubs most of its turn
+            if odd and abs(follows) < FOLLOWS:
+                found.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
+                             "frame; such a log shows neither its sign nor its unit.")
+            elif gain < 0:
                 found.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
-            elif not (0.1 if skid and name == "omega" else 0.4) < gain < 2.0:  # a skid drive scrubs most of its turn
+            elif odd:
                 found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
@@ -126,7 +135,8 @@ def sanity(log: Log) -> list[str]:
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
-    gone = lost(log)
+    found += time_faults(trials)
+    gone = () if contradicted["ground_truth"] else lost(log)
     if gone:
         found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "
                      f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
@@ -134,8 +144,8 @@ def sanity(log: Log) -> list[str]:
     return found
 
 
-def _gain(trial: Trial, channel: str, index: int) -> float | None:
-    """Regression of the measured speed (1) or yaw rate (2) on the command, where that varies."""
+def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
+    """Regression of the measured speed (1) or yaw rate (2) on the command, where that varies, and their correlation."""
     rates = speeds(trial, channel)
     if rates is None:
         return None
@@ -144,15 +154,17 @@ def _gain(trial: Trial, channel: str, index: int) -> float | None:
     if commanded.std() < 0.05:
         return None
     centred = commanded - commanded.mean()
-    return float(centred @ rates[index] / (centred @ centred))
+    measured = rates[index] - rates[index].mean()
+    norm = np.sqrt((centred @ centred) * (measured @ measured))
+    return float(centred @ measured / (centred @ centred)), float(centred @ measured / norm) if norm > 1e-12 else 0.0
 
 
 def _length(trial: Trial, channel: str) -> float:
     stream = trial.ground_truth if channel == "ground_truth" else trial.odometry
     if stream is None or stream.x is None or stream.y is None:
         return float("nan")
-    every = max(round(0.5 / max(float(np.median(np.diff(stream.t))), 1e-3)), 1) if len(stream.t) > 1 else 1
-    return float(np.hypot(np.diff(stream.x[::every]), np.diff(stream.y[::every])).sum())
+    places = np.searchsorted(stream.t, np.arange(stream.t[0], stream.t[-1], 0.5))  # rows half a second apart
+    return float(np.hypot(np.diff(stream.x[places]), np.diff(stream.y[places])).sum())
 
 
 def _length_told(trial: Trial) -> float:

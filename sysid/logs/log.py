@@ -25,6 +25,10 @@ STANDSTILL = 1.0
 """Longest part of a trial's start that is used to find its start pose [s]."""
 START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
 
+SLOWEST = 4.0  # s between rows that no log has in all of its streams
+LEAST_ROWS = 10  # of a stream to be asked for its rate
+TIME_UNITS = (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3))
+
 COMMAND_COLUMNS = ("t", "v", "omega")
 ODOMETRY_COLUMNS = ("t", "x", "y", "yaw", "v", "omega")
 POSE_COLUMNS = ("t", "x", "y", "yaw")
@@ -156,8 +160,9 @@ def load_log(folder: str | Path) -> Log:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder. Give the folder that holds dataset.toml and trials/.")
-    fields = _read_fields(folder / "dataset.toml")
+        what = "a file" if folder.exists() else "no such folder"
+        raise FileNotFoundError(f"{folder}: {what}. Give the folder that holds dataset.toml and trials/.")
+    fields = read_fields(folder / "dataset.toml")
     spec, notes = spec_from_fields(folder / "dataset.toml", fields)
     held_out = fields.get("held_out", [])
     trial_folders = sorted(path for path in (folder / "trials").glob("*") if path.is_dir())
@@ -184,6 +189,7 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
         ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
     if odometry is None and ground_truth is None:
         raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them.")
+    _check_seconds(folder, [one.t for one in (command, odometry, ground_truth) if one is not None])
     for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
         if stream is not None:
             _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
@@ -225,8 +231,11 @@ def make_trial(
 
 
 def manoeuvre_of(trial_name: str) -> str:
-    """Name without its replicate number: circle_2 -> circle."""
-    return re.sub(r"_\d+$", "", trial_name)
+    """Name without its replicate number, the number of a drive within a recording, or a recorder's date: circle_2,
+    circle_2-03 and circle_2024_05_31-10_20_30 -> circle."""
+    recording = re.sub(r"(?<=\w)-\d{2,3}$", "", trial_name)
+    undated = re.sub(r"(?<=\w)_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d(_\d+)?$", "", recording)
+    return re.sub(r"_\d+$", "", recording) if undated == recording else undated
 
 
 def standstill_end(command: Command) -> float:
@@ -286,12 +295,27 @@ def hash_files(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _read_fields(path: Path) -> dict[str, Any]:
+def read_fields(path: Path) -> dict[str, Any]:
+    """Checked fields of a dataset.toml."""
     content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
                               "see docs/log_format.md.", "Strings need quotes, decimals a point.")
     schema = next(field for field in tables.DATASET if field.name == "schema")
     tables.check(str(path), schema, content.get("schema"))  # before the fields, which follow from it
     return tables.check_table(str(path), tables.DATASET, content)
+
+
+def _check_seconds(folder: Path, times: list[np.ndarray]) -> None:
+    """Rows must not be as far apart as no recording's are: this finds milliseconds and smaller units.
+
+    Args:
+        times: of each stream (T,).
+    """
+    steps = [float(np.median(np.diff(t))) for t in times if len(t) >= LEAST_ROWS]
+    if steps and min(steps) > SLOWEST:
+        step = min(steps)
+        unit, size = next((one for one in TIME_UNITS if step > 1.5e-3 * one[1]), TIME_UNITS[-1])
+        raise ValueError(f"{folder}: t steps by {step:g} from row to row, a rate of {1 / step:.2g} Hz if that were "
+                         f"seconds: it seems to be in {unit}. Divide t by {size:.0f}.")
 
 
 def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Command) -> None:

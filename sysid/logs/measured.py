@@ -21,6 +21,7 @@ import numpy as np
 
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
+from sysid.logs.sources import about
 from sysid.logs.streams import without_held
 from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
@@ -49,15 +50,14 @@ def detect_format(path: str | Path) -> str:
     """"dataset", "drive_norlab" or "mrclam", by the files in the folder; ValueError when it is none of them."""
     path = Path(path)
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder. Give the folder of a dataset.")
+        raise (ValueError if path.exists() else FileNotFoundError)(f"{path}: {about(path)}")
     if (path / "dataset.toml").exists() or (path / "trials").exists():
         return "dataset"
     if any(path.glob("MRCLAM_*_Odometry.dat.gz")):
         return "mrclam"
-    if any(path.glob("*.npz")):
+    if any(path.glob("*.npz")) and not (path / "report.json").exists():  # a fit keeps its series so
         return "drive_norlab"
-    raise ValueError(f"{path}: no dataset.toml, no *.npz and no MRCLAM_*_Odometry.dat.gz in it. Name the folder that "
-                     "holds one of them; the formats are in docs/log_format.md.")
+    raise ValueError(f"{path}: {about(path)}")
 
 
 def drive_spec(run: str) -> VehicleSpec:

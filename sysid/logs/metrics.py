@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, command_in_force, manoeuvre_of
+from sysid.logs.replicates import same_course, shifts
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,10 @@ def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:
 
 
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
-    """Trials that are true replicates: of one manoeuvre with equal commands, two at least."""
-    groups: dict[tuple[str, bytes, bytes], list[Trial]] = {}
-    for trial in trials:
-        if trial.name == trial.manoeuvre or manoeuvre_of(trial.name) != trial.manoeuvre:
-            continue  # not a numbered repetition
-        key = (trial.manoeuvre, trial.command.v.tobytes(), trial.command.omega.tobytes())
-        groups.setdefault(key, []).append(trial)
-    return [group for group in groups.values() if len(group) > 1]
+    """Trials that are true replicates: of one manoeuvre with the same commands at the same times after its first
+    motion, two at least."""
+    numbered = [trial for trial in trials if trial.name != trial.manoeuvre == manoeuvre_of(trial.name)]
+    return [[numbered[i] for i in group] for group in same_course(numbered) if len(group) > 1]
 
 
 def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
@@ -125,7 +122,8 @@ def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
             streams = [_relative(trial, channel) for trial in group]
             if any(stream is None for stream in streams):
                 continue
-            known = [stream for stream in streams if stream is not None]
+            known = [(stream[0] - shift, stream[1]) for stream, shift in zip(streams, shifts(group), strict=True)
+                     if stream is not None]
             begin, end = max(t[0] for t, _ in known), min(t[-1] for t, _ in known)
             t = known[0][0][(known[0][0] >= begin) & (known[0][0] <= end)]
             values = np.stack([np.stack([np.interp(t, time, column) for column in table.T], axis=-1)

@@ -8,12 +8,13 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sysid.logs.bag_clocks import find_bursts, find_step
 from whill_mjx.io.reading import LONGEST_REASON
 
 TOPICS = {
@@ -94,7 +95,7 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stream = names[connection.topic]
                 rows[stream].append((received * 1e-9, header_time(message), read_message(
-                    path, connection.topic, stream, short_type(connection.msgtype), message)))
+                    stream, short_type(connection.msgtype), message)))
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
             raise
@@ -104,9 +105,15 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
     streams = {}
     for stream, topic in chosen.items():
         table = np.array([values for _, _, values in rows[stream]], float).reshape(-1, len(COLUMNS[stream]))
+        unset = np.isinf(table).any(axis=1)
         finite = np.isfinite(table).all(axis=1)
-        if not finite.all():
-            notes.append(f"{topic}: {(~finite).sum()} messages with numbers that are not finite are left out")
+        if unset.all() and len(unset):
+            raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
+                             f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
+        if unset.any():
+            notes.append(f"{topic}: {unset.sum()} messages with an orientation that is all zero are left out")
+        if not (finite | unset).all():
+            notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
         received, stamped = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
         if len(received) < 2:
             raise ValueError(f"{path}: topic {topic} has {len(received)} usable messages; at least 2 are needed. Name "
@@ -151,8 +158,14 @@ def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], note
     return chosen
 
 
-def read_message(path: Path, topic: str, stream: str, kind: str, message: Any) -> tuple[float, ...]:
-    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw."""
+def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw; all of them nan where a number is not
+    finite, and infinite where the orientation was never set."""
+    row = _columns(stream, kind, message)
+    return row if np.isfinite(row).all() or np.isinf(row).all() else (float("nan"),) * len(row)
+
+
+def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
     if stream == "command":
         twist = message.twist if kind == "TwistStamped" else message
         return float(twist.linear.x), float(twist.angular.z)
@@ -160,8 +173,7 @@ def read_message(path: Path, topic: str, stream: str, kind: str, message: Any) -
     position = getattr(pose, "position", None) or pose.translation
     q = getattr(pose, "orientation", None) or pose.rotation
     if abs(q.w) + abs(q.x) + abs(q.y) + abs(q.z) < 1e-6:
-        raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a topic "
-                         "with an orientation, or leave this one out.")
+        return (float("inf"),) * len(COLUMNS[stream])
     planar = float(position.x), float(position.y), yaw_of(q.w, q.x, q.y, q.z)
     if stream == "ground_truth":
         return planar
@@ -224,3 +236,48 @@ def stream_times(bag: Bag, stamp: str) -> dict[str, np.ndarray]:
                 raise ValueError(f"{bag.path}: topic {bag.streams[name].topic}: header stamps are {seconds:.3g} s from "
                                  "the time of receipt: another clock. Use --stamp receive.")
     return times
+
+
+def in_order(bag: Bag, stamp: str) -> Bag:
+    """The bag with its messages in the order in which they were sent, where the recorder's clock was set meanwhile."""
+    streams = dict(bag.streams)
+    for name, stream in streams.items():
+        step = find_step(stream.received, stream.stamped) if stamp == "header" and _has_stamps(stream) else None
+        if step is not None and step.clock == "receive":
+            order = np.argsort(stream.stamped, kind="stable")
+            streams[name] = replace(stream, received=stream.received[order], stamped=stream.stamped[order],
+                                    values=stream.values[order])
+    return replace(bag, streams=streams)
+
+
+def clock_notes(bag: Bag, stamp: str) -> list[str]:
+    """Notes on clocks that disagree without harm to the times that are used.
+
+    Raises:
+        ValueError: a clock that is used was set in the middle of the recording.
+    """
+    notes = []
+    all_stamped = all(_has_stamps(stream) for stream in bag.streams.values())
+    for name, stream in bag.streams.items():
+        if not _has_stamps(stream):
+            continue
+        if step := find_step(stream.received, stream.stamped):
+            way = f"{'back' if step.seconds < 0 else 'forward'} by {abs(step.seconds):.3g} s"
+            whose = "the recorder's clock" if step.clock == "receive" else f"the header's clock of {stream.topic}"
+            other = f"the header stamps of {stream.topic}" if step.clock == "receive" else "the times of receipt"
+            said = f"{whose} was set {way}, {step.after:.1f} s into the recording, as {other} show"
+            if step.clock == stamp or step.clock == "receive" and not all_stamped:
+                better = "receive" if step.clock == "header" else "header" if all_stamped else None
+                mixed = "commands and measurements of two moments are mixed" if step.seconds < 0 else (
+                    "the drive seems to pause there")
+                raise ValueError(f"{bag.path}: {said}: {mixed}. " + (
+                    f"Use --stamp {better}." if better else "Cut the bag there, or record again without setting it."))
+            notes.append(f"{said}; --stamp {stamp} does not depend on it")
+        elif stamp == "receive" and (spread := find_bursts(stream.received, stream.stamped)):
+            notes.append(f"{name}: messages of {stream.topic} came in bursts: their times of receipt vary by "
+                         f"{spread:.2g} s, while their header stamps are regular. Convert again with --stamp header")
+    return notes
+
+
+def _has_stamps(stream: BagStream) -> bool:
+    return bool(np.isfinite(stream.stamped).all() and (stream.stamped > 0).all())

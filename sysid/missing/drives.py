@@ -11,8 +11,9 @@ import jax
 import numpy as np
 
 from sysid.errors.features import Features, bin_width, make_features
-from sysid.errors.noise import roughness
+from sysid.errors.noise import BIN_SHIFT, roughness
 from sysid.logs.log import Trial
+from sysid.logs.replicates import same_course
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
@@ -66,6 +67,16 @@ class Drives:
     def mask(self) -> np.ndarray:
         """(B, K, 5) weights of the bins, 0 where nothing was measured."""
         return self.features.mask if self.weight is None else self.weight
+
+    @property
+    def repeats(self) -> np.ndarray:
+        """(B,) number of the drive that each trial repeats: as `courses`, and trials from rest whose commands are the
+        same functions of time but were not recorded at the same instants, which each need a replay of their own."""
+        numbers = self.courses.of_trial.copy()
+        for group in same_course(self.trials, BIN_SHIFT):
+            rest = [i for i in group if self.trials[i].start.v == self.trials[i].start.omega == 0.0]
+            numbers[rest] = numbers[rest].min(initial=len(numbers))
+        return numbers
 
     def weighted(self, simulated: np.ndarray, factors: np.ndarray, track: float) -> Drives:
         """The same drives with rough bins, as `simulated` (B, K, 5) shows them, weighted by noise `factors` (4, 5)."""

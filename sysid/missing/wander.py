@@ -53,7 +53,8 @@ def estimate(
     usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number],
                        reference.width)
              / float((day == number).sum()) for number in range(count)]
-    apart = [scatter(left[day == number], drives.courses.of_trial[day == number]) for number in range(count)]
+    repeats = drives.repeats
+    apart = [scatter(left[day == number], repeats[day == number]) for number in range(count)]
     apart = [one for one in apart if np.isfinite(one)]
     estimates = [coordinates(evidence, np.flatnonzero(day == number)) for number in range(count)]
     return replace(_pooled(evidence.columns, estimates), excess=_spread(np.array(excess)),

@@ -84,7 +84,7 @@ def search(
         tried = set() if calm else {one.hypothesis.effect for one in found.accepted}
         pair_round(found, evidence, hypotheses, refitter, wander, similar, thresholds, explained, tried)
         report("refits of pairs")
-    _decide(found, thresholds, wander, excess, anything, refitter.drives.courses.of_trial,
+    _decide(found, thresholds, wander, excess, anything, refitter.drives.repeats,
             lambda fit: _most_apart(fit, evidence.groups, refitter.precision))
     return found
 

@@ -14,9 +14,11 @@ from rosbags.typesys import Stores, get_typestore
 
 import sysid.convert as convert_module
 from sysid.logs.conversion import ConvertConfig, convert
+from sysid.logs.inspection import load_whole
 from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_trial
-from sysid.logs.measured import load_drive
+from sysid.logs.measured import load_any, load_drive
 from sysid.logs.rosbag import yaw_of
+from sysid.logs.sources import refuse_recording
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -319,3 +321,181 @@ def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
     log, _ = convert(ConvertConfig(bag, folder))
     assert [trial.name for trial in log.trials] == ["figure_1", "straight_1"]
     assert log.spec.name == "WHILL Model CR"
+
+
+def test_messages_before_the_first_orientation_are_left_out_and_counted(tmp_path):
+    def edit(rows):
+        first = next(k for k, row in enumerate(rows) if row[1] == ODOMETRY)
+        blank = odometry(T0, 0.0, 0.0, 0.0, 0.0, 0.0, scale=0.0)
+        return [*rows[:first], (*rows[first][:3], blank), *rows[first + 1:]]
+
+    write_bag(tmp_path / "bag", edit=edit)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert "/whill/odom: 1 messages with an orientation that is all zero are left out" in notes[0]
+    assert len(log.trials[0].odometry.t) >= 415
+
+
+def test_one_bag_that_cannot_be_used_does_not_keep_the_others_out(bag, tmp_path):
+    source = tmp_path / "bags"
+    shutil.copytree(bag, source / "figure_1")
+    write_bag(source / "parked_1", edit=drop(COMMAND))
+    (source / "torn_1.mcap").write_bytes(b"no bag")
+    log, notes = convert(ConvertConfig(source, tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["figure_1"]
+    left_out = [note for note in notes if note.startswith("left out: ")]
+    assert len(left_out) == 2 and "no command topic" in left_out[0] and "torn_1.mcap" in left_out[1]
+
+
+def too_far(rows):
+    return [(t, topic, kind, odometry(T0 + t, 1e3 * t, 0.0, 0.0, 0.0, 0.0) if topic == ODOMETRY else one)
+            for t, topic, kind, one in rows]
+
+
+def test_a_refused_trial_is_not_written_and_a_second_call_works(bag, tmp_path):
+    write_bag(tmp_path / "bags" / "far_1", edit=too_far)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"log/trials/far_1/odometry.csv: x spans .*Nothing was written"):
+            convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+        assert not (tmp_path / "log").exists() and not list(tmp_path.glob(".*partial*"))
+    shutil.copytree(bag, tmp_path / "bags" / "figure_1")
+    with pytest.raises(ValueError, match="far_1 is held out, but .* spans"):
+        convert(ConvertConfig(tmp_path / "bags", tmp_path / "log", held_out=("far_1",)))
+    log, notes = convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["figure_1"]
+    assert any("left out" in note and "far_1" in note for note in notes)
+
+
+def test_fields_that_the_loader_refuses_are_never_written(bag, tmp_path):
+    with pytest.raises(ValueError, match="wheel_radius"):
+        convert(ConvertConfig(bag, tmp_path / "log", wheel_radius=-0.1))
+    assert not (tmp_path / "log").exists()
+    convert(ConvertConfig(bag, tmp_path / "log"))
+
+
+def test_a_bag_whose_recorder_was_killed_is_read_by_the_name_of_its_folder(bag, tmp_path):
+    (file,) = bag.glob("*.db3")
+    (tmp_path / "circle_1").mkdir()
+    shutil.copy(file, tmp_path / "circle_1" / "circle_1_0.db3")
+    log, _ = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1"]
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / "packed_0.db3.zstd").write_bytes(b"(")
+    with pytest.raises(ValueError, match=r"metadata.yaml is missing.*packed_0.db3.zstd is .* \(zstd -d\)"):
+        convert(ConvertConfig(tmp_path / "packed", tmp_path / "log"))
+
+
+TUM = "# timestamp tx ty tz qx qy qz qw\n" + "1.0 0.1 0.2 0 0 0 0 1\n" * 3
+
+
+@pytest.fixture
+def given(bag, tmp_path):
+    """Files and folders that people have, by name."""
+    (tmp_path / "bags").mkdir()
+    shutil.copytree(bag, tmp_path / "bags" / "figure_1")
+    (file,) = bag.glob("*.db3")
+    shutil.copy(file, tmp_path / "drive.db3")
+    (tmp_path / "poses.txt").write_text(TUM)
+    (tmp_path / "wheels.csv").write_text("\ufefftime,left,right\n1,2,3\n")
+    (tmp_path / "texts").mkdir()
+    (tmp_path / "texts" / "poses.txt").write_text(TUM)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    (tmp_path / "run" / "series.npz").write_bytes(b"")
+    convert(ConvertConfig(bag, tmp_path / "log"))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("bags", r"a folder of ROS bags \(figure_1\). Convert it first: python -m sysid.convert"),
+    ("bags/figure_1", "a ROS bag. Convert it first: python -m sysid.convert"),
+    ("drive.db3", "a ROS bag. Convert it first: python -m sysid.convert"),
+    ("poses.txt", "a trajectory in TUM form .* ground_truth.csv"),
+    ("texts", "a folder of text files, not a dataset. poses.txt is a trajectory in TUM form"),
+    ("wheels.csv", "a text file with the columns time, left, right. A trial is a folder"),
+    ("run", "the folder of a fit. Give the folder of the dataset"),
+    ("log/trials/figure_1", "one trial, not a dataset. Give the folder that holds dataset.toml"),
+    ("log/dataset.toml", "a file of a dataset. Give its folder"),
+    ("log/trials/figure_1/command.csv", "one file of a trial. Give the folder of the dataset"),
+    ("nowhere", "no such folder or file"),
+])
+def test_a_command_given_something_else_than_a_dataset_says_what_it_is_and_what_to_do(given, name, said):
+    for load in (load_any, load_whole):
+        with pytest.raises((ValueError, FileNotFoundError), match=f"{name}: {said}"):
+            load(given / name)
+
+
+@pytest.mark.parametrize("name", ["bags", "drive.db3", "poses.txt", "wheels.csv", "log", "log/trials/figure_1"])
+def test_a_command_that_takes_a_vehicle_refuses_drives_by_saying_what_they_are(given, name):
+    with pytest.raises(ValueError, match=f"{name}: .*Needed here: a vehicle file"):
+        refuse_recording(given / name, "a vehicle file.")
+    refuse_recording(given / "run", "a vehicle file.")
+
+
+def receive_at(clock, topics=(COMMAND, ODOMETRY, TRUTH)):
+    """Rows received when a clock says: messages of some topics at other times than they were."""
+    def edit(rows):
+        return sorted([(float(clock(row[0])) if row[1] in topics else row[0], *row[1:]) for row in rows],
+                      key=lambda row: row[0])
+    return edit
+
+
+def restamped(clock):
+    """Rows whose odometry has header stamps of another clock."""
+    def edit(rows):
+        def again(t, content):
+            moved = T0 + float(clock(t - 0.03))
+            return replace(content, header=header(moved))
+        return [(t, topic, kind, again(t, one) if topic == ODOMETRY else one) for t, topic, kind, one in rows]
+    return edit
+
+
+def set_at(t, seconds, when=10.0):
+    return t + seconds * (t > when)
+
+
+@pytest.mark.parametrize("seconds", [-2.03, -0.5, 3.0])
+def test_a_recorder_whose_clock_was_set_in_the_drive_is_refused(tmp_path, seconds):
+    write_bag(tmp_path / "bag", edit=receive_at(lambda t: set_at(t, seconds)))
+    way = f"set {'back' if seconds < 0 else 'forward'} by {abs(seconds):.3g} s, (9.9|10).* s into the recording"
+    for stamp in ("receive", "header"):
+        with pytest.raises(ValueError, match=f"recorder's clock was {way}.*Cut the bag there"):
+            convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp=stamp))
+    write_bag(tmp_path / "stamped", stamped=True, edit=receive_at(lambda t: set_at(t, seconds)))
+    with pytest.raises(ValueError, match="Use --stamp header"):
+        convert(ConvertConfig(tmp_path / "stamped", tmp_path / "log"))
+    log, notes = convert(ConvertConfig(tmp_path / "stamped", tmp_path / "log", stamp="header"))
+    assert any("recorder's clock was set" in note for note in notes)
+    np.testing.assert_allclose(log.trials[0].odometry.v, motion(log.trials[0].odometry.t + 0.02)[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("seconds", [-0.45, 3.0])
+def test_header_stamps_of_a_clock_that_was_set_are_not_used(tmp_path, seconds):
+    write_bag(tmp_path / "bag", edit=restamped(lambda t: set_at(t, seconds)))
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert any(f"the header's clock of {ODOMETRY} was set" in note for note in notes)
+    with pytest.raises(ValueError, match="header's clock of /whill/odom was set .* Use --stamp receive"):
+        convert(ConvertConfig(tmp_path / "bag", tmp_path / "again", stamp="header"))
+
+
+def test_receipt_in_bursts_is_named_and_header_stamps_undo_it(tmp_path):
+    write_bag(tmp_path / "bag", edit=receive_at(lambda t: 0.5 * np.ceil(t / 0.5) + 1e-3 * (t % 0.5), (ODOMETRY,)))
+    _, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "a"))
+    assert any("/whill/odom came in bursts" in note and "--stamp header" in note for note in notes)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "b", stamp="header"))
+    assert not any("bursts" in note for note in notes)
+    assert np.diff(log.trials[0].odometry.t).max() == pytest.approx(0.05, abs=1e-3)
+
+
+@pytest.mark.parametrize("clock", [lambda t: t, lambda t: t + 0.02 * np.sin(7 * t), lambda t: 1.0001 * t + 5.0,
+                                   lambda t: t + 2.0 * np.clip(1 - (t - 6) / 2, 0, 1) * (t > 6)])
+def test_clocks_that_only_differ_and_receipt_after_an_outage_are_no_set_clock(tmp_path, clock):
+    write_bag(tmp_path / "bag", edit=receive_at(clock))
+    _, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    assert not any("was set" in note for note in notes)
+
+
+def test_a_tracked_body_that_was_turned_is_turned_back(bag, tmp_path):
+    plain, _ = convert(ConvertConfig(bag, tmp_path / "a"))
+    log, _ = convert(ConvertConfig(bag, tmp_path / "b", truth_turned=10.0))
+    turn = log.trials[0].ground_truth.yaw - plain.trials[0].ground_truth.yaw
+    np.testing.assert_allclose(turn, np.deg2rad(-10.0), atol=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,6 +153,78 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
                                                      y=1e3 * good.ground_truth.y))
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
+
+
+def lively(seconds=20.0):
+    """Speeds that turn through many headings."""
+    t = np.arange(0.0, seconds, 0.01)
+    return Command(t, 0.4 * np.sin(1.1 * t) + 0.2 * (t > 1), 0.8 * np.sin(0.5 * t + 0.4) * (t > 1))
+
+
+def turned(pose, degrees):
+    return replace(pose, yaw=pose.yaw + np.deg2rad(degrees))
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda pose: turned(pose, 10), "the outside pose moves 10 deg to the right of its own heading.*--truth-turned 10"),
+    (lambda pose: turned(pose, -90), "the outside pose moves 90 deg to the left of its own heading"),
+    (lambda pose: replace(pose, y=-pose.y), "the frame is left-handed"),
+    (lambda pose: replace(pose, x=pose.y, y=pose.x), "the frame is left-handed"),
+    (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes 5.0 s later .* another clock"),
+])
+def test_an_outside_pose_that_contradicts_the_odometry_is_named_and_no_sign_is_said_to_be_reversed(change, said):
+    good = trial_of(lively())
+    assert sanity(log_of(good)) == []
+    (found,) = sanity(log_of(replace(good, ground_truth=change(good.ground_truth))))
+    assert re.search(said, found)
+
+
+def reset_at_9_s(o):
+    later = o.t > 9
+    k = int(np.argmax(later))
+    return replace(o, x=o.x - o.x[k] * later, y=o.y - o.y[k] * later, yaw=o.yaw - o.yaw[k] * later)
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (reset_at_9_s, "at 9.[01] s.* its pose jumps by .* it was reset there"),
+    (lambda o: replace(o, v=o.v * np.cos(o.yaw)), "the twist is in the frame odom"),
+    (lambda o: replace(o, v=0 * o.v), "its speeds v are all zero though its pose moves"),
+    (lambda o: replace(o, x=-o.y, y=o.x), "its pose moves 90 deg to the left of its own heading"),
+])
+def test_odometry_whose_pose_and_speeds_contradict_each_other_is_named(change, said):
+    good = trial_of(lively())
+    found = sanity(log_of(replace(good, odometry=change(good.odometry))))
+    assert re.search(said, found[0]) and not any("sign is reversed" in one for one in found)
+
+
+def test_a_tracked_point_beside_the_axle_is_no_turned_axis():
+    good = trial_of(lively())
+    pose = good.ground_truth
+    cos, sin = np.cos(pose.yaw), np.sin(pose.yaw)
+    beside = replace(pose, x=pose.x + 0.2 * cos - 0.15 * sin, y=pose.y + 0.2 * sin + 0.15 * cos)
+    assert sanity(log_of(replace(good, ground_truth=beside))) == []
+
+
+def test_rows_in_bursts_are_named_and_do_not_shorten_the_path():
+    good = trial_of(smooth_command())
+    late = 0.5 * np.ceil(good.odometry.t / 0.5) + 1e-3 * (good.odometry.t % 0.5)
+    found = sanity(log_of(replace(good, odometry=replace(good.odometry, t=late))))
+    assert len(found) == 1 and "odometry: its rows come in bursts" in found[0] and "--stamp header" in found[0]
+
+
+def test_a_clock_that_was_set_forward_in_the_drive_is_told_from_rows_that_were_lost():
+    good = trial_of(smooth_command())
+
+    def ahead(stream):
+        return replace(stream, t=stream.t + 2.0 * (stream.t > 8))
+
+    jumped = replace(good, command=ahead(good.command), odometry=ahead(good.odometry),
+                     ground_truth=ahead(good.ground_truth))
+    (found,) = sanity(log_of(jumped))
+    assert "t jumps ahead by 2" in found and "clock was set forward" in found
+    kept = (good.odometry.t < 8) | (good.odometry.t > 10)
+    lost = {name: getattr(good.odometry, name)[kept] for name in ("t", "x", "y", "yaw", "v", "omega")}
+    assert sanity(log_of(replace(good, odometry=OdometryStream(**lost)))) == []
 
 
 def causes(log):

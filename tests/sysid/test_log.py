@@ -240,3 +240,16 @@ def test_the_hash_tells_changed_data(dataset):
     before = load_log(dataset).sha256
     replace_in(dataset / "trials" / "straight_1" / "command.csv", "2.9,0.5,0", "2.9,0.4,0")
     assert load_log(dataset).sha256 != before
+
+
+@pytest.mark.parametrize(("unit", "factor", "said"), [
+    ("milliseconds", 1e3, "seems to be in milliseconds. Divide t by 1000"),
+    ("microseconds", 1e6, "seems to be in microseconds. Divide t by 1000000"),
+    ("nanoseconds", 1e9, "seconds")])
+def test_times_in_another_unit_than_seconds_are_named_at_once(dataset, unit, factor, said):
+    for file in (dataset / "trials" / "straight_1").glob("*.csv"):
+        header, *rows = file.read_text().splitlines()
+        table = np.array([row.split(",") for row in rows], float)
+        write_csv(file, header, np.column_stack([factor * table[:, 0], table[:, 1:]]))
+    with pytest.raises(ValueError, match=f"straight_1.*{said}"):
+        load_log(dataset)

@@ -80,8 +80,7 @@ class Linear:
     def __init__(self, evidence):
         self.evidence, self.precision = evidence, evidence.precision
         self.reference = SimpleNamespace(u=np.zeros(1), spread=SPREAD)
-        self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), courses=SimpleNamespace(
-            of_trial=np.arange(len(evidence.residual))))
+        self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), repeats=np.arange(len(evidence.residual)))
 
     def fit(self, chosen, _):
         columns = self.evidence.design[..., [0, *(1 + EFFECTS.index(one) for one in chosen)]]

@@ -166,7 +166,7 @@ def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left
     monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
     monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
     monkeypatch.setattr(search_module, "_decide", lambda *_: None)
-    drives = SimpleNamespace(mask=np.ones(1), courses=SimpleNamespace(of_trial=np.zeros(1, int)))
+    drives = SimpleNamespace(mask=np.ones(1), repeats=np.zeros(1, int))
     refitter = SimpleNamespace(fit=lambda *_: base_fit(10.0), drives=drives,
                                reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
     search_module.search(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), None)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
+from sysid.errors.noise import replicate_groups as groups_of_bins
+from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, manoeuvre_of
 from sysid.logs.metrics import ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
 from sysid.pages.report import summaries
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
@@ -21,7 +22,7 @@ def pose(t, x, y, yaw):
 
 def trial_of(truth, command=None, name="circle_1", start=None, odometry=None):
     command = command or Command(np.array([0.0]), np.array([0.0]), np.array([0.0]))
-    return Trial(name, name.rsplit("_", 1)[0], command, odometry, truth, start or Start())
+    return Trial(name, manoeuvre_of(name), command, odometry, truth, start or Start())
 
 
 def test_trajectory_error_is_the_rms_distance_and_yaw_its_own_number():
@@ -126,3 +127,50 @@ def test_the_figure_eight_turns_as_far_to_the_left_as_to_the_right():
     assert rmse(np.array([3.0, 4.0])) == pytest.approx(np.sqrt(12.5))
     with pytest.raises(ValueError, match="unknown manoeuvre"):
         Command(*command_table("spiral").T)
+
+
+def recorded(name, begin=0.0, period=0.1, jitter=0.0, seed=0, lost=0.0, slower=1.0, size=1.0, late=0.0):
+    """A recording that began `begin` seconds before a drive of steps, forward and turning, given at some period."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, begin + 14.0 * slower, period)
+    t = t + jitter * random.uniform(size=len(t))
+    t = t[random.uniform(size=len(t)) >= lost]
+    step = np.floor((t - begin) / slower).astype(int)
+    levels = np.random.default_rng(7).choice([-0.6, -0.3, 0.2, 0.5], size=(2, 12)) * size
+    going = (step >= 0) & (step < 12)
+    v, omega = (np.where(going, row[np.clip(step, 0, 11)], 0.0) for row in levels)
+    command = Command(t, v, omega)
+    seen = np.arange(0.0, t[-1], 0.02)
+    return trial_of(PoseStream(seen + late, *integrate(command, Start(), seen)), command, name)
+
+
+@pytest.mark.parametrize("other", [
+    {"begin": 3.3}, {"jitter": 0.04, "seed": 3}, {"lost": 0.03, "seed": 4}, {"period": 0.05},
+    {"begin": 1.234, "jitter": 0.03, "seed": 5, "lost": 0.02}])
+def test_recordings_of_one_drive_are_replicates_whenever_they_began_and_whatever_got_lost(other):
+    first, second = recorded("steps_1", begin=2.0, jitter=0.03), recorded("steps_2", **{"begin": 2.0, **other})
+    assert [[one.name for one in group] for group in replicate_groups((first, second))] == [["steps_1", "steps_2"]]
+    noise = noise_floor((first, second))["ground_truth"]  # the drives themselves differ by the times of their commands
+    assert noise["trajectory"] < 0.1
+
+
+@pytest.mark.parametrize("other", [{"slower": 1.4}, {"slower": 1.1}, {"size": 0.9}, {"size": -1.0}])
+def test_drives_with_the_same_commands_at_other_times_or_of_another_size_are_no_replicates(other):
+    assert replicate_groups((recorded("steps_1", begin=2.0), recorded("steps_2", begin=2.0, **other))) == []
+
+
+def test_drives_cut_out_of_recordings_are_replicates_by_name():
+    names = ("steps-01", "steps_2-01", "steps_2024_05_31-10_20_30", "steps_2024_06_01-09_00_00-02", "turn-02")
+    groups = replicate_groups(tuple(recorded(name, begin=begin) for begin, name in enumerate(names)))
+    assert [[one.name for one in group] for group in groups] == [list(names[:4])]
+
+
+def test_the_noise_of_replicates_does_not_count_when_their_recordings_began():
+    first, second = recorded("steps_1"), recorded("steps_2", begin=2.5)
+    assert noise_floor((first, second))["ground_truth"]["trajectory"] < 1e-6
+
+
+def test_bins_of_replicates_are_compared_only_where_they_show_the_same_moment():
+    trials = (recorded("steps_1", begin=2.0), recorded("steps_2", begin=2.0, jitter=0.01),
+              recorded("steps_3", begin=2.6))
+    assert groups_of_bins(trials) == [[0, 1], [2]]

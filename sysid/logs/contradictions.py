@@ -1,0 +1,209 @@
+"""Poses that contradict the speeds beside them: another axis, frame or clock, a reset, or speeds that are none.
+
+In the vehicle's own frame a pose moves forward by v, and to the left and ahead by what a turn adds at a point beside
+the axle. A regression of both on v and omega shows the angle between the pose's x axis and the way it travels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import OdometryStream, Trial, command_in_force
+from sysid.logs.streams import GRID_DT, SMOOTHING
+
+RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
+VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
+WHOLE = 0.8  # share of the motion that a direction must explain
+LITTLE = 0.75  # the same, below which something is wrong
+ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
+SURE = 6.0  # standard errors that such an angle must have, taken as if samples were independent
+BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
+REACH = 10.0  # s of a clock that is looked for
+LATE = 0.6  # s that the fit does not reach
+JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step of the pose that is a reset
+FEW = 3  # resets of one drive; more steps are noise
+ZERO = 0.02  # of the pose's speed, below which reported speeds are none
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A pose's own motion beside the speeds it should have, every GRID_DT."""
+
+    t: np.ndarray  # (G,) s
+    steps: np.ndarray  # (G, 2) m/s, in the fixed frame
+    yaw: np.ndarray  # (G,)
+    turn: np.ndarray  # (G,) rad/s
+    v: np.ndarray  # (G,) m/s that it should have
+    omega: np.ndarray  # (G,) rad/s
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Which way a pose travels in its own frame."""
+
+    angle: float
+    """To the left of its own heading [rad]."""
+    error: float
+    explained: float
+    """Share of the motion that this explains."""
+
+
+def contradictions(trials: Sequence[Trial]) -> dict[str, list[str]]:
+    """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it."""
+    return {name: _of_stream(name, trials) for name in ("odometry", "ground_truth")}
+
+
+def _of_stream(name: str, trials: Sequence[Trial]) -> list[str]:
+    found: list[str] = []
+    if name == "odometry":
+        found += _resets(trials)
+        found += _empty_speeds(trials)
+        if found:
+            return found
+    motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
+    if not motions:
+        return found
+    plain = _median([direction(one) for one in motions])
+    if plain.explained < LITTLE:
+        mirrored = _median([direction(one, mirrored=True) for one in motions])
+        if mirrored.explained > WHOLE:
+            return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
+                    "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
+        lates = [late for one in motions if (late := lateness(one)) is not None]
+        if len(lates) > len(motions) / 2:
+            late = float(np.median(lates))
+            return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
+                    f"beside it: another clock. Subtract {late:.1f} s from its t."]
+        if name == "odometry" and _median([direction(one, world=True) for one in motions]).explained > WHOLE:
+            return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
+                    "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
+        if name == "odometry" and plain.explained < LITTLE / 2:
+            found.append(f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of "
+                         "how the pose moves. Check that both are of one vehicle, frame and clock.")
+        return found
+    if plain.explained > WHOLE and ANGLE < abs(plain.angle) < BACKWARDS and abs(plain.angle) > SURE * plain.error:
+        degrees = np.rad2deg(plain.angle)
+        side = "left" if degrees > 0 else "right"
+        what = "the outside pose" if name == "ground_truth" else "its pose"
+        remedy = (f"add {degrees:.0f} deg to its yaw (sysid.convert takes --truth-turned {-degrees:.0f})"
+                  if name == "ground_truth" else "its speeds agree with the commands; turn x and y")
+        found.append(f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
+                     f"the vehicle's. Correct them: {remedy}.")
+    return found
+
+
+def motion_of(trial: Trial, name: str) -> Motion | None:
+    """Motion of a stream's pose beside the odometry's speeds, or the commands where there are none that move."""
+    source, odometry = getattr(trial, name), trial.odometry
+    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+        return None
+    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
+    t = np.arange(source.t[0] + half, source.t[-1] - half, GRID_DT)
+    if len(t) < 50:
+        return None
+
+    def at(when: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return np.asarray(np.interp(when, source.t, column))
+
+    steps, turn = (np.stack([at(t + half, one) - at(t - half, one) for one in columns], axis=-1) / (2 * half)
+                   for columns in ((source.x, source.y), (source.yaw,)))
+    held = command_in_force(trial.command, t - RESPONSE)
+    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    if odometry is not None and odometry.v.std() > ZERO:
+        shifts = np.linspace(-half, half, 5)
+        v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
+                    for one in (odometry.v, odometry.omega))
+    if v.std() < VARIED:
+        return None
+    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
+
+
+def direction(motion: Motion, mirrored: bool = False, world: bool = False) -> Direction:
+    """Direction in which a pose travels.
+
+    Args:
+        mirrored: with y negated.
+        world: where v is the speed along the fixed x axis.
+    """
+    x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
+    cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
+    along = (x if world else cos * x + sin * y) + 1j * (0.0 * y if world else -sin * x + cos * y)
+    design = np.column_stack([motion.v, motion.omega])
+    gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    left = along - design @ gains
+    power = float(np.square(np.abs(along)).sum())
+    explained = 1 - float(np.square(np.abs(left)).sum()) / max(power, 1e-12)
+    error = np.sqrt(np.mean(np.square(left.imag)) / np.square(motion.v).sum()) / max(abs(gains[0]), 1e-9)
+    return Direction(float(np.angle(gains[0])), float(error), explained)
+
+
+def lateness(motion: Motion) -> float | None:
+    """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
+    explains what nothing else does; None otherwise."""
+    speed, rate = np.hypot(*motion.steps.T), np.abs(motion.v)
+    best, at, now = 0.0, 0, 0.0
+    most = min(round(REACH / GRID_DT), len(speed) // 2)
+    for lag in range(-most, most + 1, 5):
+        ours = slice(max(lag, 0), len(speed) + min(lag, 0))
+        theirs = slice(max(-lag, 0), len(speed) - max(lag, 0))
+        pairs = [(speed[ours], rate[theirs]), (motion.turn[ours], motion.omega[theirs])]
+        both = min(_correlation(*pair) for pair in pairs)
+        now = both if lag == 0 else now
+        if both > best:
+            best, at = both, lag
+    late = at * GRID_DT
+    return late if best > WHOLE and now < LITTLE and abs(late) > LATE else None
+
+
+def _resets(trials: Sequence[Trial]) -> list[str]:
+    """Steps of the odometry's pose that its speeds do not allow."""
+    found = []
+    for trial in trials:
+        stream = trial.odometry
+        if stream is None or stream.x is None or stream.y is None or len(stream.t) < 20:
+            continue
+        dt = np.diff(stream.t)
+        steps = [np.hypot(np.diff(stream.x), np.diff(stream.y))]
+        steps += [] if stream.yaw is None else [np.abs(np.diff(stream.yaw))]
+        jumps = np.zeros(len(dt), bool)
+        for step, speed in zip(steps, (stream.v, stream.omega), strict=False):
+            way = np.maximum(np.abs(speed[1:]), np.abs(speed[:-1])) * dt
+            usual = float(np.percentile(step / dt, 95)) * dt
+            jumps |= step > JUMP[0] + JUMP[1] * np.maximum(way, usual)
+        at = np.flatnonzero(jumps)
+        if 0 < len(at) <= FEW:
+            found.append((trial.name, float(stream.t[at[0] + 1]), float(steps[0][at[0]])))
+    if not found:
+        return []
+    name, at_time, size = found[0]
+    return [f"odometry: in {len(found)} of {len(trials)} trials ({name}, at {at_time:.1f} s) its pose jumps by "
+            f"{size:.2f} m from one row to the next, which its speeds do not: it was reset there. Split the trial "
+            "there."]
+
+
+def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
+    """Odometry whose pose moves while its speeds are zero."""
+    empty = [trial for trial in trials if isinstance(one := trial.odometry, OdometryStream) and one.x is not None
+             and one.y is not None and np.hypot(np.ptp(one.x), np.ptp(one.y)) > 0.3
+             and float(np.abs(one.v).sum() / max(len(one.v), 1)) * float(np.ptp(one.t))
+             < ZERO * float(np.hypot(np.diff(one.x), np.diff(one.y)).sum())]
+    if len(empty) <= len(trials) / 2:
+        return []
+    return ["odometry: its speeds v are all zero though its pose moves with the commands: the driver does not fill the "
+            "twist. Compute v and omega from the pose, or record a topic that has them."]
+
+
+def _median(found: Sequence[Direction]) -> Direction:
+    angle = float(np.angle(np.median([np.exp(1j * one.angle).real for one in found])
+                           + 1j * np.median([np.exp(1j * one.angle).imag for one in found])))
+    return Direction(angle, float(np.median([one.error for one in found])),
+                     float(np.median([one.explained for one in found])))
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / norm if norm > 1e-9 else 0.0

@@ -1,0 +1,138 @@
+"""Drives that repeat one another: the same commands as functions of time, whenever the recording began.
+
+A dataset's commands repeat exactly. Those of a bag never do: the recording begins at another moment, messages come a
+little earlier or later, and some get lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Command, Trial, command_in_force
+
+EXACT = 1e-6  # s, m/s, rad/s that equal tables may differ by
+NONE = 1e-3  # m/s or rad/s of a command below which nothing moves
+TABLE_DT = 0.01  # s, of the functions that are compared
+PERIODS = 1.5  # of the commands, by which a change may come earlier or later
+TIMING = (0.05, 0.2)  # s, bounds of that time
+VALUE = (2e-3, 0.005)  # m/s or rad/s, and share of the largest command, by which values may differ
+LONGEST = 3600.0  # s of drive that are compared
+
+
+@dataclass(frozen=True)
+class Course:
+    """The commands of one drive as a function of time."""
+
+    command: Command
+    begin: float  # s, first command to move; nan where none does
+    end: float  # s, of the last motion
+    period: float  # s, between commands
+    distance: float  # m, with both signs counted as positive
+    turn: float  # rad, in the same way
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything is commanded."""
+        return bool(np.isfinite(self.begin))
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """(T, 2) commands in force at times t (T,) since the first motion, 0 before and after the motion."""
+        when = self.begin + t
+        held = command_in_force(self.command, when)
+        inside = ((held >= 0) & (when < self.end))[:, None]
+        return np.where(inside, self.command.table[np.maximum(held, 0), 1:], 0.0)
+
+
+def course_of(trial: Trial) -> Course:
+    """The commands of a trial; the last one holds until the trial's end."""
+    command = trial.command
+    last = max(trial.duration, float(command.t[-1]))
+    hold = np.maximum(np.diff(np.append(command.t, last)), 0.0)
+    moving = np.flatnonzero((np.abs(command.v) > NONE) | (np.abs(command.omega) > NONE))
+    begin = end = float("nan")
+    if len(moving):
+        begin = float(command.t[moving[0]])
+        end = float(command.t[moving[-1] + 1]) if moving[-1] + 1 < len(command.t) else last
+    period = float(np.median(np.diff(command.t))) if len(command.t) > 1 else 0.0
+    return Course(command, begin, end, period, float((np.abs(command.v) * hold).sum()),
+                  float((np.abs(command.omega) * hold).sum()))
+
+
+def shift_between(a: Course, b: Course) -> float | None:
+    """How much later the commands of b come than those of a [s]; None where they are not the same function of time."""
+    if len(a.command.t) == len(b.command.t) and np.allclose(a.command.table, b.command.table, rtol=1e-5, atol=EXACT):
+        return 0.0
+    if not (a.moves and b.moves) or max(a.end - a.begin, b.end - b.begin) > LONGEST:
+        return None
+    timing = float(np.clip(PERIODS * max(a.period, b.period), *TIMING))
+    if abs((a.end - a.begin) - (b.end - b.begin)) > 2 * timing:
+        return None
+    for one, other in ((a.distance, b.distance), (a.turn, b.turn)):
+        if abs(one - other) > 0.1 * max(one, other) + 0.2:
+            return None
+    t = np.arange(-2 * timing, max(a.end - a.begin, b.end - b.begin) + 2 * timing, TABLE_DT)
+    ours, theirs = a.at(t), b.at(t)
+    lag = _best_lag(ours, theirs, round(timing / TABLE_DT))
+    theirs = b.at(t + lag * TABLE_DT)
+    allowed = VALUE[0] + VALUE[1] * np.abs(ours).max(axis=0)
+    width = 2 * round(timing / TABLE_DT) + 1
+    if not (_within(ours, theirs, allowed, width) and _within(theirs, ours, allowed, width)):
+        return None
+    return b.begin - a.begin + lag * TABLE_DT
+
+
+def side_by_side(a: Course, b: Course, most: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Commands (T, 2) of two drives at the same times since their first motion; None where one does not move, or where
+    their motion begins more than `most` apart in the recordings [s] or does not last as long."""
+    if not (a.moves and b.moves) or abs(a.begin - b.begin) > most or abs(a.end - b.end) > TIMING[1] + most:
+        return None
+    t = np.arange(0.0, min(max(a.end - a.begin, b.end - b.begin), LONGEST), TABLE_DT)
+    return a.at(t), b.at(t)
+
+
+def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
+    """Indices of trials of one manoeuvre with the same commands, in order of first appearance; single ones too.
+
+    Args:
+        most: how much earlier or later than in the first of them the commands may come in the recording [s].
+    """
+    courses = [course_of(trial) for trial in trials]
+    groups: list[list[int]] = []
+    of_manoeuvre: dict[str, list[list[int]]] = {}
+    for i, trial in enumerate(trials):
+        mine = of_manoeuvre.setdefault(trial.manoeuvre, [])
+        for group in mine:
+            shift = shift_between(courses[group[0]], courses[i])
+            if shift is not None and abs(shift) <= most:
+                group.append(i)
+                break
+        else:
+            mine.append([i])
+            groups.append(mine[-1])
+    return groups
+
+
+def shifts(trials: Sequence[Trial]) -> np.ndarray:
+    """(N,) how much later each trial's commands come than the first one's [s]; 0 where they are not the same."""
+    courses = [course_of(trial) for trial in trials]
+    return np.array([shift_between(courses[0], course) or 0.0 for course in courses])
+
+
+def _best_lag(ours: np.ndarray, theirs: np.ndarray, most: int) -> int:
+    """Rows by which theirs (T, 2) come later than ours (T, 2), at most so many, where the difference is least."""
+    inside = slice(most, len(ours) - most)
+    left = {lag: float(np.abs(ours[inside] - np.roll(theirs, -lag, axis=0)[inside]).sum())
+            for lag in sorted(range(-most, most + 1), key=abs)}
+    return min(left, key=lambda lag: (left[lag], abs(lag)))
+
+
+def _within(ours: np.ndarray, theirs: np.ndarray, allowed: np.ndarray, width: int) -> bool:
+    """Whether each row of ours (T, 2) lies among the rows of theirs that are at most half a width away."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    low = minimum_filter1d(theirs, width, axis=0, mode="nearest")
+    high = maximum_filter1d(theirs, width, axis=0, mode="nearest")
+    return bool(((ours >= low - allowed) & (ours <= high + allowed)).all())
