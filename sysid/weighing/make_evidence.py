@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid.errors.features import CHANNELS
+from sysid.errors.noise import BIN_SHIFT
 from sysid.logs.log import Trial, command_in_force
+from sysid.logs.replicates import same_course
 from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.refit import Refitter, without_each
 from sysid.missing.signatures import gather, manoeuvre_groups
@@ -149,10 +151,8 @@ def _pool(ready: Prepared, names: Sequence[str], bins: int) -> tuple[np.ndarray,
 
 def _course_of(trial: Trial, day: int, seen: list[Trial], leftovers: Sequence[object]) -> int:
     """Number of the replicates that a reference drive belongs to."""
-    from sysid.errors.noise import same_commands
-
     for number, other in enumerate(seen):
-        if other is trial or same_commands(other, trial) and _day_of(other, leftovers) == day:
+        if other is trial or len(same_course((other, trial), BIN_SHIFT)) == 1 and _day_of(other, leftovers) == day:
             return number
     seen.append(trial)
     return len(seen) - 1
