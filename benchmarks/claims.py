@@ -920,6 +920,44 @@ CLAIMS = (
         ("set", "verdict", "looks the same", "values", "before", "after"),
         _shared,
     ),
+    Claim(
+        MISSING,
+        "A trial: naming by posterior weight",
+        "decision",
+        "`close_loop --decision posterior` beside the search, on logs that were kept aside while it was tuned. 71 logs "
+        "were judged by both. The search stays the default: the trial names too much that is outside the catalogue.",
+        ("figure", "posterior", "search"),
+        (
+            ("right, of 71 logs", "{right}", "{right_search}"),
+            ("right class at 2x", "{class_accuracy_2x|%}", "{class_accuracy_2x_search|%}"),
+            ("wrong name at 2x", "{wrong_name_2x|%}", "{wrong_name_2x_search|%}"),
+            ("outside the catalogue at 2x: unexplained", "{out_of_catalogue_2x|%}", "{out_of_catalogue_2x_search|%}"),
+            ("two effects: both named", "{pair_both|%}", "{pair_both_search|%}"),
+            ("two effects: a wrong name", "{pair_wrong|%}", "{pair_wrong_search|%}"),
+            ("noise factor inside its 95 % interval, twice the noise", "{noise_factor_coverage_2|%}", "-"),
+            ("false alarms at twice the noise, upper 95 % bound", "{false_alarm_upper_noise_2|%}", "-"),
+            ("verdict from saved evidence, one core [s]", "{verdict_s}", "-"),
+        ),
+    ),
+    # The code
+    Claim(
+        "The code itself",
+        "How easily the code is entered",
+        "house",
+        "Counted from the sources. A floor is a step of the longest chain of imports inside a package.",
+        ("figure", "value"),
+        (
+            ("import circles", "{import_circles}"),
+            ("floors of `sysid`", "{import_floors_sysid}"),
+            ("files at the top of `sysid`", "{files_top_sysid}"),
+            ("files at the top of `whill_mjx`", "{files_top_whill_mjx}"),
+            ("files for a new effect that can be named", "{files_per_new_effect}"),
+            ("functions over 60 lines", "{functions_over_60}"),
+            ("functions with more than 6 arguments", "{functions_over_6_arguments}"),
+            ("lines of `sysid`", "{lines_sysid}"),
+            ("sentences over 35 words in README and docs", "{sentences_over_35_words}"),
+        ),
+    ),
     # Bridge
     Claim(
         BRIDGE,
