@@ -49,7 +49,8 @@ class Course:
 def course_of(trial: Trial) -> Course:
     """The commands of a trial; the last one holds until the trial's end."""
     command = trial.command
-    last = max(trial.duration, float(command.t[-1]))
+    ends = [float(stream.t[-1]) for stream in (trial.odometry, trial.ground_truth) if stream is not None]
+    last = max([*ends, float(command.t[-1])])
     hold = np.maximum(np.diff(np.append(command.t, last)), 0.0)
     moving = np.flatnonzero((np.abs(command.v) > NONE) | (np.abs(command.omega) > NONE))
     begin = end = float("nan")
