@@ -134,7 +134,7 @@ def test_the_chair_with_its_suspension_looks_up_by_what_it_sinks():
 
 @pytest.mark.quick
 def test_a_ramp_in_the_room_does_not_change_the_camera_of_the_vehicle():
-    from whill_mjx.effects import Incline
+    from whill_mjx.effects.incline import Incline
 
     spec, params = preset("whill_cr_ramp")
     model = build_model(spec)

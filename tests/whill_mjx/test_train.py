@@ -437,5 +437,5 @@ def test_a_longer_hold_keeps_the_budget_in_control_periods(name, factor):
 
 @pytest.mark.quick
 def test_a_decision_must_hold():
-    with pytest.raises(ValueError, match="action_repeat 0"):
+    with pytest.raises(ValueError, match="action_repeat is 0"):
         with_repeat(find_preset("paper", "obstacle_course"), 0)
