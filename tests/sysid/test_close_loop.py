@@ -195,7 +195,7 @@ def test_a_name_whose_law_the_drives_did_not_put_to_test_comes_with_a_warning(sl
     first = sloping.stood[0]
     tested = replace(first.falsifiers[0], falsifier=Falsifier("grows as its law says", by), outcome=outcome)
     said = warnings(replace(sloping, stood=(replace(first, falsifiers=(tested,)),)))
-    assert any("do not tell whether slope grows as its law says" in one for one in said) == warns
+    assert any("do not show whether slope grows as its law says" in one for one in said) == warns
 
 
 def test_report_and_vehicle_file(sloping, tmp_path):
