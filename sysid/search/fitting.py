@@ -18,7 +18,7 @@ from sysid.errors.space import Space, make_space, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
-from sysid.logs.log import Log, Prediction, Trial
+from sysid.logs.log import Log, Prediction, Trial, check_same_vehicle
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
 from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
@@ -37,6 +37,7 @@ from sysid.search.settings import (
     FitConfig,
 )
 from sysid.search.valleys import FIRST, LOOK, gradient_search
+from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -87,15 +88,12 @@ def fit_log(
         model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
     """
     config = config or FitConfig()
+    check_options(config)
     began = time.perf_counter()
     given = make_problem(log, config, params, model)
     model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
     trials = objective.trials
-    wanted = space.names if config.profile == ("all",) else config.profile
-    check_names(space, wanted)
-    if wanted and config.method in GLOBAL:
-        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
-                         "profile starts from. Use --method features, lm or both.")
+    wanted = profiled(space, config)
 
     scan = coarse = search = None
     points = least_squares.random_starts(space, config.starts, config.seed)
@@ -219,7 +217,18 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
     noise = estimate_noise(odometry_frames.at_frames(log.training, frame))
     objective = make_objective(plant, params, space, trials, noise)
     objective = replace(objective, prior=bounds_alone(space))
+    profiled(space, config)
     return Problem(plant, params, space, objective, intervals, model, frame)
+
+
+def profiled(space: Space, config: FitConfig) -> tuple[str, ...]:
+    """Parameters whose profile is wanted; ValueError where there can be none."""
+    wanted = tuple(space.names) if config.profile == ("all",) else config.profile
+    check_names(space, wanted)
+    if wanted and config.method in GLOBAL:
+        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
+                         "profile starts from. Use --method features, lm or both.")
+    return wanted
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
@@ -227,10 +236,7 @@ def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]
     from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
 
     spec, params, _ = read_vehicle(path)
-    for name in ("wheel_radius", "track", "wheelbase", "drive"):
-        if getattr(spec, name) != getattr(log.spec, name):
-            raise ValueError(f"{path}: {name} is {getattr(spec, name)}, but {getattr(log.spec, name)} in {log.name!r}. "
-                             "The vehicle file must be of the same vehicle; correct dataset.toml or leave it out.")
+    check_same_vehicle(log, spec, str(path), "The vehicle file must be of the same vehicle")
     return params, load_intervals(path)
 
 

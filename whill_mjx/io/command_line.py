@@ -84,6 +84,8 @@ POSITIVE = Range(0, above=True)
 SHARE = Range(0, 1)
 SEED = Range(0, 2_000_000_000)
 """Seeds are added to others in 32 bits."""
+PHYSICS_DT = Range(1e-4, 0.05)
+"""Physics steps [s] at which the drive's controller and the wheels' slip are stable."""
 
 
 def check_range(option: str, value: Any, allowed: Range, default: Any = None) -> None:
