@@ -22,7 +22,7 @@ from bridge.commands import CommandTopic, Ear, Endpoint, endpoints
 from bridge.controller import Controller
 from bridge.diagnosis import Evidence, FrameLog, causes
 from bridge.guard import BEAT_PERIOD, GuardLink
-from bridge.options import Parser, count, number, result_file
+from bridge.options import Parser, in_range, result_file, whole
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import Command, SafetyConfig, State
 from bridge.whill import ChairGate, ChairState
@@ -53,25 +53,25 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--whill-state", default="", metavar="TOPIC",
                         help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
                              f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
-    parser.add_argument("--v-limits", type=number(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
+    parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: the policy's")
-    parser.add_argument("--omega-limits", type=number(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
-    parser.add_argument("--slew", type=number(0, infinite=True), nargs=2, metavar=("V", "OMEGA"),
+    parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
+    parser.add_argument("--slew", type=in_range(0, infinite=True), nargs=2, metavar=("V", "OMEGA"),
                         default=(math.inf, math.inf),
                         help="largest change of commands [m/s2, rad/s2]; a stop is not slowed")
     parser.add_argument("--image-topic", default=ros.IMAGE_TOPIC)
     parser.add_argument("--compressed", action="store_true",
                         help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
-    parser.add_argument("--crop", type=count(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
+    parser.add_argument("--crop", type=whole(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
                         help="the part of the camera's image that the policy sees [pixels]")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
     parser.add_argument("--guard", choices=("own", "other"), default="own",
                         help="own: start a guard process; other: wait for one, such as a guard of another computer")
-    parser.add_argument("--stamp-age", type=number(0, infinite=True), default=SafetyConfig.stamp_age,
+    parser.add_argument("--stamp-age", type=in_range(0, infinite=True), default=SafetyConfig.stamp_age,
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
-    parser.add_argument("--frame-age", type=number(0, infinite=True), default=SafetyConfig.frame_age,
+    parser.add_argument("--frame-age", type=in_range(0, infinite=True), default=SafetyConfig.frame_age,
                         help="largest age of a frame since its receipt [s]")
     parser.add_argument("--pace", choices=("wall", "stamp"), default="wall",
                         help="clock of the policy's rate; stamp: for a simulator that is not in real time")
@@ -81,7 +81,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="after a stop that passes by itself: drive again, or wait for an operator")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node could send commands; when it does, it drives")
-    parser.add_argument("--realtime", type=count(0, 99), default=0, metavar="PRIORITY",
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on bridge/rearm")
     parser.add_argument("--lifecycle", action="store_true",

@@ -20,7 +20,7 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
-def number(
+def in_range(
     low: float = -math.inf, high: float = math.inf, kind: type[int] | type[float] = float, infinite: bool = False
 ) -> Callable[[str], float]:
     """A type for `add_argument`: a number from `low` to `high`, finite unless `infinite` is set.
@@ -53,6 +53,6 @@ def result_file(text: str) -> Path:
     return path
 
 
-def count(low: int = 1, high: int = 1_000_000_000) -> Callable[[str], float]:
+def whole(low: int = 1, high: int = 1_000_000_000) -> Callable[[str], float]:
     """A type for `add_argument`: a whole number from `low` to `high`."""
-    return number(low, high, int)
+    return in_range(low, high, int)

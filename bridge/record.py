@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.options import Parser, number
+from bridge.options import Parser, in_range
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
@@ -201,18 +201,18 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
     parser.add_argument("trial", help="name of the trial, like circle_1")
-    parser.add_argument("--seconds", type=number(0, 1e7), default=0.0,
+    parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
                         help="end after so long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--vehicle", default="WHILL Model CR")
-    parser.add_argument("--wheel-radius", type=number(0.001, 2), default=0.1325, help="[m]")
-    parser.add_argument("--track", type=number(0.01, 5), default=0.496, help="[m]")
-    parser.add_argument("--wheelbase", type=number(0, 5), default=0.45, help="[m]")
-    parser.add_argument("--mass", type=number(0.01, 1e4), help="[kg], where known")
-    parser.add_argument("--v-limit", type=number(0.01, 100), default=1.0, help="[m/s]")
-    parser.add_argument("--omega-limit", type=number(0.01, 100), default=1.0, help="[rad/s]")
+    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
+    parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")
+    parser.add_argument("--wheelbase", type=in_range(0, 5), default=0.45, help="[m]")
+    parser.add_argument("--mass", type=in_range(0.01, 1e4), help="[kg], where known")
+    parser.add_argument("--v-limit", type=in_range(0.01, 100), default=1.0, help="[m/s]")
+    parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0, help="[rad/s]")
     return parser.parse_args(arguments)
 
 

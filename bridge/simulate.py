@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bridge import ros
-from bridge.options import Parser, count, number, result_file
+from bridge.options import Parser, in_range, result_file, whole
 
 RESET_SILENCE = 0.5
 MATCHING = 0.3
@@ -352,16 +352,16 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="change a field of the task, such as gates=1 or layout=fixed; repeat for more")
     parser.add_argument("--vehicle", help="vehicle file or built-in vehicle; default: that of the policy, "
                         "or the task's own")
-    parser.add_argument("--episodes", type=count(0), default=0, help="end after so many; 0: never")
-    parser.add_argument("--seed", type=count(0), default=0, help="of the first episode; each next one adds 1")
-    parser.add_argument("--wait", type=number(0), default=10.0,
+    parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
+    parser.add_argument("--wait", type=in_range(0), default=10.0,
                         help="wait so long for a driver before the first one [s]")
-    parser.add_argument("--linger", type=number(0), default=1.0, help="listen for so long after the last episode [s]")
+    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen for so long after the last episode [s]")
     parser.add_argument("--results", type=result_file, help="JSON file for the outcome of the episodes")
-    parser.add_argument("--image-size", type=count(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
+    parser.add_argument("--image-size", type=whole(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
                         help="enlarge the camera image")
     parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
-    parser.add_argument("--realtime", type=count(0, 99), default=0, metavar="PRIORITY",
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)

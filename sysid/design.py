@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, listen, refusing
+from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing
 
 if __name__ == "__main__":
     listen()
@@ -28,6 +28,7 @@ from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_place
+from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.specs import VehicleSpec
 
 
@@ -69,6 +70,8 @@ def main(config: DesignConfig) -> list[Path]:
     with refusing():
         check_out(config)
         spec, params, intervals, noise = load_subject(config.vehicle)
+        for name in config.parameters:
+            check_known("--parameters", name, describe(params))
     limits = Limits(
         max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
         min(spec.v_max, 1.0) if config.v_max is None else config.v_max,

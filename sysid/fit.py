@@ -23,7 +23,7 @@ from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import parameter_table, table
 from sysid.replay.models import Model
 from sysid.run_folder import run_folder, settings_of
-from sysid.search.fitting import expected_steps, make_problem
+from sysid.search.fitting import check_settings, expected_steps
 from sysid.search.settings import GLOBAL, FitConfig
 from sysid.search.studies import open_storage, without_secrets
 from whill_mjx.io.command_line import refusing
@@ -65,7 +65,7 @@ def main(arguments: Arguments) -> None:
         settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
         log = load_any(arguments.dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
         check_storage(settings)
-        model = make_problem(log, settings).model
+        model = check_settings(log, settings)
         references = [load_any(path) for path in arguments.reference]
     chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
               "chained": arguments.chained, **settings_of(settings)}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
+import runpy
 import shlex
 import shutil
 import typing
+import warnings
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,8 @@ from whill_mjx.io import command_line
 from whill_mjx.io.command_line import Range
 
 pytestmark = pytest.mark.quick
-CHAIR = Path(__file__).parents[1] / "sysid" / "data" / "chair"
+ROOT = Path(__file__).parents[1]
+CHAIR = ROOT / "sysid" / "data" / "chair"
 COMMANDS = {
     "fit": (fit.Arguments, fit.main), "close_loop": (close_loop.Arguments, close_loop.main),
     "design": (design.DesignConfig, design.main), "convert": (ConvertConfig, convert.main),
@@ -47,6 +49,11 @@ def refused(command, words, capsys):
     assert len(lines) == 1, lines
     assert ended.value.code == command_line.REFUSED
     return lines[0]
+
+
+def files_of(folder):
+    """Everything in a folder but locks."""
+    return sorted(path for path in folder.rglob("*") if path.name != ".lock")
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +89,7 @@ def mistakes(tmp_path_factory):
     ("fit", "file", "file"),
     ("fit", "empty", "empty: no dataset.toml"),
     ("fit", "data --parameters body.nope", "body.nope"),
-    ("fit", "data --effects nope", "unknown effect 'nope'"),
+    ("fit", "data --effects nope", "no effect 'nope'"),
     ("fit", "data --profile nope", "profile of 'nope'"),
     ("fit", "data --method tpe --profile all", "--profile with --method tpe"),
     ("fit", "data --vehicle nope.toml", "nope.toml: no such vehicle file"),
@@ -93,7 +100,7 @@ def mistakes(tmp_path_factory):
     ("fit", "data --model other.py", "other.py: defines no 'model'"),
     ("fit", "data --model other.py:x", "x is a int"),
     ("fit", "data --model other.py --close-loop", "--close-loop asks what the simulator's vehicle lacks"),
-    ("fit", "data --train nope", "--train"),
+    ("fit", "data --train nope", "selection 'nope' matches no trial"),
     ("fit", "data --format mrclam", "data"),
     ("fit", "data --storage nope --method tpe", "storage 'nope' is neither"),
     ("fit", "data --storage journal:a.log", "--storage journal:a.log: --method features has no global search"),
@@ -110,7 +117,7 @@ def mistakes(tmp_path_factory):
     ("close_loop", "data --reference nowhere", "nowhere"),
     ("close_loop", "data --vehicle nope", "unknown vehicle 'nope'"),
     ("close_loop", "data --vehicle data", "data: a dataset"),
-    ("close_loop", "data --vehicle husky", "husky: wheel_radius is 0.1651, but"),
+    ("close_loop", "data --vehicle husky", "husky: wheel_radius is 0.165, but 0.1325"),
     ("close_loop", "data --vehicle whill_cr --reference data", "--reference and --vehicle are both given"),
     ("close_loop", "data --decision coin", "--decision"),
     ("close_loop", "nowhere", "nowhere"),
@@ -179,11 +186,11 @@ def test_a_mistake_in_identification_ends_with_one_line_and_writes_nothing(
     command, words, told, mistakes, monkeypatch, capsys
 ):
     monkeypatch.chdir(mistakes)
-    for work in ("sysid.run_folder.keep_steps", "sysid.searches.compare", "sysid.inspect.look", "sysid.design.propose"):
-        monkeypatch.setattr(work, lambda *words: pytest.fail("begun"))
-    before = sorted(mistakes.rglob("*"))
+    for work in ("run_folder.keep_steps", "searches.make_problem", "inspect.look", "design.propose"):
+        monkeypatch.setattr(f"sysid.{work}", lambda *words: pytest.fail("begun"))
+    before = files_of(mistakes)
     assert told in refused(command, words, capsys)
-    assert sorted(mistakes.rglob("*")) == before
+    assert files_of(mistakes) == before
 
 
 def out_of_range(kind, marks):
@@ -225,7 +232,8 @@ def test_no_option_takes_a_number_that_makes_no_sense(command, option, word, cap
         command_line.run(ALL[command], lambda options: pytest.fail("begun"), None, args=words,
                          positional=command not in ("drive", "train") and command != "evaluate")
     line = capsys.readouterr().err
-    assert ended.value.code == command_line.REFUSED and line.count("\n") == 1 and option in line
+    named = option in line or option.rpartition(".")[2].replace("-", "_") in line
+    assert ended.value.code == command_line.REFUSED and line.count("\n") == 1 and named
 
 
 BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulate.main, "chair": chair.main,
@@ -258,22 +266,32 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
 ])  # fmt: skip
 def test_a_mistake_in_the_bridge_ends_with_one_line(command, words, told, mistakes, monkeypatch, capsys):
     monkeypatch.chdir(mistakes)
-    before = sorted(mistakes.rglob("*"))
+    before = files_of(mistakes)
     try:
         code = BRIDGE[command](shlex.split(words))
     except SystemExit as ended:
         code = ended.code
     lines = capsys.readouterr().err.splitlines()
     assert code == 2 and len(lines) == 1 and told in lines[0], (code, lines)
-    assert sorted(mistakes.rglob("*")) == before
+    assert files_of(mistakes) == before
 
 
-@pytest.mark.parametrize("module", ["tables", "merge", "pictures", "house", "effects"])
-def test_help_of_a_benchmark_writes_nothing(module, mistakes, monkeypatch, capsys):
-    name = f"benchmarks.{module}"
-    monkeypatch.setattr("sys.argv", [name, "--help"])
-    before = {path: path.stat().st_mtime_ns for path in CHAIR.parents[2].glob("*.md")}
-    with pytest.raises(SystemExit) as ended:
-        importlib.import_module(name).main()
-    assert ended.value.code in (0, None) and "usage" in capsys.readouterr().out
-    assert {path: path.stat().st_mtime_ns for path in before} == before
+BENCHMARKS = sorted(path for path in (ROOT / "benchmarks").rglob("*.py") if "__main__\":" in path.read_text())
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("word", ["--help", "--no-such-option"])
+def test_a_benchmark_says_what_it_takes_and_writes_nothing(word, path, monkeypatch, capsys):
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__main__")
+    monkeypatch.setattr("sys.argv", [name, word])
+    pages = {page: page.stat().st_mtime_ns for page in [*ROOT.glob("*.md"), *ROOT.glob("benchmarks/**/*.md")]}
+    with pytest.raises(SystemExit) as ended, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of modules that other tests have imported
+        runpy.run_module(name, run_name="__main__", alter_sys=True)
+    said = capsys.readouterr()
+    if word == "--help":
+        assert ended.value.code in (0, None) and "--help" in said.out
+    else:
+        assert ended.value.code == 2 and said.err.count("\n") == 1
+        assert "no-such-option" in said.err or "required" in said.err
+    assert {page: page.stat().st_mtime_ns for page in pages} == pages

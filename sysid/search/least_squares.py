@@ -240,7 +240,6 @@ def profile_delays(
         at[:, index] = grid
         held = np.full(len(at), index)
 
-
         def compute(at: np.ndarray = at, held: np.ndarray = held) -> tuple[np.ndarray, np.ndarray]:
             return tangent().followed(objective, at, held, robust)
 
