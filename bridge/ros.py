@@ -17,6 +17,7 @@ from typing import Any
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
+IMU_TOPIC = "imu"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 CHAIR_STATE_TOPIC = "whill/states/model_cr2"
@@ -97,16 +98,29 @@ def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], No
 def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
                      incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
     """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
+    subscribe_counting_losses(node, kind, topic, callback, best_effort(), lost, incompatible_qos=incompatible)
+
+
+def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
+                              lost: Callable[[Any], None], **callbacks: Any) -> Any:
+    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription."""
     try:
         from rclpy.event_handler import UnsupportedEventTypeError
     except ImportError:  # Humble
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
-        events = subscription_events(incompatible_qos=incompatible, message_lost=lost)
-        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+        events = subscription_events(message_lost=lost, **callbacks)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
     except UnsupportedEventTypeError:
-        events = subscription_events(incompatible_qos=incompatible)
-        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+        events = subscription_events(**callbacks)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+
+
+def is_reliable(policy: Any) -> bool:
+    """Return whether a publisher's reliability, as the graph gives it, is reliable."""
+    from rclpy.qos import ReliabilityPolicy
+
+    return bool(policy == ReliabilityPolicy.RELIABLE)
 
 
 def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
