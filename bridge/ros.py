@@ -18,6 +18,9 @@ IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
 IMU_TOPIC = "imu"
+CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
+SCAN_TOPIC = "sensing/lidar/scan"
+PAUSE_TOPIC = "simulate/pause"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 CHAIR_STATE_TOPIC = "whill/states/model_cr2"
@@ -152,6 +155,40 @@ def diagnostics(node: Any) -> Callable[[bool, str, dict[str, Any]], None]:
         publisher.publish(message)
 
     return report
+
+
+def clock_publisher(node: Any) -> Callable[[int, int], None]:
+    """Return a function that publishes a time (seconds, nanoseconds) on /clock."""
+    from rosgraph_msgs.msg import Clock
+
+    publisher = node.create_publisher(Clock, "/clock", reliable())
+
+    def publish(seconds: int, nanoseconds: int) -> None:
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+        publisher.publish(message)
+
+    return publish
+
+
+def transform_publisher(node: Any) -> Callable[[Any], None]:
+    """Return a function that publishes an odometry's pose on /tf; it does nothing where tf2_msgs is not installed."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        return lambda odometry: None
+    from geometry_msgs.msg import TransformStamped
+
+    publisher = node.create_publisher(TFMessage, "/tf", reliable(10))
+
+    def publish(odometry: Any) -> None:
+        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+        position = odometry.pose.pose.position
+        message.transform.translation.x, message.transform.translation.y = position.x, position.y
+        message.transform.rotation = odometry.pose.pose.orientation
+        publisher.publish(TFMessage(transforms=[message]))
+
+    return publish
 
 
 def managed_node(name: str) -> Any:

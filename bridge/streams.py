@@ -1,4 +1,4 @@
-"""Subscriptions that lose nothing: reliable where the publishers offer it, and deep enough for a pause of the reader."""
+"""Subscriptions that lose nothing: reliable where the publishers offer it, and deep enough for a pause."""
 
 from collections.abc import Callable
 from typing import Any

@@ -12,6 +12,7 @@ class PointRobot:
 
     period = 0.1
     goal = 0.3
+    intrinsics = (60.0, 60.0, 32.0, 32.0)
 
     def __init__(self, task="", vehicle=None):
         self.reset(0)
@@ -33,7 +34,8 @@ class PointRobot:
         image[0, self.steps % 64] = 254 - self.steps % 100  # each frame differs, as a real camera's do
         reached = self.x >= self.goal
         return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=reached or self.steps >= 100,
-                     odometry=(self.x, self.y, self.yaw, v, omega))
+                     odometry=(self.x, self.y, self.yaw, v, omega),
+                     ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 5.0, 1.0]))
 
 
 class EndlessRobot(PointRobot):

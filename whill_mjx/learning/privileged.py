@@ -33,6 +33,13 @@ def truth(env: Env, state: State) -> jax.Array:
     return jnp.concatenate([near, free_distances(body, state.scene.boxes) / UNIT]).astype(jnp.float32)
 
 
+def scan(env: Env, state: State) -> jax.Array:
+    """(RAYS,) m from the drive-axle centre to the first box in each direction of ANGLES, at most RANGE."""
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    body = footprint(env.model.spec, x, y, yaw)
+    return free_distances(body.replace(x=x, y=y), state.scene.boxes)
+
+
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
     """(RAYS,) m from the footprint's centre to the first box in each direction of ANGLES, at most RANGE."""
     turn = body.yaw + ANGLES[:, None] - boxes.yaw  # (RAYS, P): direction in each box's frame
