@@ -47,12 +47,7 @@ class TrialWriter:
         Raises:
             ValueError: the trial exists already, or its name is no plain file name.
         """
-        if not TRIAL_NAME.fullmatch(trial):
-            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
-                             "Choose another name, like circle_1.")
-        self.folder = Path(dataset) / "trials" / trial
-        if self.folder.exists():
-            raise ValueError(f"{self.folder}: exists already; a recording never replaces another. Choose another name.")
+        self.folder = self.check(dataset, trial)
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
         self._partial.mkdir()
@@ -63,6 +58,21 @@ class TrialWriter:
         self._first_pose: tuple[float, float, float] | None = None
         self._yaw: float | None = None
         self.rows = dict.fromkeys(COLUMNS, 0)
+
+    @staticmethod
+    def check(dataset: str | Path, trial: str) -> Path:
+        """Return the folder of a trial that can be recorded.
+
+        Raises:
+            ValueError: as the constructor.
+        """
+        if not TRIAL_NAME.fullmatch(trial):
+            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
+                             "Choose another name, like circle_1.")
+        folder = Path(dataset) / "trials" / trial
+        if folder.exists():
+            raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
+        return folder
 
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
@@ -120,6 +130,17 @@ class TrialWriter:
         os.replace(self._partial, self.folder)
         return self.folder
 
+    def put_aside(self) -> Path:
+        """End a recording that is no trial, such as a stopped drive; return its folder, below `aborted` in the dataset.
+
+        Raises:
+            OSError: as `close`.
+        """
+        aside = self.folder.parent.with_name("aborted")
+        aside.mkdir(exist_ok=True)
+        self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
+        return self.close()
+
     def _add(self, stream: str, t: float, *values: float) -> None:
         if not all(math.isfinite(value) for value in (t, *values)):
             return  # a log holds measurements; a fit cannot use a hole with a number's name
@@ -170,7 +191,9 @@ def toml_text(text: str) -> str:
 class RecordNode:
     """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
 
-    def __init__(self, node: Any, writer: TrialWriter, options: argparse.Namespace) -> None:
+    def __init__(self, node: Any, writer: TrialWriter | None, options: argparse.Namespace, seconds: float = 0.0
+                 ) -> None:
+        """Listen on the graph, for so long [s] or without end. What comes is dropped while `writer` is None."""
         from nav_msgs.msg import Odometry
         from sensor_msgs.msg import Imu
 
@@ -178,13 +201,13 @@ class RecordNode:
         self.failure: OSError | None = None
         """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
-        self._seconds = options.seconds
+        self._seconds = seconds
         self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
         self.streams = [Stream(node, Odometry, options.odometry_topic, self._on_odometry),
                         Stream(node, Odometry, options.ground_truth_topic, self._on_ground_truth),
                         Stream(node, Imu, options.imu_topic, self._on_imu)]
         ros.steady_timer(node, LOOK_PERIOD, self._look)
-        ros.steady_timer(node, 1.0, lambda: self._write(writer.flush))
+        ros.steady_timer(node, 1.0, self._flush)
 
     def finished(self) -> bool:
         """Return whether the recording time is over, or nothing can be written any more."""
@@ -199,26 +222,30 @@ class RecordNode:
         for stream in self.streams:
             stream.look()
 
+    def _flush(self) -> None:
+        self._write(lambda writer: writer.flush())
+
     def _on_command(self, v: float, omega: float) -> None:
-        self._write(self.writer.command, time.monotonic(), v, omega)
+        now = time.monotonic()
+        self._write(lambda writer: writer.command(now, v, omega))
 
     def _on_odometry(self, message: Any) -> None:
-        speed = message.twist.twist
-        self._write(self.writer.odometry, time.monotonic(), *planar_pose(message), speed.linear.x, speed.angular.z,
-                    ros.stamp_seconds(message.header.stamp))
+        now, speed, stamp = time.monotonic(), message.twist.twist, ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.odometry(now, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
-        self._write(self.writer.ground_truth, time.monotonic(), *planar_pose(message),
-                    ros.stamp_seconds(message.header.stamp))
+        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.ground_truth(now, *planar_pose(message), stamp))
 
     def _on_imu(self, message: Any) -> None:
-        self._write(self.writer.imu, time.monotonic(), message.angular_velocity.z,
-                    ros.stamp_seconds(message.header.stamp))
+        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.imu(now, message.angular_velocity.z, stamp))
 
-    def _write(self, write: Callable[..., None], *values: float) -> None:
+    def _write(self, write: Callable[[TrialWriter], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
         try:
-            write(*values)
+            if self.writer is not None:
+                write(self.writer)
         except OSError as error:
             self.failure = self.failure or error
 
@@ -281,6 +308,17 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
     parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    add_dataset_options(parser)
+    options = parser.parse_args(arguments)
+    if (options.trial is None) != options.recover:
+        parser.error("give either the name of a trial or --recover")
+    if not (math.isfinite(options.seconds) and options.seconds >= 0):
+        parser.error(f"--seconds {options.seconds}: must be 0 or above")
+    return options
+
+
+def add_dataset_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the topics that are recorded, and what dataset.toml says of the vehicle."""
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
@@ -291,12 +329,6 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--mass", type=float, help="[kg], where known")
     parser.add_argument("--v-limit", type=float, default=1.0, help="[m/s]")
     parser.add_argument("--omega-limit", type=float, default=1.0, help="[rad/s]")
-    options = parser.parse_args(arguments)
-    if (options.trial is None) != options.recover:
-        parser.error("give either the name of a trial or --recover")
-    if not (math.isfinite(options.seconds) and options.seconds >= 0):
-        parser.error(f"--seconds {options.seconds}: must be 0 or above")
-    return options
 
 
 def finish(writer: TrialWriter) -> Path | None:
@@ -342,7 +374,7 @@ def main(arguments: list[str] | None = None) -> int:
     failed = False
     try:
         with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
-            recorder = RecordNode(node, writer, options)
+            recorder = RecordNode(node, writer, options, options.seconds)
             ros.spin(node, recorder.finished)
             failed = recorder.failure is not None
             for topic, count in recorder.lost().items():

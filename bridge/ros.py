@@ -34,6 +34,7 @@ GUARD_TOPIC = "bridge/guard"
 DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
+MANOEUVRE_NAME = "bridge_manoeuvre"
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
