@@ -236,9 +236,10 @@ def main(arguments: list[str] | None = None) -> int:
         options = parse_arguments(parameters.as_options(ros_arguments, ros.MANOEUVRE_NAME, "commands") + own)
         table, safety, place = prepare(options)
         if options.dataset and not options.check:
-            write_dataset_file(options.dataset, options)
             for number in range(options.first, options.first + options.repeat):
                 TrialWriter.check(options.dataset, f"{options.trial}_{number}")
+            options.dataset.mkdir(parents=True, exist_ok=True)
+            write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
         print(f"bridge.manoeuvre: {error}", file=sys.stderr)
         return 2
