@@ -15,9 +15,12 @@ import array
 import ast
 import importlib
 import math
+import os
 import sys
+import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +28,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bridge import ros
+from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
 
 RESET_SILENCE = 0.5
 MATCHING = 0.3
@@ -33,6 +37,8 @@ LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
+TOKEN_VARIABLE = "BRIDGE_TOKEN"
+"""Environment variable with the token of episode control; on a command line everybody could read it."""
 SCAN_RANGE = 5.0
 """Range of the scanner [m]."""
 TRUTH_DEVIATION = (1e-3, 1e-3)
@@ -64,6 +70,10 @@ class Frame:
     collided: bool = False
     reached_goal: bool = False
     done: bool = False
+    terminated: bool = False
+    """Whether the episode ended by itself; one that is done and not terminated ran out of time."""
+    reward: float = 0.0
+    """Of the last period, where the simulator has one."""
     odometry: tuple[float, float, float, float, float] | None = None
     """x, y, yaw, v, omega as the vehicle's own odometry reports them; None where the simulator has none."""
     ranges: np.ndarray | None = None
@@ -139,6 +149,7 @@ class ChairSimulator:
         reported = [float(getattr(odometry, name)) for name in names]
         return Frame(np.asarray(time_step.obs), x, y, yaw, v, omega, collided=bool(metrics["collision"]),
                      reached_goal=bool(metrics["success"]), done=bool(time_step.terminated | time_step.truncated),
+                     terminated=bool(time_step.terminated), reward=float(time_step.reward),
                      odometry=(reported[0], reported[1], reported[2], reported[3], reported[4]),
                      ranges=np.asarray(self._scan(self._state)))
 
@@ -210,7 +221,8 @@ class SimulateNode:
         kind = getattr(commands, options.command_type)
         node.create_subscription(kind, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
         ros.subscribe_state(node, Bool, ros.PAUSE_TOPIC, self._on_pause)
-        self.paused = False
+        self.paused = self.stepped = False
+        self._lock = threading.Lock()  # a period is simulated by the timer or by a client, never by both
         self.episodes: list[Episode] = []
         self.command_log: deque[tuple[float, float, float]] = deque(maxlen=LOG_LENGTH)
         """Steady time of receipt [s], v, omega."""
@@ -253,20 +265,84 @@ class SimulateNode:
     def _on_pause(self, message: Any) -> None:
         self.paused = bool(message.data)
 
+    def calls(self) -> Calls:
+        """Return the calls of episode control (`bridge.episodes`)."""
+        calls: Calls = {"hello": lambda _: {"protocol": PROTOCOL, "period": self.vehicle.period},
+                        "mode": self._call_mode, "reset": self._call_reset, "step": self._call_step,
+                        "state": self._call_state}
+
+        def locked(call: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[dict[str, Any]], dict[str, Any]]:
+            def run(message: dict[str, Any]) -> dict[str, Any]:
+                with self._lock:
+                    return call(message)
+
+            return run
+
+        return {name: locked(call) for name, call in calls.items()}
+
+    def _call_mode(self, message: dict[str, Any]) -> dict[str, Any]:
+        mode = message.get("mode")
+        if mode not in ("step", "realtime"):
+            raise ValueError(f"mode is {mode!r}; it must be step or realtime")
+        self.stepped = mode == "step"
+        return {"mode": mode}
+
+    def _call_reset(self, message: dict[str, Any]) -> dict[str, Any]:
+        seed = int(number(message, "seed", 0, 2**31 - 1))
+        self.finished_at = None
+        stamp = self._begin(seed)
+        return {"episode": len(self.episodes), "stamp": stamp}
+
+    def _call_step(self, message: dict[str, Any]) -> dict[str, Any]:
+        v, omega = (number(message, name, -100, 100) for name in ("v", "omega"))
+        periods = int(number(message, "periods", 1, 1000, 1))
+        if not self.stepped:
+            raise ValueError("steps need the mode step; call mode first")
+        reward = 0.0
+        for _ in range(periods):
+            if self._frame is None:
+                raise ValueError("no episode runs; call reset first")
+            frame = self.vehicle.step(v, omega)
+            self._pass_time(self.vehicle.period)
+            reward += frame.reward
+            stamp = self._show(frame)
+            if frame.done:
+                break
+        return {"episode": len(self.episodes), "stamp": stamp, "reward": reward, "terminated": frame.terminated,
+                "truncated": frame.done and not frame.terminated, "collided": bool(frame.collided),
+                "reached_goal": bool(frame.reached_goal)}
+
+    def _call_state(self, _: dict[str, Any]) -> dict[str, Any]:
+        state: dict[str, Any] = {"episode": len(self.episodes), "mode": "step" if self.stepped else "realtime",
+                                 "done": self._frame is None}
+        if self._frame is not None:
+            state.update({name: float(getattr(self._frame, name)) for name in ("x", "y", "yaw", "v", "omega")})
+        return state
+
+    def _pass_time(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+        if self._clock is not None:
+            self._clock(*self.clock.stamp())
+
     def _on_half_period(self) -> None:
+        with self._lock:
+            self._advance_half_period()
+
+    def _advance_half_period(self) -> None:
+        if self.stepped:
+            self._e_stop.publish(self._types[2](data=False))
+            return
         if self.paused:
             return
         self._half += 1
-        self.clock.advance(self.vehicle.period / 2)
-        if self._clock is not None:
-            self._clock(*self.clock.stamp())
+        self._pass_time(self.vehicle.period / 2)
         if self._half % 2:
             self._e_stop.publish(self._types[2](data=False))  # never pulled; between two images, not to delay one
         if self.finished_at is not None:
             return
         if self._frame is None:
             if time.monotonic() >= self._begin_at and self._half % 2 == 0 and self._has_driver():
-                self._begin()
+                self._begin(self.options.seed + len(self.episodes))
         elif self._half % 2:
             self._next = self.vehicle.step(*self._command())
             self._publish_pose(_halfway(self._frame, self._next))
@@ -282,34 +358,38 @@ class SimulateNode:
             self._alone_at = now
         return now - self._alone_at > MATCHING
 
-    def _begin(self) -> None:
-        seed = self.options.seed + len(self.episodes)
+    def _begin(self, seed: int) -> tuple[int, int]:
+        """Begin the episode of a seed; return the stamp of its first image."""
+        self._pass_time(self.vehicle.period / 2)  # no two images have the same stamp
         self.episodes.append(Episode(seed))
         self._next = None
         self._collision.publish(self._types[2](data=False))
-        self._show(self.vehicle.reset(seed))
+        stamp = self._show(self.vehicle.reset(seed))
         self.episodes[-1].began, self.episodes[-1].steps = time.monotonic(), 0
+        return stamp
 
-    def _show(self, frame: Frame) -> None:
-        """Publish the end of a period, and end the episode where it is over."""
+    def _show(self, frame: Frame) -> tuple[int, int]:
+        """Publish the end of a period, and end the episode where it is over; return the stamp of the image."""
         self._frame = frame
-        self._publish_image(frame)
+        stamp = self._publish_image(frame)
         self._publish_pose(frame)
         episode = self.episodes[-1]
         episode.steps += 1
         if not frame.done:
-            return
+            return stamp
         episode.collided, episode.reached_goal = bool(frame.collided), bool(frame.reached_goal)
         episode.x, episode.y, episode.ended = float(frame.x), float(frame.y), time.monotonic()
         if frame.collided:
             self._collision.publish(self._types[2](data=True))
         self._frame = None
         self._begin_at = time.monotonic() + RESET_SILENCE
-        self.node.get_logger().info(f"episode {len(self.episodes)}: {episode}")
-        if len(self.episodes) == self.options.episodes:
+        if not self.stepped:
+            self.node.get_logger().info(f"episode {len(self.episodes)}: {episode}")
+        if len(self.episodes) == self.options.episodes and not self.stepped:
             self.finished_at = time.monotonic()
-        if self.options.results:
+        if self.options.results and not self.stepped:
             ros.write_json(self.options.results, self.results())
+        return stamp
 
     def _command(self) -> tuple[float, float]:
         """Return the command in force: the last one, zero where it has expired or is not finite."""
@@ -326,7 +406,7 @@ class SimulateNode:
         else:
             header.stamp = self.node.get_clock().now().to_msg()
 
-    def _publish_image(self, frame: Frame) -> None:
+    def _publish_image(self, frame: Frame) -> tuple[int, int]:
         message, image = self._types[0](), frame.image
         if self.options.image_size:
             image = enlarge(image, self.options.image_size)
@@ -340,6 +420,7 @@ class SimulateNode:
         intrinsics = getattr(self.vehicle, "intrinsics", None)
         if intrinsics is not None:
             self._info.publish(self._camera_info(message, intrinsics, frame.image.shape[:2]))
+        return message.header.stamp.sec, message.header.stamp.nanosec
 
     def _camera_info(self, image: Any, intrinsics: tuple[float, ...], size: tuple[int, ...]) -> Any:
         """Return sensor_msgs/CameraInfo of an ideal pinhole for an image that was enlarged from `size`."""
@@ -475,6 +556,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
     parser.add_argument("--clock", action="store_true", help="publish the simulated time on /clock and stamp with it")
     parser.add_argument("--speed", type=speed, default=1.0, help="simulated seconds per second, such as 0.5; default 1")
+    parser.add_argument("--port", type=int, metavar="PORT",
+                        help="serve episode control over TCP: resets and lock-step (bridge.episodes); 0: any free port")
+    parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS",
+                        help=f"address of the port; another than the loopback needs a token in {TOKEN_VARIABLE}")
     parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
     parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
@@ -492,7 +577,17 @@ def main(arguments: list[str] | None = None) -> int:
     vehicle = make_vehicle(options)
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
+        try:
+            server = None if options.port is None else EpisodeServer(
+                simulate.calls(), options.bind, options.port, os.environ.get(TOKEN_VARIABLE, ""))
+        except (ValueError, OSError, OverflowError) as error:
+            print(f"bridge.simulate: --port {options.port}: {error}", file=sys.stderr)
+            return 2
+        if server is not None:
+            node.get_logger().info(f"episode control on {options.bind}, port {server.port}")
         ros.spin(node, simulate.finished)
+        if server is not None:
+            server.close()
         if options.results:
             ros.write_json(options.results, simulate.results())
     return 0

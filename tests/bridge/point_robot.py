@@ -34,7 +34,8 @@ class PointRobot:
         image = np.full((64, 64, 3), 255, np.uint8)
         image[0, self.steps % 64] = 254 - self.steps % 100  # each frame differs, as a real camera's do
         reached = self.x >= self.goal
-        return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=reached or self.steps >= self.longest,
+        done = reached or self.steps >= self.longest
+        return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
                      odometry=(self.x, self.y, self.yaw, v, omega),
                      ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 5.0, 1.0]))
 
