@@ -6,6 +6,8 @@ distance in `RAYS` directions. Lengths are in units of `UNIT`, so that the learn
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +33,13 @@ def truth(env: Env, state: State) -> jax.Array:
     ahead, aside = dx * jnp.cos(yaw) + dy * jnp.sin(yaw), dy * jnp.cos(yaw) - dx * jnp.sin(yaw)
     near = jnp.stack([ahead, aside, v, omega]) / UNIT
     return jnp.concatenate([near, free_distances(body, state.scene.boxes) / UNIT]).astype(jnp.float32)
+
+
+def scan(env: Env, state: State) -> jax.Array:
+    """(RAYS,) m from the drive-axle centre to the first box in each direction of ANGLES, at most RANGE."""
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    body = footprint(env.model.spec, x, y, yaw)
+    return free_distances(dataclasses.replace(body, x=x, y=y), state.scene.boxes)
 
 
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
