@@ -2,6 +2,9 @@
 
     schema, kind      1, "sysid-close-loop"
     verdict, reason   "named", "none" or "unexplained", and why in one sentence
+    noise             channel -> factor on the noise of the reference days, its 95 % interval, and whether it surely
+                      `changed`; empty without reference days
+    noise_sentence    the channels that changed, null where none did
     warnings          what speaks against taking a name as certain, in sentences
     question          what was asked: against a reference, or of the model family
     effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
@@ -48,6 +51,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors.noise_level import said
 from sysid.follow_up.calibrated import calibrated
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
@@ -94,8 +98,10 @@ def make_report(result: Result) -> dict[str, Any]:
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
+    noise = {} if result.noise is None else result.noise.report()
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
+        "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
         "warnings": warnings(result), "question": asked, "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
@@ -310,6 +316,8 @@ def base_table(result: Result) -> list[dict[str, Any]]:
 def summary(report: dict[str, Any]) -> str:
     """What a person reads first."""
     lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+    if report["noise_sentence"] is not None:
+        lines.append(f"noise: {report['noise_sentence']}")
     lines += [f"  warning: {one}" for one in report["warnings"]]
     for one in report["effects"]:
         values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
