@@ -65,6 +65,8 @@ def verdict(report: dict[str, Any]) -> str:
     if rows:
         parts.append(table(["effect", "kind", "or one of", "parameter", "value", "95 % from", "to", "unit"],
                            rows))
+        if left_open := [text for one in report["effects"] for text in not_determined(one["parameters"])]:
+            parts.append(bullets(left_open))
         parts.append(bullets([f"{one['name']}: {one['equation']}" for one in report["effects"] if one["equation"]]))
         for one in report["effects"]:
             evidence = one["evidence"]["by_manoeuvre"]
@@ -76,6 +78,19 @@ def verdict(report: dict[str, Any]) -> str:
                 "effect fitted to the others lowers the squared residual there"))
             parts += [paragraph(agreement(one)), predictions(one)]
     return "".join(parts)
+
+
+def not_determined(parameters: dict[str, Any]) -> list[str]:
+    """Which parameters of an effect the drives do not determine up to an end of their physical range, in words."""
+    out = []
+    for name, p in parameters.items():
+        below, above = p["open"]
+        if below or above:
+            unit = "" if p["unit"] == "-" else f" {p['unit']}"
+            least, most = (f"{end:.3g}{unit}" for end in p["interval"])
+            where = "" if below and above else f" above {least}" if above else f" below {most}"
+            out.append(f"the drives do not determine {name}{where}")
+    return out
 
 
 def agreement(effect: dict[str, Any]) -> str:
