@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -64,7 +65,7 @@ class NoiseLevels:
         reach = np.exp(special.stdtrit(self.freedom, (1 + CONFIDENCE) / 2) * self.error)
         return float(self.factor[channel] / reach), float(self.factor[channel] * reach)
 
-    def report(self) -> dict[str, dict[str, object]]:
+    def report(self) -> dict[str, dict[str, Any]]:
         """Channel -> factor, 95 % interval, and whether it surely is another than on the reference days."""
         return {name: {"factor": float(self.factor[c]), "interval": list(self.interval(c)),
                        "changed": bool(self.changed[c])}
@@ -78,14 +79,16 @@ def noise_levels(ours: NoisyDrives, theirs: NoisyDrives, channels: Sequence[str]
         alpha: probability that a channel of any counts as changed where the noise is as usual.
     """
     for parts in (_between_replicates, _in_steady_motion):
-        sizes = [_size(parts(one)) for one in (ours, theirs)]
-        if sizes[0] is not None and sizes[1] is not None and np.isfinite(sizes[0][0] - sizes[1][0]).any():
-            (mine, own, parts_of_ours), (usual, other, parts_of_theirs) = sizes
-            error, measured = float(np.hypot(own, other)), np.isfinite(mine - usual)
-            freedom = float((min(parts_of_ours, parts_of_theirs) - 1) * measured.sum())
+        mine, usual = _size(parts(ours)), _size(parts(theirs))
+        if mine is None or usual is None:
+            continue
+        apart = mine.log - usual.log
+        measured = np.isfinite(apart)
+        if measured.any():
+            error = float(np.hypot(mine.error, usual.error))
+            freedom = float((min(mine.parts, usual.parts) - 1) * measured.sum())
             limit = special.stdtrit(freedom, 1 - alpha / (2 * len(channels))) * error
-            return NoiseLevels(tuple(channels), np.exp(mine - usual), error, freedom,
-                               np.where(measured, np.abs(mine - usual), 0.0) > limit)
+            return NoiseLevels(tuple(channels), np.exp(apart), error, freedom, np.nan_to_num(np.abs(apart)) > limit)
     return None
 
 
@@ -99,7 +102,7 @@ def steady_bins(trial: Trial, bins: int, width: float) -> np.ndarray:
     return np.asarray(end - width - last >= SETTLED - 1e-6)
 
 
-def said(levels: Mapping[str, Mapping[str, object]], alone: bool) -> str:
+def said(levels: Mapping[str, Mapping[str, Any]], alone: bool) -> str:
     """The channels that changed in a sentence without its full stop, "" where none did.
 
     Args:
@@ -108,7 +111,7 @@ def said(levels: Mapping[str, Mapping[str, object]], alone: bool) -> str:
     """
     parts = []
     for name, one in levels.items():
-        low, high = one["interval"]  # type: ignore[misc]
+        low, high = one["interval"]
         if one["changed"]:
             parts.append(f"the {SPOKEN.get(name, name)} is {one['factor']:.2g} times as noisy as on the reference days "
                          f"({low:.2g} to {high:.2g})")
@@ -130,10 +133,18 @@ def _in_steady_motion(drives: NoisyDrives) -> Parts:
             if inside.any()]
 
 
-def _size(parts: Parts) -> tuple[np.ndarray, float, int] | None:
-    """Logarithm (C,) of the noise's size, up to a constant, its standard error by leaving out each part in turn, and
-    the number of parts; None where there are too few. The error is that of all channels together: a few parts show it
-    of one badly."""
+@dataclass(frozen=True)
+class _Size:
+    """Noise of some drives."""
+
+    log: np.ndarray  # (C,) logarithm of its size, up to a constant; nan where not measured
+    error: float
+    """Standard error of all channels together: a few parts show it of one badly."""
+    parts: int
+
+
+def _size(parts: Parts) -> _Size | None:
+    """Size of the noise, with its error by leaving out each part in turn; None where there are too few."""
     changes = [_changes(*one) for one in parts]
     if len(changes) < BLOCKS:
         return None
@@ -144,7 +155,7 @@ def _size(parts: Parts) -> tuple[np.ndarray, float, int] | None:
     count = len(without)
     variance = (count - 1) * np.square(without - without.mean(0)).mean(0)
     known = variance[np.isfinite(variance)]
-    return (size, float(np.sqrt(known.mean())), count) if len(known) else None
+    return _Size(size, float(np.sqrt(known.mean())), count) if len(known) else None
 
 
 def _changes(series: np.ndarray, seen: np.ndarray) -> list[np.ndarray]:
