@@ -123,8 +123,12 @@ Parts = list[tuple[np.ndarray, np.ndarray]]
 
 
 def _between_replicates(drives: NoisyDrives) -> Parts:
+    parts = []
     apart = deviations(drives.series * drives.weight, [list(group) for group in drives.replicates])
-    return [(apart[list(group)], drives.weight[list(group)] > 0) for group in drives.replicates if len(group) > 1]
+    for group in (list(each) for each in drives.replicates if len(each) > 1):
+        measured = (drives.weight[group] > 0).all(0)  # by all of them: else they differ by what was not measured
+        parts.append((apart[group], np.broadcast_to(measured, apart[group].shape)))
+    return parts
 
 
 def _in_steady_motion(drives: NoisyDrives) -> Parts:

@@ -67,6 +67,16 @@ def test_what_strikes_now_and_then_is_not_noise():
     assert not found.changed.any()
 
 
+def test_bins_that_only_some_replicates_measure_do_not_count():
+    ours = drives(1)
+    ours.series[...] += 20.0  # far from 0, which stands where nothing was measured
+    for drive in range(0, 20, 2):
+        ours.weight[drive, drive % 7 :: 7] = 0.0
+    found = noise_levels(ours, drives(0), CHANNELS, ALPHA)
+    assert not found.changed.any()
+    assert found.factor == pytest.approx(1.0, abs=0.25)
+
+
 def test_without_replicates_only_steady_motion_counts():
     def edges(random, shape):
         return 10.0 * random.standard_normal(shape) * (np.arange(shape[1]) < 30)[:, None]
