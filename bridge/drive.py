@@ -10,7 +10,6 @@ import argparse
 import math
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from bridge import parameters, ros
@@ -18,6 +17,7 @@ from bridge.bases import BASES
 from bridge.commands import endpoints
 from bridge.controller import Controller
 from bridge.diagnosis import Evidence, FrameLog, causes
+from bridge.options import Parser, in_range, result_file, whole
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import SafetyConfig
 from bridge.vehicle_node import NOT_ACTIVE, VehicleNode, add_options, limits
@@ -32,18 +32,19 @@ STARTING = 2.0
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="bridge.drive", description="Drive a vehicle with a policy file.")
+    parser = Parser(prog="bridge.drive", description="Drive a vehicle with a policy file.")
     parser.add_argument("policy", nargs="+", help="policy file: a folder or a zip of it; of several the last counts")
-    parser.add_argument("--slew", type=float, nargs=2, metavar=("V", "OMEGA"), default=(math.inf, math.inf),
+    parser.add_argument("--slew", type=in_range(0, infinite=True), nargs=2, metavar=("V", "OMEGA"),
+                        default=(math.inf, math.inf),
                         help="largest change of commands [m/s2, rad/s2]; a stop is not slowed")
     parser.add_argument("--image-topic", default=ros.IMAGE_TOPIC)
     parser.add_argument("--compressed", action="store_true",
                         help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
-    parser.add_argument("--crop", type=int, nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
+    parser.add_argument("--crop", type=whole(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
                         help="the part of the camera's image that the policy sees [pixels]")
-    parser.add_argument("--stamp-age", type=float, default=SafetyConfig.stamp_age,
+    parser.add_argument("--stamp-age", type=in_range(0, infinite=True), default=SafetyConfig.stamp_age,
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
-    parser.add_argument("--frame-age", type=float, default=SafetyConfig.frame_age,
+    parser.add_argument("--frame-age", type=in_range(0, infinite=True), default=SafetyConfig.frame_age,
                         help="largest age of a frame since its receipt [s]")
     parser.add_argument("--pace", choices=("wall", "stamp"), default="wall",
                         help="clock of the policy's rate; stamp: for a simulator that is not in real time")
@@ -54,7 +55,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on bridge/rearm")
     parser.add_argument("--lifecycle", action="store_true",
                         help="be a lifecycle node, which stands until it is configured and activated")
-    parser.add_argument("--results", type=Path, help="JSON file for the counts of the drive, written at its end")
+    parser.add_argument("--results", type=result_file, help="JSON file for the counts of the drive, written at its end")
     add_options(parser)
     options = parser.parse_intermixed_args(arguments)
     options.policy = options.policy[-1]  # the first ones come from parameter files

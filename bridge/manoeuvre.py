@@ -21,6 +21,7 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.options import Parser, in_range, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
@@ -162,18 +163,18 @@ def _enter_was_pressed() -> bool:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="bridge.manoeuvre", description="Drive a command file and record it.")
+    parser = Parser(prog="bridge.manoeuvre", description="Drive a command file and record it.")
     parser.add_argument("commands", type=Path, help="CSV file with the columns t,v,omega")
-    parser.add_argument("--space", type=positive, nargs=2, required=True, metavar=("LENGTH", "WIDTH"),
+    parser.add_argument("--space", type=in_range(1e-3, 1e3), nargs=2, required=True, metavar=("LENGTH", "WIDTH"),
                         help="free floor [m]; nothing else may stand or walk on it")
-    parser.add_argument("--radius", type=positive, default=0.9,
+    parser.add_argument("--radius", type=in_range(1e-3, 1e3), default=0.9,
                         help="of the vehicle around its drive-axle centre [m]; default: a WHILL with its rider's feet")
-    parser.add_argument("--uncertainty", type=fraction, default=0.15,
+    parser.add_argument("--uncertainty", type=in_range(1e-3, 0.999), default=0.15,
                         help="how much faster or slower the vehicle may be than commanded; default 0.15")
-    parser.add_argument("--slew", type=positive, nargs=2, metavar=("V", "OMEGA"), default=(1.0, 2.0),
+    parser.add_argument("--slew", type=in_range(1e-3, 1e3), nargs=2, metavar=("V", "OMEGA"), default=(1.0, 2.0),
                         help="steepest change of the commands [m/s2, rad/s2]; default 1 2")
-    parser.add_argument("--repeat", type=count, default=1, help="replicates, each of them armed by an operator")
-    parser.add_argument("--first", type=count, default=1, help="number of the first replicate")
+    parser.add_argument("--repeat", type=whole(), default=1, help="replicates, each of them armed by an operator")
+    parser.add_argument("--first", type=whole(), default=1, help="number of the first replicate")
     parser.add_argument("--dataset", type=Path, help="folder of the dataset to record into; default: do not record")
     parser.add_argument("--trial", default="", help="name of the trials before their number; default: the file's name")
     parser.add_argument("--check", action="store_true", help="only check, and say where to put the vehicle")
@@ -182,34 +183,6 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     options.trial = options.trial or options.commands.stem
     return options
-
-
-def positive(text: str) -> float:
-    """Return a finite number above 0."""
-    return _number(text, 0.0, math.inf, "a number above 0")
-
-
-def fraction(text: str) -> float:
-    """Return a number above 0 and below 1."""
-    return _number(text, 0.0, 1.0, "a number above 0 and below 1")
-
-
-def count(text: str) -> int:
-    """Return a whole number from 1 on."""
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
-    return value
-
-
-def _number(text: str, low: float, high: float, rule: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low < value < high:
-        raise argparse.ArgumentTypeError(f"{text!r} must be {rule}")
-    return value
 
 
 def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, str]:

@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from bridge import ros
 from bridge.commands import CommandListener
+from bridge.options import Parser, in_range
 from bridge.streams import Stream
 
 COLUMNS = {
@@ -302,18 +303,17 @@ def planar_pose(message: Any) -> tuple[float, float, float]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line. The geometry's defaults are those of the WHILL Model CR."""
-    parser = argparse.ArgumentParser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
+    parser = Parser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
     parser.add_argument("trial", nargs="?", help="name of the trial, like circle_1")
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
-    parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
+    parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
+                        help="end after so long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     add_dataset_options(parser)
     options = parser.parse_args(arguments)
     if (options.trial is None) != options.recover:
         parser.error("give either the name of a trial or --recover")
-    if not (math.isfinite(options.seconds) and options.seconds >= 0):
-        parser.error(f"--seconds {options.seconds}: must be 0 or above")
     return options
 
 
@@ -323,12 +323,12 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
     parser.add_argument("--vehicle", default="WHILL Model CR")
-    parser.add_argument("--wheel-radius", type=float, default=0.1325, help="[m]")
-    parser.add_argument("--track", type=float, default=0.496, help="[m]")
-    parser.add_argument("--wheelbase", type=float, default=0.45, help="[m]")
-    parser.add_argument("--mass", type=float, help="[kg], where known")
-    parser.add_argument("--v-limit", type=float, default=1.0, help="[m/s]")
-    parser.add_argument("--omega-limit", type=float, default=1.0, help="[rad/s]")
+    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
+    parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")
+    parser.add_argument("--wheelbase", type=in_range(0, 5), default=0.45, help="[m]")
+    parser.add_argument("--mass", type=in_range(0.01, 1e4), help="[kg], where known")
+    parser.add_argument("--v-limit", type=in_range(0.01, 100), default=1.0, help="[m/s]")
+    parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0, help="[rad/s]")
 
 
 def finish(writer: TrialWriter) -> Path | None:

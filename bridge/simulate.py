@@ -29,6 +29,7 @@ import numpy as np
 
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
+from bridge.options import Parser, in_range, result_file, whole
 
 RESET_SILENCE = 0.5
 MATCHING = 0.3
@@ -493,37 +494,27 @@ def enlarge(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
-    """Return the simulator that `--simulator MODULE:FACTORY` names."""
+    """Return the simulator that `--simulator MODULE:FACTORY` names.
+
+    Raises:
+        ValueError, FileNotFoundError: an option, or the policy's folder, is refused.
+    """
     module, _, name = options.simulator.partition(":")
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise SystemExit(f"bridge.simulate: --simulator {options.simulator}: {error}. It must be MODULE:FACTORY, "
-                         "called with task and vehicle. Correct it or leave it out.") from error
+        raise ValueError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
+                         "vehicle. Correct it or leave it out.") from error
     changes = dict(options.set)
     if options.policy is None:
         return factory(task=options.task or "corridor", vehicle=options.vehicle, **changes)
     from whill_mjx.evaluation.policy_world import read_world
 
-    try:
-        world = read_world(options.policy)
-    except ValueError as error:
-        raise SystemExit(f"bridge.simulate: {error}") from error
+    world = read_world(options.policy)
     same = options.task in (None, world.task)
     fields = {**world.fields, **changes} if same else changes
     return factory(task=options.task or world.task, vehicle=options.vehicle or world.vehicle,
                    size=(world.height, world.width), **fields)
-
-
-def speed(text: str) -> float:
-    """Return a speed of time from 0.01 to 100."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.01 <= value <= 100:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number from 0.01 to 100")
-    return value
 
 
 def field(text: str) -> tuple[str, Any]:
@@ -539,7 +530,7 @@ def field(text: str) -> tuple[str, Any]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="python -m bridge.simulate",
+    parser = Parser(prog="python -m bridge.simulate",
                                      description="Serve the simulator on the vehicle's topics.")
     parser.add_argument("policy", nargs="?", type=Path, help="folder of a policy or of its training: task, gates, "
                         "vehicle and camera are those that it was trained with")
@@ -548,33 +539,41 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="change a field of the task, such as gates=1 or layout=fixed; repeat for more")
     parser.add_argument("--vehicle", help="vehicle file or built-in vehicle; default: that of the policy, "
                         "or the task's own")
-    parser.add_argument("--episodes", type=int, default=0, help="end after so many; 0: never")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode; each next one adds 1")
-    parser.add_argument("--wait", type=float, default=10.0, help="wait so long for a driver before the first one [s]")
-    parser.add_argument("--linger", type=float, default=1.0, help="listen for so long after the last episode [s]")
-    parser.add_argument("--results", type=Path, help="JSON file for the outcome of the episodes")
-    parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="enlarge the camera image")
+    parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
+    parser.add_argument("--wait", type=in_range(0), default=10.0,
+                        help="wait so long for a driver before the first one [s]")
+    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen for so long after the last episode [s]")
+    parser.add_argument("--results", type=result_file, help="JSON file for the outcome of the episodes")
+    parser.add_argument("--image-size", type=whole(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
+                        help="enlarge the camera image")
     parser.add_argument("--clock", action="store_true", help="publish the simulated time on /clock and stamp with it")
-    parser.add_argument("--speed", type=speed, default=1.0, help="simulated seconds per second, such as 0.5; default 1")
-    parser.add_argument("--port", type=int, metavar="PORT",
+    parser.add_argument("--speed", type=in_range(0.01, 100), default=1.0,
+                        help="simulated seconds per second, such as 0.5; default 1")
+    parser.add_argument("--port", type=whole(0, 65535), metavar="PORT",
                         help="serve episode control over TCP: resets and lock-step (bridge.episodes); 0: any free port")
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS",
                         help=f"address of the port; another than the loopback needs a token in {TOKEN_VARIABLE}")
     parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
-    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
+                        help="SCHED_FIFO priority, like 20")
     parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until its episodes are over, SIGTERM or Ctrl-C."""
+    """Run the node until its episodes are over, SIGTERM or Ctrl-C; return 2 where an option is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
     if options.simulator.startswith("bridge.simulate:"):  # others may abort with it
         from whill_mjx.processor import share_results
 
         share_results()
-    vehicle = make_vehicle(options)
+    try:
+        vehicle = make_vehicle(options)
+    except (ValueError, FileNotFoundError) as error:
+        print(f"bridge.simulate: {error}", file=sys.stderr)
+        return 2
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
         try:

@@ -18,6 +18,7 @@ from bridge import inputs, ros
 from bridge.bases import BASES
 from bridge.commands import CommandTopic, Ear, Endpoint
 from bridge.guard import BEAT_PERIOD, GuardLink
+from bridge.options import in_range, whole
 from bridge.safety import Command, State, Supervisor
 from bridge.whill import ChairGate, ChairState
 
@@ -231,9 +232,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--whill-state", default="", metavar="TOPIC",
                         help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
                              f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
-    parser.add_argument("--v-limits", type=float, nargs=2, metavar=("LOW", "HIGH"),
+    parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: those of policy and base")
-    parser.add_argument("--omega-limits", type=float, nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
+    parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
@@ -241,7 +242,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="own: start a guard process; other: wait for one, such as a guard of another computer")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node could send commands; when it does, it drives")
-    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
+                        help="SCHED_FIFO priority, like 20")
     inputs.add_options(parser)
 
 

@@ -12,9 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
+
 from sysid import command_line
 from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.log import Log
+from whill_mjx.io.folders import claim_folder
+
+KIND = "sysid.inspect"
+OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png")
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
     from sysid.pages.report import write_report
     from whill_mjx.logs.dataset import write_text
 
-    paths = [folder / "inspect.txt", folder / "inspect.json", folder / "inspect.png"]
+    paths = [folder / name for name in OUTPUTS]
     write_text(paths[0], text(found) + "\n")
     write_report(paths[1], found)
     write_plot(paths[2], log, found)
@@ -48,14 +57,24 @@ def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
 
 def main(config: InspectConfig) -> dict[str, Any]:
     """Load, look, print and write."""
-    from sysid.pages.report import plain
-
-    log = load_whole(config.dataset, config.select, config.format)
-    found = inspect(log)
-    print(json.dumps(plain(found), indent=1) if config.json else text(found))
-    if config.out is not None:
+    with refusing():
+        log = load_whole(config.dataset, config.select, config.format)
+    if config.out is None:
+        return look(config, log)
+    with claim_folder(config.out, KIND, OUTPUTS) as claim:
+        claim.settle({})  # another look replaces an earlier one as a whole
+        found = look(config, log)
         for path in write(config.out, log, found):
             print(f"wrote {path}", file=sys.stderr)
+    return found
+
+
+def look(config: InspectConfig, log: Log) -> dict[str, Any]:
+    """What was found, printed."""
+    from sysid.pages.report import plain
+
+    found = inspect(log)
+    print(json.dumps(plain(found), indent=1) if config.json else text(found))
     return found
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.logs.log import Log
+from sysid.logs.log import Log, check_same_vehicle
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives
@@ -43,7 +43,7 @@ def find_missing(
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
-    _check(log, references)
+    check_logs(log, references)
     if log.fields.get("pose_stamps") == "receipt":
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
@@ -100,7 +100,8 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
         close()
 
 
-def _check(log: Log, references: Sequence[Log]) -> None:
+def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
+    """Raise ValueError for logs in which nothing can be found."""
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
@@ -109,9 +110,6 @@ def _check(log: Log, references: Sequence[Log]) -> None:
         if not other.training:
             raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
                              "held_out.")
-        for name in ("wheel_radius", "track", "wheelbase", "drive"):
-            mine, theirs = getattr(log.spec, name), getattr(other.spec, name)
-            if mine != theirs:
-                raise ValueError(f"reference {other.name!r}: {name} is {theirs}, but {mine} in {log.name!r}. A "
-                                 "reference must be a drive of the same vehicle; correct dataset.toml or leave it out.")
+        check_same_vehicle(log, other.spec, f"reference {other.name!r}", "A reference must be a drive of the same "
+                                                                         "vehicle")
 
