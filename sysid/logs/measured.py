@@ -6,6 +6,9 @@ Dataset 6 (Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): fiv
 
 Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
 both systems repeat the last value between updates.
+
+Two faults of the DRIVE files are mended here. Their converter turned the positions of a window by the mean of its first
+five yaws but counted yaw from the first one; and an ICP update that fell between two windows is in neither.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.gyro import told_sign
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.sources import about
@@ -39,8 +43,10 @@ CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
 MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
-# The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
-GYRO_SIGN = {"warthog_gravel": -1.0}
+FRAME_SAMPLES = 5
+"""Samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions."""
+HELD = 1e-9
+"""Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
 MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
@@ -80,8 +86,8 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
     Args:
         folder: folder with the .npz and .csv.gz files.
         runs: file stems, e.g. ("warthog_sand_1",).
-        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the note on
-            the log states how often and by how much.
+        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
+            is then that of wheels and gyro, and the note on the log states how often and how much.
 
     Returns:
         One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
@@ -127,7 +133,8 @@ def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -
 def only_changes(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> PoseStream:
     """The samples at which the pose differs from the one before (yaw unwrapped); the first sample is the start."""
     yaw = np.unwrap(yaw)
-    changed = np.flatnonzero((np.diff(x) != 0) | (np.diff(y) != 0) | (np.diff(yaw) != 0)) + 1
+    moved = np.abs([np.diff(x), np.diff(y), np.diff(yaw)]).max(axis=0)
+    changed = np.flatnonzero(moved > HELD) + 1
     return PoseStream(t[changed], x[changed], y[changed], yaw[changed])
 
 
@@ -157,12 +164,14 @@ def _drive_windows(path: Path, run: str, chained: bool
     spec = drive_spec(run)
     command_v, command_omega = twist_from_wheels(spec, block("cmd_left"), block("cmd_right"))
     wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
-    x, y, yaw = block("icp_x"), block("icp_y"), np.unwrap(block("icp_yaw"), axis=1)
-    gyro = GYRO_SIGN.get(run, 1.0) * block("imu_yaw")
+    x, y, yaw = in_first_frame(block("icp_x"), block("icp_y"), block("icp_yaw"))
+    gyro = block("imu_yaw")
     for name in DRIVE_COLUMNS:
         if not (np.abs(block(name)) < LARGEST).all():
             raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
                              "incomplete windows.")
+    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(len(data))])
+    gyro *= sign or 1.0
     length = DRIVE_STEP_ROWS if chained else 1
     t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
     trials, missed = [], []
@@ -174,7 +183,7 @@ def _drive_windows(path: Path, run: str, chained: bool
         pose = (x[row], y[row], yaw[row])
         breaks: list[tuple[float, float]] = []
         for k in range(row + 1, row + length):
-            pose, gap, between = _chain(pose, (x[k], y[k], yaw[k]))
+            pose, gap, between = _chain(pose, (x[k], y[k], yaw[k]), wheel_v[k - 1], gyro[k - 1])
             missed.append(gap)
             if gap > 0:
                 breaks.append((between[0] * DRIVE_DT, between[1] * DRIVE_DT))
@@ -189,37 +198,61 @@ def _drive_windows(path: Path, run: str, chained: bool
                             breaks=tuple(breaks)))
         rates[name] = t, gyro[rows].ravel()
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
+    if sign != 1.0:
+        note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
+                 ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
     if chained:
         late = np.array([gap for gap in missed if gap > 0] or [0.0])
         note += (f", chained by the last pose of each 2 s window: {np.mean(np.array(missed) > 0):.0%} of the joints "
-                 f"miss an ICP update; those are off by {np.median(late):.2f} m (median), {late.max():.2f} m at most")
+                 f"miss an ICP update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), "
+                 f"{late.max():.2f} m at most")
     return trials, note, rates
 
 
+def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Windows (N, 40) in the frame of their first sample, yaw unwrapped.
+
+    The publishers' converter (dataset_parser.py, build_torch_ready_dataset) turned the positions by the mean of the
+    first five yaws, which it did not unwrap: where yaw passes +-pi within them the mean is far off.
+    """
+    turned = yaw[:, :FRAME_SAMPLES].mean(axis=1, keepdims=True)
+    cos, sin = np.cos(turned), np.sin(turned)
+    return cos * x - sin * y, sin * x + cos * y, np.unwrap(yaw, axis=1)
+
+
 def _chain(
-    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]
+    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...], v: np.ndarray, omega: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, tuple[int, int]]:
     """Both windows in the frame of the first, the motion that the joint misses [m] (0 where it misses none), and the
     samples between which it does.
 
     The second window's frame is that of its own first sample. An ICP update between the last sample of the first
-    window and the first sample of the second is lost; then the time since the last change is over 1.5 update periods.
+    window and the first sample of the second is in neither. Then the time since the last change is over 1.5 update
+    periods. What the vehicle moved meanwhile is taken from its wheels and its gyro: that misses the ICP's own motion
+    from one update to the next by about half as much as the mean speed before and after does.
+
+    Args:
+        v: (40,) speeds of the wheels [m/s] in the last window of `first`.
+        omega: (40,) yaw rates of the gyro [rad/s] there.
     """
+    n = len(first[0])
+    before, after = (np.flatnonzero(np.abs(np.diff(one, axis=1)).max(axis=0) > HELD) + 1 for one in (
+        np.stack(first), np.stack(second)))
+    way = turn = 0.0
+    samples = (n, n)
+    if len(before) >= 2 and len(after) >= 2:
+        period = float(np.median(np.diff(np.append(before, n + after))))
+        last = int(before[-1])
+        if n + after[0] - last > 1.5 * period and last > n - DRIVE_ROWS:
+            samples = last, int(n + after[0])
+            way, turn = (DRIVE_DT * float(rate[last - n :].sum()) for rate in (v, omega))
     x0, y0, yaw0 = (float(values[-1]) for values in first)
+    x0, y0, yaw0 = x0 + way * np.cos(yaw0 + turn / 2), y0 + way * np.sin(yaw0 + turn / 2), yaw0 + turn
     cos, sin = np.cos(yaw0), np.sin(yaw0)
     x, y, yaw = second
     joined = (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
               np.concatenate([first[2], yaw0 + yaw]))
-    n = len(first[0])
-    changes = np.flatnonzero(np.diff(joined[0]) != 0) + 1
-    before, after = changes[changes < n], changes[changes > n]
-    if len(before) < 2 or len(after) < 2:
-        return joined, 0.0, (n, n)
-    period = float(np.median(np.diff(changes)))
-    if after[0] - before[-1] <= 1.5 * period:
-        return joined, 0.0, (n, n)
-    speed = np.hypot(joined[0][after[-1]] - joined[0][after[0]], joined[1][after[-1]] - joined[1][after[0]])
-    return joined, float(speed / max(after[-1] - after[0], 1) * period), (int(before[-1]), int(after[0]))
+    return joined, abs(way), samples
 
 
 def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
