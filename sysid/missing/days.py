@@ -11,16 +11,14 @@ import numpy as np
 
 from sysid.errors.noise import BIN_SHIFT, Whitener, replicate_groups, scatter
 from sysid.errors.space import Space
-from sysid.logs.log import Trial
-from sysid.logs.replicates import course_of, side_by_side
+from sysid.logs.log import START_NOISE, Trial
+from sysid.logs.replicates import course_of, near
 from sysid.missing.evidence import Columns
 
 ASSUMED_DAYS = 4.0
 """How many days the mean over all hypotheses counts as, beside the days' information on one."""
 EXCESS = 0.06
 """Standard deviation of a day's excess where reference days do not determine it."""
-
-EVEN = 0.97  # least correlation of two commands for their drives to be compared bin by bin
 
 
 class Binned(Protocol):
@@ -108,22 +106,10 @@ class Reference:
 
 
 def alike(a: Trial, b: Trial) -> bool:
-    """Whether two trials have the same course of commands up to size, so that bins correspond."""
-    if a.manoeuvre != b.manoeuvre:
-        return False
-    if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=0.02):
-        ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
-    elif (both := side_by_side(course_of(a), course_of(b), BIN_SHIFT)) is not None:
-        ours, theirs = both
-    else:
-        return False
-    for x, y in zip(ours.T, theirs.T, strict=True):
-        if np.allclose(x, y, atol=1e-6):
-            continue
-        size = np.linalg.norm(x) * np.linalg.norm(y)
-        if size == 0 or x @ y < EVEN * size:
-            return False
-    return True
+    """Whether two trials are nearly the same drive, so that the model leaves about the same in their bins: commands
+    that are close as functions of time, in shape and in size, from the same speeds."""
+    same_start = max(abs(a.start.v - b.start.v), abs(a.start.omega - b.start.omega)) <= START_NOISE
+    return a.manoeuvre == b.manoeuvre and same_start and near(course_of(a), course_of(b), BIN_SHIFT)
 
 
 def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
