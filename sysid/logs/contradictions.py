@@ -15,17 +15,22 @@ from sysid.logs.log import OdometryStream, Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
+NONE = 0.02  # m/s, below which a speed is none
 VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
+APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
 WHOLE = 0.8  # share of the motion that a direction must explain
 LITTLE = 0.75  # the same, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
-SURE = 6.0  # standard errors that such an angle must have, taken as if samples were independent
+SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 REACH = 10.0  # s of a clock that is looked for
-LATE = 0.6  # s that the fit does not reach
+LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
+UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step of the pose that is a reset
 FEW = 3  # resets of one drive; more steps are noise
-ZERO = 0.02  # of the pose's speed, below which reported speeds are none
+FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
+EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
+PLAINER = 0.1  # share of the motion that another explanation must explain more of
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class Motion:
     turn: np.ndarray  # (G,) rad/s
     v: np.ndarray  # (G,) m/s that it should have
     omega: np.ndarray  # (G,) rad/s
+    commanded: bool
+    """Whether these are the commands, since there is no odometry."""
 
 
 @dataclass(frozen=True)
@@ -51,48 +58,50 @@ class Direction:
     """Share of the motion that this explains."""
 
 
-def contradictions(trials: Sequence[Trial]) -> dict[str, list[str]]:
-    """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it."""
-    return {name: _of_stream(name, trials) for name in ("odometry", "ground_truth")}
+def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
+    """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it.
+
+    Args:
+        reach: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
+    """
+    return {name: _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
+            for name in ("odometry", "ground_truth")}
 
 
-def _of_stream(name: str, trials: Sequence[Trial]) -> list[str]:
-    found: list[str] = []
-    if name == "odometry":
-        found += _resets(trials)
-        found += _empty_speeds(trials)
-        if found:
-            return found
+def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
+    if name == "odometry" and (found := [*_resets(trials), *_empty_speeds(trials)]):
+        return found
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
-        return found
-    plain = _median([direction(one) for one in motions])
+        return []
+    plain = _median([direction(one, reach) for one in motions])
+    lates = [late for one in motions if (late := lateness(one)) is not None]
+    if len(lates) > len(motions) / 2:
+        late = float(np.median(lates))
+        return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
+                f"beside it: another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s "
+                f"{'from' if late > 0 else 'to'} its t."]
     if plain.explained < LITTLE:
-        mirrored = _median([direction(one, mirrored=True) for one in motions])
+        mirrored = _median([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
             return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
                     "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
-        lates = [late for one in motions if (late := lateness(one)) is not None]
-        if len(lates) > len(motions) / 2:
-            late = float(np.median(lates))
-            return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
-                    f"beside it: another clock. Subtract {late:.1f} s from its t."]
-        if name == "odometry" and _median([direction(one, world=True) for one in motions]).explained > WHOLE:
+        if name == "odometry" and _in_fixed_frame(motions):
             return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
                     "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
         if name == "odometry" and plain.explained < LITTLE / 2:
-            found.append(f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of "
-                         "how the pose moves. Check that both are of one vehicle, frame and clock.")
-        return found
+            return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
+                    "the pose moves. Check that both are of one vehicle, frame and clock."]
+        return []
     if plain.explained > WHOLE and ANGLE < abs(plain.angle) < BACKWARDS and abs(plain.angle) > SURE * plain.error:
         degrees = np.rad2deg(plain.angle)
         side = "left" if degrees > 0 else "right"
         what = "the outside pose" if name == "ground_truth" else "its pose"
         remedy = (f"add {degrees:.0f} deg to its yaw (sysid.convert takes --truth-turned {-degrees:.0f})"
                   if name == "ground_truth" else "its speeds agree with the commands; turn x and y")
-        found.append(f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
-                     f"the vehicle's. Correct them: {remedy}.")
-    return found
+        return [f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
+                f"the vehicle's. Correct them: {remedy}."]
+    return []
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -112,50 +121,80 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                    for columns in ((source.x, source.y), (source.yaw,)))
     held = command_in_force(trial.command, t - RESPONSE)
     v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    if odometry is not None and odometry.v.std() > ZERO:
+    commanded = odometry is None or bool(odometry.v.std() <= NONE)
+    if odometry is not None and not commanded:
         shifts = np.linspace(-half, half, 5)
         v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
                     for one in (odometry.v, odometry.omega))
     if v.std() < VARIED:
         return None
-    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
+    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega, commanded)
 
 
-def direction(motion: Motion, mirrored: bool = False, world: bool = False) -> Direction:
+def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
     """Direction in which a pose travels.
 
     Args:
+        reach: how far from the axle's centre its point may be [m].
         mirrored: with y negated.
-        world: where v is the speed along the fixed x axis.
     """
     x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
     cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
-    along = (x if world else cos * x + sin * y) + 1j * (0.0 * y if world else -sin * x + cos * y)
+    along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
     design = np.column_stack([motion.v, motion.omega])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    if abs(gains[1]) > reach:
+        gains[1] *= reach / abs(gains[1])
+        gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
     left = along - design @ gains
     power = float(np.square(np.abs(along)).sum())
     explained = 1 - float(np.square(np.abs(left)).sum()) / max(power, 1e-12)
-    error = np.sqrt(np.mean(np.square(left.imag)) / np.square(motion.v).sum()) / max(abs(gains[0]), 1e-9)
-    return Direction(float(np.angle(gains[0])), float(error), explained)
+    # What v alone shows: on a circle a turned axis and a point before the axle move alike.
+    alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
+    independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
+    error = np.sqrt(np.mean(np.square(left.imag)) / independent / max(np.mean(np.square(alone)), 1e-12))
+    return Direction(float(np.angle(gains[0])), float(error / max(abs(gains[0]), 1e-9)), explained)
+
+
+def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
+    """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
+    fixed, own = [], []
+    for one in motions:
+        cos, sin = np.cos(one.yaw), np.sin(one.yaw)
+        x, y = one.steps.T
+        fixed.append(_explained(one.v, np.column_stack([x, y])))
+        own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
+    return bool(np.median(fixed) > max(WHOLE, float(np.median(own)) + PLAINER))
+
+
+def _explained(signal: np.ndarray, design: np.ndarray) -> float:
+    """Share of a signal's (T,) square that columns (T, C) explain."""
+    left = signal - design @ np.linalg.lstsq(design, signal, rcond=None)[0]
+    return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
 
 
 def lateness(motion: Motion) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
-    explains what nothing else does; None otherwise."""
-    speed, rate = np.hypot(*motion.steps.T), np.abs(motion.v)
+    explains what nothing else does; None otherwise.
+
+    Rates of motion and of turning are compared, which no frame changes.
+    """
+    channels = [(ours, theirs) for ours, theirs in ((motion.turn, motion.omega), (
+        np.hypot(*motion.steps.T), np.abs(motion.v))) if min(ours.std(), theirs.std()) > VARIED]
+    if not channels:
+        return None
+    mine, other = channels[0]  # a point beside the axle moves while the vehicle turns on the spot
     best, at, now = 0.0, 0, 0.0
-    most = min(round(REACH / GRID_DT), len(speed) // 2)
+    most = min(round(REACH / GRID_DT), len(motion.t) // 2)
     for lag in range(-most, most + 1, 5):
-        ours = slice(max(lag, 0), len(speed) + min(lag, 0))
-        theirs = slice(max(-lag, 0), len(speed) - max(lag, 0))
-        pairs = [(speed[ours], rate[theirs]), (motion.turn[ours], motion.omega[theirs])]
-        both = min(_correlation(*pair) for pair in pairs)
-        now = both if lag == 0 else now
-        if both > best:
-            best, at = both, lag
+        ours = slice(max(lag, 0), len(motion.t) + min(lag, 0))
+        theirs = slice(max(-lag, 0), len(motion.t) - max(lag, 0))
+        alike = _correlation(mine[ours], other[theirs])
+        now = alike if lag == 0 else now
+        if alike > best:
+            best, at = alike, lag
     late = at * GRID_DT
-    return late if best > WHOLE and now < LITTLE and abs(late) > LATE else None
+    return late if best > WHOLE and 1 - best < UNLIKE * (1 - now) and abs(late) > LATE[motion.commanded] else None
 
 
 def _resets(trials: Sequence[Trial]) -> list[str]:
@@ -185,15 +224,29 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
-    """Odometry whose pose moves while its speeds are zero."""
-    empty = [trial for trial in trials if isinstance(one := trial.odometry, OdometryStream) and one.x is not None
-             and one.y is not None and np.hypot(np.ptp(one.x), np.ptp(one.y)) > 0.3
-             and float(np.abs(one.v).sum() / max(len(one.v), 1)) * float(np.ptp(one.t))
-             < ZERO * float(np.hypot(np.diff(one.x), np.diff(one.y)).sum())]
-    if len(empty) <= len(trials) / 2:
+    """Odometry whose pose moves while both of its speeds are exactly zero."""
+    shares = [share for trial in trials if (share := _empty_share(trial)) is not None]
+    if not shares or float(np.median(shares)) < EMPTY:
         return []
-    return ["odometry: its speeds v are all zero though its pose moves with the commands: the driver does not fill the "
-            "twist. Compute v and omega from the pose, or record a topic that has them."]
+    share = float(np.median(shares))
+    how = "all zero though its pose moves" if share > 0.95 else (
+        f"zero in {share:.0%} of the time in which its pose moves")
+    return [f"odometry: its speeds are {how}: the driver does not fill the twist. Compute v and omega from the pose, or "
+            "record a topic that has them."]
+
+
+def _empty_share(trial: Trial) -> float | None:
+    """Share of the time in which the pose moves and both speeds are exactly zero; None where it does not move."""
+    stream = trial.odometry
+    if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < 20:
+        return None
+    half = max(SMOOTHING, float(np.median(np.diff(stream.t))))
+    moved = [np.interp(stream.t + half, stream.t, one) - np.interp(stream.t - half, stream.t, one)
+             for one in (stream.x, stream.y, stream.yaw)]
+    faster = np.zeros(len(stream.t), bool)
+    for rate in (np.hypot(moved[0], moved[1]) / (2 * half), np.abs(moved[2]) / (2 * half)):
+        faster |= rate > max(VARIED, FASTER * float(np.percentile(rate, 90)))
+    return float(((stream.v == 0) & (stream.omega == 0))[faster].mean()) if faster.sum() > 10 else None
 
 
 def _median(found: Sequence[Direction]) -> Direction:

@@ -11,12 +11,13 @@ from sysid.logs.contradictions import contradictions
 from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.streams import speeds, standstill
+from sysid.logs.streams import response_shift, speeds, standstill
 from sysid.logs.time_faults import time_faults
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
+LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
 SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
 
@@ -111,23 +112,24 @@ def sanity(log: Log) -> list[str]:
     """Signs that a column has another unit, sign or origin than it should, as sentences."""
     trials, skid = log.trials, log.spec.drive == "skid"
     found = []
-    contradicted = contradictions(trials)
+    contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
-            gains = [found_gain for trial in trials if (found_gain := _gain(trial, channel, index)) is not None]
+            gains = _gains(trials, channel, index)
             if not gains or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
-            gain, follows = (float(value) for value in np.median(gains, axis=0))
-            where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(gains)} trials)"
-            odd = not (0.1 if skid and name == "omega" else 0.4) < gain < 2.0  # a skid drive scrubs most of its turn
+            least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn
+            gain, follows = max(gains, key=lambda one: (least < one[0] < 2.0, abs(one[1])))
+            where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
+            odd = not least < gain < 2.0
             if odd and abs(follows) < FOLLOWS:
                 found.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
-            elif gain < 0:
+            elif odd and all(one < 0 for one, _ in gains):
                 found.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
-            elif odd:
+            elif odd and gain > 0:
                 found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
@@ -142,6 +144,17 @@ def sanity(log: Log) -> list[str]:
                      f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
                      "against it say little of a model; a fit leaves such trials out.")
     return found
+
+
+def _gains(trials: Sequence[Trial], channel: str, index: int) -> list[tuple[float, float]]:
+    """Two estimates of a measured speed (1) or yaw rate (2) over the command, each with its correlation, as medians over
+    trials: one at the delay and lag that fit best, and one at a usual delay. The first errs where commands are short
+    or periodic, the second where the vehicle follows late."""
+    best = [shift for trial in trials if (shift := response_shift(trial, channel).get(("v", "omega")[index - 1]))]
+    usual = [one for trial in trials if (one := _gain(trial, channel, index)) is not None]
+    both = ([(one.gain, one.correlation) for one in best], usual)
+    return [(float(np.median([gain for gain, _ in found])), float(np.median([follows for _, follows in found])))
+            for found in both if found]
 
 
 def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
