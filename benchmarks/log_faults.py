@@ -169,7 +169,8 @@ def _moving_at(drive: Drive, random: Random) -> float:
     odometry = drive["odometry"]
     effort = np.abs(odometry[:, 4]) / max(np.abs(odometry[:, 4]).max(), 0.1)
     effort += np.abs(odometry[:, 5]) / max(np.abs(odometry[:, 5]).max(), 0.2)
-    inside = (odometry[:, 0] > 3.0) & (odometry[:, 0] < odometry[-1, 0] - 3.0)
+    edge = min(3.0, 0.3 * float(odometry[-1, 0]))
+    inside = (odometry[:, 0] > edge) & (odometry[:, 0] < odometry[-1, 0] - edge)
     able = np.flatnonzero(inside & (effort > 0.5 * effort[inside].max()))
     return float(odometry[random.choice(able), 0])
 

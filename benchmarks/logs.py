@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import figure, record
-from benchmarks.log_faults import FAULTS, Drive, Fault, Robot, healthy
+from benchmarks.log_faults import FAULTS, ROOT, Drive, Fault, Robot, healthy
 
 CLAIM = "Faults of time and frames in driving logs are named, healthy logs are not, and an hour of driving is read fast"
 WRONG = re.compile("sign is reversed|check its unit")
@@ -133,6 +134,64 @@ def fault_figures(count: int, seed: int, verbose: bool) -> dict[str, Any]:
     return found
 
 
+def write_hour(path: Path, seconds: float = 3600.0) -> None:
+    """Write a bag: odometry at 50 Hz and commands at 10 Hz, of drives of 20 s with 5 s of standstill between them."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = {name: store.types[f"{name.split('/')[0]}/msg/{name.split('/')[1]}"] for name in (
+        "std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/Vector3", "geometry_msgs/Twist",
+        "geometry_msgs/Point", "geometry_msgs/Quaternion", "geometry_msgs/Pose", "geometry_msgs/PoseWithCovariance",
+        "geometry_msgs/TwistWithCovariance", "nav_msgs/Odometry")}
+    blank = np.zeros(36)
+
+    def twist(v: float, omega: float) -> Any:
+        return kinds["geometry_msgs/Twist"](linear=kinds["geometry_msgs/Vector3"](x=v, y=0.0, z=0.0),
+                                            angular=kinds["geometry_msgs/Vector3"](x=0.0, y=0.0, z=omega))
+
+    t = np.arange(0.0, seconds, 0.02)
+    going = t % 25.0 > 5.0
+    v, omega = 0.6 * going * np.sin(0.4 * t) ** 2, 0.5 * going * np.sin(0.7 * t)
+    late_v, late_omega = (np.interp(t - 0.2, t, one) for one in (v, omega))
+    yaw = np.cumsum(late_omega) * 0.02
+    x, y = np.cumsum(late_v * np.cos(yaw)) * 0.02, np.cumsum(late_v * np.sin(yaw)) * 0.02
+    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        commands = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=store)
+        odometry = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        for k, now in enumerate(t):
+            stamp = int((1.7e9 + now) * 1e9)
+            if k % 5 == 0:
+                writer.write(commands, stamp, store.serialize_cdr(twist(v[k], omega[k]), "geometry_msgs/msg/Twist"))
+            time_of = kinds["builtin_interfaces/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+            pose = kinds["geometry_msgs/Pose"](
+                position=kinds["geometry_msgs/Point"](x=x[k], y=y[k], z=0.0),
+                orientation=kinds["geometry_msgs/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw[k] / 2), w=np.cos(yaw[k] / 2)))
+            message = kinds["nav_msgs/Odometry"](
+                header=kinds["std_msgs/Header"](stamp=time_of, frame_id="odom"), child_frame_id="base_link",
+                pose=kinds["geometry_msgs/PoseWithCovariance"](pose=pose, covariance=blank),
+                twist=kinds["geometry_msgs/TwistWithCovariance"](twist=twist(late_v[k], late_omega[k]),
+                                                                 covariance=blank))
+            writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+
+
+def hour_figures(repeats: int) -> dict[str, Any]:
+    """Seconds from a bag of an hour to an inspected dataset: both commands, started as a user does."""
+    seconds = []
+    with TemporaryDirectory() as folder:
+        bag = Path(folder) / "hour"
+        write_hour(bag)
+        for number in range(repeats):
+            dataset = Path(folder) / f"dataset_{number}"
+            began = time.perf_counter()
+            for command in (["sysid.convert", str(bag), "--out", str(dataset), "--split", "standstill"],
+                            ["sysid.inspect", str(dataset)]):
+                subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True, cwd=ROOT)
+            seconds.append(time.perf_counter() - began)
+            progress(f"an hour of driving, repeat {number + 1} of {repeats}: {seconds[-1]:.1f} s")
+    return {"bag_hour_s": figure(seconds, "s, convert and inspect")}
+
+
 def progress(text: str) -> None:
     """Show how far the work is, on a terminal."""
     if sys.stderr.isatty():
@@ -142,14 +201,17 @@ def progress(text: str) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.logs", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--parts", nargs="+", default=["faults"], choices=["faults"])
+    parser.add_argument("--parts", nargs="+", default=["faults", "hour"], choices=["faults", "hour"])
     parser.add_argument("--count", type=int, default=200, help="faulty logs, and healthy ones")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=3, help="of the hour")
     parser.add_argument("--dry", action="store_true", help="print what goes wrong, record nothing")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     if "faults" in options.parts:
         figures |= fault_figures(options.count, options.seed, options.dry)
+    if "hour" in options.parts:
+        figures |= hour_figures(options.repeats)
     for name, one in figures.items():
         print(f"{name}: {one['value']:.3g} {one['unit']} {one.get('size', '')}")
     if not options.dry:

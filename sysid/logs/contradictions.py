@@ -15,6 +15,7 @@ from sysid.logs.log import OdometryStream, Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
+MOVING = 0.05  # m/s or rad/s of a pose that moves
 NONE = 0.02  # m/s, below which a speed is none
 VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
 APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
@@ -23,7 +24,7 @@ LITTLE = 0.75  # the same, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
 SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
-REACH = 10.0  # s of a clock that is looked for
+REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step of the pose that is a reset
@@ -43,8 +44,6 @@ class Motion:
     turn: np.ndarray  # (G,) rad/s
     v: np.ndarray  # (G,) m/s that it should have
     omega: np.ndarray  # (G,) rad/s
-    commanded: bool
-    """Whether these are the commands, since there is no odometry."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +70,18 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
 def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
     if name == "odometry" and (found := [*_resets(trials), *_empty_speeds(trials)]):
         return found
-    motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
-    if not motions:
-        return []
-    plain = _median([direction(one, reach) for one in motions])
-    lates = [late for one in motions if (late := lateness(one)) is not None]
-    if len(lates) > len(motions) / 2:
+    lates = [late for trial in trials if (late := lateness(trial, name)) is not None]
+    if len(lates) > len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
         late = float(np.median(lates))
         return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
                 f"beside it: another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s "
                 f"{'from' if late > 0 else 'to'} its t."]
+    motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
+    if not motions:
+        return []
+    plain = _pooled([direction(one, reach) for one in motions])
     if plain.explained < LITTLE:
-        mirrored = _median([direction(one, reach, mirrored=True) for one in motions])
+        mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
             return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
                     "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
@@ -121,14 +120,13 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                    for columns in ((source.x, source.y), (source.yaw,)))
     held = command_in_force(trial.command, t - RESPONSE)
     v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    commanded = odometry is None or bool(odometry.v.std() <= NONE)
-    if odometry is not None and not commanded:
+    if odometry is not None and odometry.v.std() > NONE:
         shifts = np.linspace(-half, half, 5)
         v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
                     for one in (odometry.v, odometry.omega))
     if v.std() < VARIED:
         return None
-    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega, commanded)
+    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
@@ -173,28 +171,46 @@ def _explained(signal: np.ndarray, design: np.ndarray) -> float:
     return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
 
 
-def lateness(motion: Motion) -> float | None:
+def lateness(trial: Trial, name: str) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
     explains what nothing else does; None otherwise.
 
-    Rates of motion and of turning are compared, which no frame changes.
+    Rates of turning are compared, or of motion where there is no turn: no frame changes them.
     """
-    channels = [(ours, theirs) for ours, theirs in ((motion.turn, motion.omega), (
-        np.hypot(*motion.steps.T), np.abs(motion.v))) if min(ours.std(), theirs.std()) > VARIED]
-    if not channels:
+    source, odometry = getattr(trial, name), trial.odometry
+    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
         return None
-    mine, other = channels[0]  # a point beside the axle moves while the vehicle turns on the spot
-    best, at, now = 0.0, 0, 0.0
-    most = min(round(REACH / GRID_DT), len(motion.t) // 2)
-    for lag in range(-most, most + 1, 5):
-        ours = slice(max(lag, 0), len(motion.t) + min(lag, 0))
-        theirs = slice(max(-lag, 0), len(motion.t) - max(lag, 0))
-        alike = _correlation(mine[ours], other[theirs])
-        now = alike if lag == 0 else now
-        if alike > best:
-            best, at = alike, lag
-    late = at * GRID_DT
-    return late if best > WHOLE and 1 - best < UNLIKE * (1 - now) and abs(late) > LATE[motion.commanded] else None
+    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
+    t = np.arange(begin, end, LAG_DT)
+    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
+    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
+    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
+                 for one in (source.x, source.y, source.yaw))
+    held = command_in_force(trial.command, t - RESPONSE)
+    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    commanded = odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
+    if odometry is not None and not commanded:
+        v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
+    pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))
+             if min(ours.std(), theirs.std()) > VARIED]
+    if not pairs:
+        return None
+    ours, theirs = pairs[0]
+    most = min(round(REACH / LAG_DT), len(t) - 1)
+    alike = np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)])
+    now, k = float(alike[most]), int(np.argmax(alike))
+    bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
+    late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
+    near = round(LATE[commanded] / LAG_DT)
+    against = -float(alike[most - near : most + near + 1].min())  # where the sign is reversed
+    clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
+    return late if clear and abs(late) > LATE[commanded] else None
+
+
+def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
+    """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
+    one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
+    return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
 
 
 def _resets(trials: Sequence[Trial]) -> list[str]:
@@ -224,39 +240,42 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
-    """Odometry whose pose moves while both of its speeds are exactly zero."""
-    shares = [share for trial in trials if (share := _empty_share(trial)) is not None]
-    if not shares or float(np.median(shares)) < EMPTY:
+    """Odometry whose pose moves, or turns, while the speed of it is exactly zero."""
+    found = [shares for trial in trials if (shares := _empty_shares(trial)) is not None]
+    if not found:
         return []
-    share = float(np.median(shares))
-    how = "all zero though its pose moves" if share > 0.95 else (
-        f"zero in {share:.0%} of the time in which its pose moves")
-    return [f"odometry: its speeds are {how}: the driver does not fill the twist. Compute v and omega from the pose, or "
-            "record a topic that has them."]
+    shares = [float(np.median(known)) if (known := [one[k] for one in found if np.isfinite(one[k])]) else 0.0
+              for k in (0, 1)]
+    empty = [name for name, share in zip(("v", "omega"), shares, strict=True) if share > EMPTY]
+    if not empty:
+        return []
+    how = "all zero" if max(shares) > 0.95 else f"zero in {max(shares):.0%} of that time"
+    return [f"odometry: its pose moves with the commands, but its speeds {' and '.join(empty)} are {how}: the driver "
+            "does not fill the twist. Compute v and omega from the pose, or record a topic that has them."]
 
 
-def _empty_share(trial: Trial) -> float | None:
-    """Share of the time in which the pose moves and both speeds are exactly zero; None where it does not move."""
+def _empty_shares(trial: Trial) -> tuple[float, float] | None:
+    """Shares of the time in which the pose travels and v is exactly zero, and in which it turns and omega is; nan where
+    it does not."""
     stream = trial.odometry
     if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < 20:
         return None
     half = max(SMOOTHING, float(np.median(np.diff(stream.t))))
-    moved = [np.interp(stream.t + half, stream.t, one) - np.interp(stream.t - half, stream.t, one)
-             for one in (stream.x, stream.y, stream.yaw)]
-    faster = np.zeros(len(stream.t), bool)
-    for rate in (np.hypot(moved[0], moved[1]) / (2 * half), np.abs(moved[2]) / (2 * half)):
-        faster |= rate > max(VARIED, FASTER * float(np.percentile(rate, 90)))
-    return float(((stream.v == 0) & (stream.omega == 0))[faster].mean()) if faster.sum() > 10 else None
+    x, y, turn = (np.abs(np.interp(stream.t + half, stream.t, one) - np.interp(stream.t - half, stream.t, one))
+                  / (2 * half) for one in (stream.x, stream.y, stream.yaw))
+    shares = []
+    for rate, speed in ((np.hypot(x, y), stream.v), (turn, stream.omega)):
+        faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
+        shares.append(float((speed == 0)[faster].mean()) if faster.sum() > 10 else float("nan"))
+    return shares[0], shares[1]
 
 
-def _median(found: Sequence[Direction]) -> Direction:
-    angle = float(np.angle(np.median([np.exp(1j * one.angle).real for one in found])
-                           + 1j * np.median([np.exp(1j * one.angle).imag for one in found])))
-    return Direction(angle, float(np.median([one.error for one in found])),
+def _pooled(found: Sequence[Direction]) -> Direction:
+    """The direction of all trials together, each by how well it shows one."""
+    weights = np.array([1 / max(one.error, 1e-4) ** 2 for one in found])
+    each = np.exp(1j * np.array([one.angle for one in found]))
+    angle = float(np.angle((weights * each).sum()))
+    apart = np.angle(each * np.exp(-1j * angle))
+    scatter = float((weights * apart**2).sum() / weights.sum() / max(len(found) - 1, 1))
+    return Direction(angle, float(np.sqrt(max(1 / weights.sum(), scatter))),
                      float(np.median([one.explained for one in found])))
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / norm if norm > 1e-9 else 0.0

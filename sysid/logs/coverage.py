@@ -18,6 +18,7 @@ STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
+CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
 FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
 SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
 
@@ -121,15 +122,17 @@ def sanity(log: Log) -> list[str]:
                 continue
             least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn
             gain, follows = max(gains, key=lambda one: (least < one[0] < 2.0, abs(one[1])))
+            if abs(gains[-1][1]) > CLOSELY:
+                gain, follows = gains[-1]
             where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
             odd = not least < gain < 2.0
             if odd and abs(follows) < FOLLOWS:
                 found.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
-            elif odd and all(one < 0 for one, _ in gains):
+            elif gain < 0:
                 found.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
-            elif odd and gain > 0:
+            elif odd:
                 found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]

@@ -333,12 +333,12 @@ def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
     steps = {name: float(np.median(np.diff(t))) for name, t in times.items() if len(t) > 1}
     spans = {name: float(t[-1] - t[0]) for name, t in times.items() if len(t) > 1}
     for name, t in times.items():
-        if len(t) < LEAST_ROWS or steps[name] <= SLOWEST:
+        if steps.get(name, 0.0) <= SLOWEST:
             continue
         shortest = min(spans, key=lambda other: spans[other])
         longer = spans[name] / max(spans[shortest], 1e-9)
-        if name == "command.csv" and longer < LONGER and min(steps.values()) <= SLOWEST:
-            continue  # sent only when it changes
+        if longer < LONGER and (len(t) < LEAST_ROWS or name == "command.csv" and min(steps.values()) <= SLOWEST):
+            continue  # commands may be sent only when they change
         step, others = steps[name], ""
         if longer > LONGER:
             size = min((size for _, size in TIME_UNITS), key=lambda size: abs(np.log(longer / size)))

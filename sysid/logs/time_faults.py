@@ -67,8 +67,9 @@ def forward_jump(trial: Trial) -> tuple[float, float] | None:
     for k in np.flatnonzero(long & still)[np.argsort(-gaps[long & still])]:
         begin, end = stream.t[k], stream.t[k + 1]
         middle = (begin + end) / 2
-        sent = int(((command.t > begin) & (command.t < end)).sum())
-        if ((changed > begin) & (changed < end)).any() or usual < gaps[k] / 4 and sent > 0.5 * gaps[k] / usual:
+        low, high = (3 * begin + end) / 4, (begin + 3 * end) / 4  # half of the gap
+        sent = int(((command.t > low) & (command.t < high)).sum())
+        if ((changed > low) & (changed < high)).any() or sent > 0.25 * gaps[k] / usual:
             continue  # commands went on in it
         if other is None or not (np.abs(other.t - middle) < gaps[k] / 4).any():  # the outside pose has the gap as well
             return float(stream.t[k]), float(gaps[k])
@@ -94,7 +95,7 @@ def timeout_stops(trial: Trial) -> list[tuple[float, float, float]]:
             rates[1:], (command.v[k], command.omega[k]), ASKED, strict=True)), key=lambda one: abs(one[1]))
         if abs(asked) < 1.0:
             continue
-        before, inside = (t >= begin - 0.5) & (t <= begin), (t > begin) & (t < end)
+        before, inside = (t >= begin) & (t <= begin + SETTLED), (t > begin) & (t < end)
         if not before.any() or inside.sum() < 5:
             continue
         usual_speed = float(np.median(channel[before]))
