@@ -226,6 +226,7 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
         jumps = np.zeros(len(dt), bool)
         for step, speed in zip(steps, (stream.v, stream.omega), strict=False):
             way = np.maximum(np.abs(speed[1:]), np.abs(speed[:-1])) * dt
+            way = np.max([np.roll(way, shift) for shift in (-2, -1, 0, 1, 2)], axis=0)  # rows held up catch up at once
             usual = float(np.percentile(step / dt, 95)) * dt
             jumps |= step > JUMP[0] + JUMP[1] * np.maximum(way, usual)
         at = np.flatnonzero(jumps)

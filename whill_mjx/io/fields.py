@@ -266,6 +266,9 @@ DATASET = (
     Field("odometry", kind="text", needed=False),
     Field("ground_truth", kind="text", needed=False),
     Field("held_out", kind="texts", needed=False),
+    Field("input", kind="text", choices=("commands", "wheels"), needed=False,
+          remedy="Write \"wheels\" where command.csv holds measured wheel speeds, else leave it out."),
+    Field("columns", kind="texts", needed=False),
 )
 """dataset.toml of a driving log."""
 
