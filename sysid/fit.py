@@ -70,7 +70,8 @@ def main(arguments: Arguments) -> None:
                       "deviations")
         print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
-    fitted = "vehicle.toml" if not settings.model else "model.toml"
+    other = settings.model or log.fields.get("input") == "wheels"
+    fitted = "model.toml" if other else "vehicle.toml"
     print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
     if arguments.close_loop:
         from sysid.pages.loop_report import write_result

@@ -166,7 +166,7 @@ def _by_name(table: Table, name: str) -> Column | None:
     stamp_part = words[-1] in ("secs", "sec", "nsecs", "nsec", "nanosec")
     if (set(words) & set(TIME_WORDS) and not set(words[-1:]) & {"x", "y", "z", "w"} or stamp_part
             or words == ["rosbagtimestamp"]):
-        if words[-1] in ("nsecs", "nsec", "nanosec") and any(w in words for w in ("header", "stamp")):
+        if words[-1] in ("nsecs", "nsec", "nanosec") and "+" not in name and {"header", "stamp"} & set(words):
             return None  # the rest of a second; joined with secs when read
         return Column("time", table.stem, name, unit, "its name")
     told = {one for known in STREAM_WORDS.values() for one in known}
@@ -337,7 +337,8 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
         if one.unit not in kind:  # nothing shows it: SI, if that is at all possible
             values = arrays[one.file, one.name]
             usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
-            largest = {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
+            wheel = one.role.rpartition(".")[2] in ("left", "right")  # small ones turn fast
+            largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
             first = next(iter(UNITS[kind_of(one.role)]))
             one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest)
         settled.append(one)

@@ -54,6 +54,9 @@ class ConvertConfig:
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
     truth_turned: float = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
+    input: Literal["auto", "commands", "wheels"] = "auto"
+    """What drives the model: commands, or measured wheel speeds (of joint states or odometry) in their place; auto takes
+    the latter where no recording has commands."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
@@ -103,7 +106,6 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
                                 "or a measured set.")
     bags = find_bags(config.source)
     notes: list[str] = []
-    refused: list[ValueError] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
     if not bags and not is_known(config.source) and text_files(config.source):
         spec = _spec(config)
@@ -111,18 +113,20 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         more |= found
     elif bags:
         spec = _spec(config)
-        drives = []
-        for path in bags:
+        wheels = config.input == "wheels"
+        drives, notes, refused = _bags_drives(bags, config, spec, wheels)
+        if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
             try:
-                cut_out, said = bag_drives(path, config)
-            except ValueError as error:
-                refused.append(error)
-                notes.append(f"left out: {error}")
-                continue
-            drives += cut_out
-            notes += [f"{path.name}: {note}" for note in said]
-        if len(refused) == len(bags):
+                drives, notes, refused = _bags_drives(bags, config, spec, True)
+                wheels = True
+            except ValueError:
+                drives = []
+            if not drives:
+                _, _, refused = _bags_drives(bags, config, spec, False)
+        if not drives and refused:
             raise refused[0]
+        if wheels:
+            more["input"] = "wheels"
     else:
         from sysid.logs.inspection import load_whole
 
@@ -145,11 +149,30 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
 
 
+def _bags_drives(
+    bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec, wheels: bool
+) -> tuple[list[Drive], list[str], list[ValueError]]:
+    """Trials of several bags, notes, and why some are left out."""
+    drives: list[Drive] = []
+    notes: list[str] = []
+    refused: list[ValueError] = []
+    for path in bags:
+        try:
+            cut_out, said = bag_drives(path, config, spec, wheels)
+        except ValueError as error:
+            refused.append(error)
+            notes.append(f"left out: {error}")
+            continue
+        drives += cut_out
+        notes += [f"{path.name}: {note}" for note in said]
+    return drives, notes, refused
+
+
 def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive], list[str], dict[str, Any]]:
     """Trials of CSV and TUM files, notes, and what dataset.toml says of them."""
     drives: list[Drive] = []
     notes: list[str] = []
-    found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track))
+    found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
         raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert those "
@@ -167,10 +190,18 @@ def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive],
     return drives, notes, more
 
 
-def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str]]:
-    """Trials of one bag, and notes."""
+def bag_drives(
+    path: Path, config: ConvertConfig, spec: VehicleSpec, wheels: bool = False
+) -> tuple[list[Drive], list[str]]:
+    """Trials of one bag, and notes.
+
+    Args:
+        spec: nominal geometry, of wheels whose angles or rates were recorded.
+        wheels: the input is measured wheel speeds.
+    """
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
-    bag = in_order(read_bag(path, {name: topic for name, topic in asked.items() if topic is not None}), config.stamp)
+    topics = {name: topic for name, topic in asked.items() if topic is not None}
+    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
     times = stream_times(bag, config.stamp)
     notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
                            for name, stream in bag.streams.items()), *clock_notes(bag, config.stamp)]
@@ -228,7 +259,7 @@ def cut(
     for stream, table in tables.items():
         inside = table[(table[:, 0] >= begin - 1e-9) & (table[:, 0] <= end + 1e-9)].copy()
         if stream == "command":
-            before = table[table[:, 0] < begin - 1e-9]
+            before = table[table[:, 0] <= begin + 1e-6]
             first = before[-1, 1:] if len(before) else np.zeros(2)
             inside = np.vstack([[begin, *first], inside[inside[:, 0] > begin + 1e-6]])
         if len(inside) < 2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from sysid.logs.contradictions import contradictions
 from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.streams import response_shift, speeds, standstill
+from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import time_faults
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
@@ -20,6 +20,8 @@ SLOW_SECONDS = 1.0  # s of such commands that are enough
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
 FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
+Responses = Mapping[str, Mapping[str, Mapping[str, Shift]]]
+"""Channel -> trial -> "v" or "omega" -> how late it follows the command."""
 SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
 
 
@@ -109,15 +111,20 @@ def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
     return groups
 
 
-def sanity(log: Log) -> list[str]:
-    """Signs that a column has another unit, sign or origin than it should, as sentences."""
+def sanity(log: Log, responses: Responses | None = None) -> list[str]:
+    """Signs that a column has another unit, sign or origin than it should, as sentences.
+
+    Args:
+        responses: `response_shift` of every trial by channel, where it is known.
+    """
     trials, skid = log.trials, log.spec.drive == "skid"
     found = []
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
+        shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
-            gains = _gains(trials, channel, index)
+            gains = _gains(trials, channel, index, list(shifts.values()))
             if not gains or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
             least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn
@@ -149,11 +156,13 @@ def sanity(log: Log) -> list[str]:
     return found
 
 
-def _gains(trials: Sequence[Trial], channel: str, index: int) -> list[tuple[float, float]]:
+def _gains(
+    trials: Sequence[Trial], channel: str, index: int, shifts: Sequence[Mapping[str, Shift]]
+) -> list[tuple[float, float]]:
     """Two estimates of a measured speed (1) or yaw rate (2) over the command, each with its correlation, as medians over
     trials: one at the delay and lag that fit best, and one at a usual delay. The first errs where commands are short
     or periodic, the second where the vehicle follows late."""
-    best = [shift for trial in trials if (shift := response_shift(trial, channel).get(("v", "omega")[index - 1]))]
+    best = [shift for one in shifts if (shift := one.get(("v", "omega")[index - 1]))]
     usual = [one for trial in trials if (one := _gain(trial, channel, index)) is not None]
     both = ([(one.gain, one.correlation) for one in best], usual)
     return [(float(np.median([gain for gain, _ in found])), float(np.median([follows for _, follows in found])))

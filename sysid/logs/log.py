@@ -175,6 +175,9 @@ def load_log(folder: str | Path) -> Log:
                          "Correct the names, or nothing is really held out.")
     timeout = fields.get("command_timeout")
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    if fields.get("input") == "wheels":
+        trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
+        notes.append("the input is measured wheel speeds, no commands: delays, drive and limits of the vehicle do not show")
     return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
 
 
@@ -237,6 +240,12 @@ def make_trial(
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
     return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
+
+
+def held_from_middle(rates: Command) -> Command:
+    """Measured speeds as commands: each holds from half an interval before its time to half an interval after."""
+    middle = (rates.t[1:] + rates.t[:-1]) / 2
+    return Command(np.concatenate([rates.t[:1], middle]), rates.v, rates.omega)
 
 
 def with_timeout(command: Command, timeout: float) -> Command:

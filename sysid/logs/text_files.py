@@ -44,14 +44,14 @@ def text_files(source: Path) -> list[list[Path]]:
 
 
 def read_drives(
-    source: Path, said: Sequence[str], geometry: tuple[float, float], default: Sequence[str] = ()
+    source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
 ) -> list[TextDrive]:
     """The drives of a CSV file, a TUM file or a folder of them.
 
     Args:
         said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
         geometry: wheel radius and track [m], of wheel speeds.
-        default: decisions that hold where a drive has such columns: those of an existing dataset.
+        wheels: take measured wheel speeds as the input, and leave commands out.
 
     Raises:
         ValueError: in one line, what is not clear, what was guessed and what to give.
@@ -65,6 +65,7 @@ def read_drives(
             alone = len(group) == 1 and (source.is_file() or len(groups) > 1)
             name = group[0].stem if alone else files[0].absolute().parent.name
             columns, agreed = _decide(source, group, agreed)
+            columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
             drives.append(_join(name, source, group, columns, geometry))
     return drives
 

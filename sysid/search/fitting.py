@@ -24,7 +24,8 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
-from sysid.search import least_squares, slopes, starts, tpe
+from sysid.replay.wheel_model import wheel_model
+from sysid.search import least_squares, slopes, starts, thin, tpe
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import (
     FEATURE_ITERATIONS,
@@ -189,6 +190,7 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
     trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
     if not trials:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
@@ -196,6 +198,8 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is None and log.fields.get("input") == "wheels":
+        model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
@@ -213,6 +217,7 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
         params = with_effects(params, (*config.effects, *measured))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+        space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     plant = replace(plant, frame=frame)
     if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
         space = space.without(odometry_frames.AGE, "speeds are those of the odometry's frames")
