@@ -25,7 +25,8 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
-from sysid.search import least_squares, slopes, starts, tpe
+from sysid.replay.wheel_model import wheel_model
+from sysid.search import least_squares, slopes, starts, thin, tpe
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import (
     FEATURE_ITERATIONS,
@@ -186,6 +187,7 @@ class Problem:
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
     trials = _training(log, config)
+    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
@@ -223,6 +225,8 @@ def _subject(
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is None and log.fields.get("input") == "wheels":
+        model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
@@ -240,6 +244,7 @@ def _subject(
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
         params = with_effects(params, (*config.effects, *measured))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+        space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals
 
 

@@ -259,11 +259,16 @@ DATASET = (
     *_optional(*SIZES),
     Field("command_limits", "m/s, rad/s", 1e-3, SPEED, kind="numbers", count=2, needed=False,
           remedy="Write [v, omega], both positive."),
+    Field("command_timeout", "s", 0.01, 60.0, needed=False,
+          remedy="It is how long the base drives on where no command comes; leave it out where it never stops."),
     Field("reference_point", kind="text", choices=("drive axle centre", "vehicle centre"), needed=False,
           remedy="Move the measured poses to one of them before writing the log."),
     Field("odometry", kind="text", needed=False),
     Field("ground_truth", kind="text", needed=False),
     Field("held_out", kind="texts", needed=False),
+    Field("input", kind="text", choices=("commands", "wheels"), needed=False,
+          remedy="Write \"wheels\" where command.csv holds measured wheel speeds, else leave it out."),
+    Field("columns", kind="texts", needed=False),
 )
 """dataset.toml of a driving log."""
 
