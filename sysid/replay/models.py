@@ -28,7 +28,7 @@ from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
 
-AROUND = ("command", "sensing")
+AROUND = ("command", "sensing", "outside")
 """Places of effects that need to know nothing of what is inside a model."""
 Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 """Initial value, lowest, highest, and, where it has one, the unit."""
@@ -99,6 +99,23 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
     if not both:
         return rolling
     return (*rolling, "sensor_delay", "pose_delay") if receipt else (*rolling, "sensor_delay")
+
+
+def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
+    """What a usual first calibration finds, where it is known to show: sizes of the wheels, and of what measures them.
+
+    A command fixes how fast wheels turn, an outside pose how far the vehicle comes by that: both together show radii
+    and track. The odometry beside them shows the sizes that it takes for them, and the pose itself which point of the
+    vehicle it follows. Without an outside pose nothing tells them apart. On a skid drive wheels slip in every turn, and
+    the track has no part of its own in that.
+    """
+    if not any(effect.name == "slip_traction" for effect in params.effects):
+        return ()
+    if not any(trial.ground_truth is not None for trial in trials):
+        return ()
+    both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
+    sizes = ("wheel_radius_difference",) if spec.drive == "skid" else ("wheel_radius_difference", "track_width")
+    return (*sizes, *(("odometry_scale",) if both else ()), "pose_mount")
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:

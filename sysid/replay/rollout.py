@@ -208,6 +208,9 @@ def path_of(
     """
     params, latency = without(params, SensorDelay.name)
     params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "reference"):  # the start is that of a tracked point
+            start = effect.reference(start)
     if not warm_up:  # which finds its commands on the way
         params, command = delayed(params, command, plant.dt)
 

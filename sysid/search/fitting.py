@@ -21,7 +21,15 @@ from sysid.logs import odometry_frames
 from sysid.logs.log import Log, Prediction, Trial
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
-from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
+from sysid.replay.models import (
+    Model,
+    calibration_effects,
+    get_parameters,
+    measured_effects,
+    model_space,
+    set_parameters,
+    with_effects,
+)
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.search import least_squares, slopes, starts, tpe
@@ -211,7 +219,8 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         params = preset_params(log.spec, config.preset) if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
-        params = with_effects(params, (*config.effects, *measured))
+        sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
+        params = with_effects(params, (*config.effects, *measured, *sizes))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
     plant = replace(plant, frame=frame)
     if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
