@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import SLOW, TIMESTEP, VEHICLES, Chair, Contact, Nominal
+from benchmarks.plant.chair import COULOMB, SLOW, VEHICLES, Chair, Contact, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects.sensing import OdometryScale
 from benchmarks.plant.make import Result, write_dataset
@@ -75,13 +75,14 @@ def make_uncalibrated(
     """
     chair = uncalibrated(vehicle, wrong)
     small = vehicle == "small"
-    plant = SmallPlant(chair) if small else Plant(chair)
+    plant = SmallPlant(chair, COULOMB) if small else Plant(chair)
     tables = dict(manoeuvres or nine(seed))
     if small and manoeuvres is None:
         tables = {name: table * [1.0, SLOWER, FASTER] for name, table in tables.items()}
     noise = Noise().of(chair)
-    if small:  # turns as a chair of its size would
-        noise = replace(noise, yaw_torque=noise.yaw_torque * chair.nominal.track / Nominal().track, position=0.001)
+    if small:  # a smooth floor, markers near the cameras
+        noise = replace(noise, yaw_torque=0.2 * noise.yaw_torque * chair.nominal.track / Nominal().track,
+                        position=0.001, yaw=0.002)
     results: list[Result] = []
     for replicate in range(1, replicates + 1):
         for name, messages in tables.items():
@@ -123,7 +124,7 @@ class SmallPlant(Plant):
             for side, sign, radius in (("left", 1, chair.radius[0]), ("right", -1, chair.radius[1])))
         high = sum(chair.radius) / 2
         return mujoco.MjModel.from_xml_string(f"""
-<mujoco><option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="100"/>
+<mujoco><option timestep="{contact.timestep:g}" integrator="implicitfast" cone="elliptic" impratio="100"/>
   <default><geom contype="0" conaffinity="0" mass="0"/></default>
   <worldbody><geom name="floor" type="plane" size="0 0 1"/>
     <body name="chassis" pos="0 0 {high}"><freejoint/>

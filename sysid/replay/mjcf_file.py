@@ -18,6 +18,7 @@ from whill_mjx.io.fields import Field, check
 from whill_mjx.logs.dataset import write_text
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
+ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
 ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
@@ -84,6 +85,54 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Size:
+    """A true size of the driven wheels, which the file only believes: of their round geoms and places."""
+
+    path: str
+    """`wheels.radius` or `wheels.track` [m], `wheels.difference` [-], left radius less right one over their mean."""
+    unit: str
+    nominal: float
+    """What the file says."""
+    geoms: tuple[tuple[int, ...], tuple[int, ...]]
+    """Of the wheels, left and right."""
+    bodies: tuple[int, int]
+    along: tuple[np.ndarray, np.ndarray]
+    """(3,) in the frames of the wheels' parents: a wheel that grows rises, a track that grows moves it outwards."""
+
+    def changes(self, model: Any, value: Any) -> dict[str, Any]:
+        """Arrays of a model, of NumPy or JAX, with the value put in; what rolls on the floor stays on it."""
+        half = (value - self.nominal) / 2
+        moves = {"wheels.track": (half, half), "wheels.radius": (2 * half, 2 * half),
+                 "wheels.difference": (half * self._radius(model), -half * self._radius(model))}[self.path]
+        place = model.body_pos
+        for body, move, along in zip(self.bodies, moves, self.along, strict=True):
+            place = _added(place, body, move * along)
+        if self.path == "wheels.track":
+            return {"body_pos": place}
+        size = model.geom_size
+        for sign, geoms in zip((1, -1), self.geoms, strict=True):
+            factor = value / self.nominal if self.path == "wheels.radius" else 1 + sign * half
+            for geom in geoms:
+                size = _added(size, (geom, 0), (factor - 1) * size[geom, 0])
+        return {"body_pos": place, "geom_size": size}
+
+    def _radius(self, model: Any) -> Any:
+        return model.geom_size[self.geoms[0][0], 0]
+
+    def read(self, model: Any) -> float:
+        """What the file says."""
+        return self.nominal
+
+
+def _added(array: Any, index: Any, change: Any) -> Any:
+    if isinstance(array, jax.Array):
+        return array.at[index].add(change)
+    array = np.array(array)
+    array[index] += change
+    return array
+
+
+@dataclass(frozen=True)
 class Robot:
     """A compiled differential drive and where its parts are."""
 
@@ -109,6 +158,10 @@ class Robot:
     wheel_radius: float
     track: float
     rest: np.ndarray  # qpos after SETTLE
+    added: tuple[int, ...] = ()
+    """Actuators that the file does not have."""
+    distance: float = 0.0
+    """Between the driven wheels, as the file says [m]."""
     notes: tuple[str, ...] = ()
     """What was left out of the file."""
 
@@ -132,7 +185,8 @@ def load_robot(
         bodies = [int(host.jnt_bodyid[one]) for one in ids]
         radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
         inertias = [_wheel_inertias(host, one, radius) for one in ids]
-        if _add_servos(spec, joints, inertias):
+        bare = _add_servos(spec, joints, inertias)
+        if bare:
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
@@ -165,7 +219,7 @@ def load_robot(
     return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
                  _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
                  rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(),
-                 (*replaced, *notes))
+                 tuple(actuators[one] for one in bare), distance, (*replaced, *notes))
 
 
 def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:
@@ -186,6 +240,30 @@ def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tup
     if fastest > REST_SPEED:
         raise ValueError(f"{path}: after {SETTLE:g} s on its floor, without a command, the model still moves at "
                          f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
+
+
+SIZES = ("wheels.radius", "wheels.difference", "wheels.track")
+
+
+def sizes_of(robot: Robot) -> dict[str, Size]:
+    """The true sizes that may be fitted; none where a wheel rolls on something that is not round."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    mujoco.mj_kinematics(host, data)
+    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    bodies = [int(host.jnt_bodyid[joint]) for joint in joints]
+    touching = [[int(one) for one in _parts(host, body) if _touches_ground(host, int(one))] for body in bodies]
+    kinds = [int(one) for one in ROUND]
+    if not all(geoms and all(int(host.geom_type[one]) in kinds for one in geoms) for geoms in touching):
+        return {}
+    geoms = (tuple(touching[0]), tuple(touching[1]))
+    out = data.xanchor[joints[0]] - data.xanchor[joints[1]]
+    out, up = out / np.linalg.norm(out), np.array([0.0, 0.0, 1.0])
+    frames = [data.xmat[host.body_parentid[body]].reshape(3, 3).T for body in bodies]
+    raised, apart = (frames[0] @ up, frames[1] @ up), (frames[0] @ out, frames[1] @ -out)
+    radius = max(float(host.geom_size[one, 0]) for one in geoms[0])
+    known = (("wheels.radius", "m", radius, raised), ("wheels.difference", "-", 0.0, raised),
+             ("wheels.track", "m", robot.distance, apart))
+    return {path: Size(path, unit, value, geoms, _pair(bodies), along) for path, unit, value, along in known}
 
 
 def resolve(robot: Robot, path: str) -> Entry:
@@ -230,22 +308,25 @@ def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
     return {name: i for name, i in found.items() if name and name != "world"}
 
 
-def write_mjcf(robot: Robot, values: Mapping[Entry, float], path: Path) -> Path:
+def write_mjcf(robot: Robot, values: Mapping[Entry | Size, float], path: Path) -> Path:
     """Write the completed model with values put in, whole or not at all."""
     host, spec = robot.host, robot.spec.copy()
     arrays: dict[str, np.ndarray] = {}
     for entry, value in values.items():
-        view: Any = _Overlaid(host, arrays)
+        view: Any = Overlaid(host, arrays)
         arrays.update(entry.changes(view, value))
     for entry in values:
+        if isinstance(entry, Size):
+            _put_size(spec, entry, Overlaid(host, arrays))
+            continue
         for number in entry.ids:
-            _put(spec, entry, number, _Overlaid(host, arrays))
+            _put(spec, entry, number, Overlaid(host, arrays))
     spec.compile()
     write_text(path, spec.to_xml())
     return path
 
 
-class _Overlaid:
+class Overlaid:
     """A model with some of its arrays replaced."""
 
     def __init__(self, host: mujoco.MjModel, arrays: dict[str, np.ndarray]):
@@ -253,6 +334,13 @@ class _Overlaid:
 
     def __getattr__(self, name: str) -> Any:
         return self._arrays.get(name, getattr(self._host, name))
+
+
+def _put_size(spec: Any, entry: Size, model: Any) -> None:
+    for body in entry.bodies:
+        spec.body(mujoco.mj_id2name(model._host, KINDS["body"], body)).pos = model.body_pos[body]
+    for geom in (one for geoms in entry.geoms for one in geoms):
+        spec.geom(mujoco.mj_id2name(model._host, KINDS["geom"], geom)).size[0] = model.geom_size[geom, 0]
 
 
 def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
@@ -344,8 +432,8 @@ def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[st
     return tuple(left_out.values())
 
 
-def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
-    """Give velocity servos to wheels without actuators; whether there were any.
+def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> list[int]:
+    """Give velocity servos to wheels without actuators; numbers of these wheels.
 
     Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
     vehicles follow within the same time. A wheel that slips is far lighter, so the integration is implicit in speed.
@@ -361,7 +449,7 @@ def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float
         joint.armature += max(ROTOR_SHARE * total - wheel, 0.0)
     if bare:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    return bool(bare)
+    return bare
 
 
 def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float) -> tuple[float, float]:
@@ -390,8 +478,7 @@ def _drive_gain(
 
 def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
     """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
-    kinds = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
-    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, kinds)]
+    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
     touching = [one for one in round_ones if _touches_ground(host, one)]
     sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
     if not sizes and known is None:

@@ -24,6 +24,7 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import (
     Model,
     calibration_effects,
+    effects_around,
     get_parameters,
     measured_effects,
     model_space,
@@ -208,9 +209,14 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
-        model = model.with_effects(config.effects)
+        calibrated = config.calibrate and not config.parameters
+        model = model.with_effects((*config.effects, *(effects_around(model, trials) if calibrated else ())))
         plant, params = model.plant, model.params if params is None else params
         space = model_space(params, config.parameters or None)
+        if not config.calibrate or not any(trial.ground_truth is not None for trial in trials):
+            why = "no outside pose shows it" if config.calibrate else "not selected"
+            for name in [one for one in space.names if one.startswith("wheels.") and one not in config.parameters]:
+                space = space.without(name, why)
     else:
         plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
         given = params is not None
