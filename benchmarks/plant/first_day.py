@@ -1,8 +1,8 @@
 """Drives of a vehicle that nobody has calibrated: sizes of its wheels and the place of its markers are not as believed.
 
 The contact plant drives with true radii and a true track; controller and odometry take the believed ones. The outside
-pose follows a rigid body that is off the axle's middle and turned. `small` is a robot of a kilogram with cylinder wheels
-and a ball behind, `write_urdf` writes the file that its owner has of it, with the believed sizes.
+pose follows a rigid body that is off the axle's middle and turned. `small` is a robot of a kilogram on two wheels and a
+ball. `write_urdf` writes the file that its owner has of it, with the believed sizes.
 """
 
 from __future__ import annotations

@@ -37,11 +37,12 @@ def calibration_notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: 
         one = next((found[name] for name in names if name in found), None)
         if one is None:
             continue
-        factor = (lambda x: 1 + x) if one.name == names[0] else (lambda x, size=stated[what]: x / size)
         if not one.identifiable:
             open_ones.append(what)
             continue
-        notes.append(_size(what, stated[what], factor(one.value), factor(one.low), factor(one.high)))
+        relative = one.name == names[0]  # otherwise in metres
+        value, low, high = (1 + x if relative else x / stated[what] for x in (one.value, one.low, one.high))
+        notes.append(_size(what, stated[what], value, low, high))
     for what, name in (("distance", "odometry_scale.linear"), ("yaw", "odometry_scale.angular")):
         one = found.get(name)
         if one is not None and one.identifiable and abs(one.value - 1) > LEAST and not one.low <= 1 <= one.high:
@@ -69,7 +70,8 @@ def _size(what: str, stated: float, value: float, low: float, high: float) -> st
     if abs(value - 1) < LEAST:
         return f"The {what} is as stated, {stated:.4g} m ({interval})."
     side = "larger" if value > 1 else "smaller"
-    return f"The {what} is {stated * value:.4g} m ({interval}), {abs(value - 1):.1%} {side} than the stated {stated:.4g} m."
+    return (f"The {what} is {stated * value:.4g} m ({interval}), {abs(value - 1):.1%} {side} than the stated "
+            f"{stated:.4g} m.")
 
 
 def _offset(one: Estimate, sides: tuple[str, str]) -> str:

@@ -22,8 +22,8 @@ from sysid.logs.log import Trial
 from sysid.replay import pieces
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import cores, on_all_cores, on_processor
-from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.on_host import HostReplay, replay_of
+from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.rollout import make_batch
 
 VECTOR, FEW, MANY = 8, 32, 128
@@ -73,7 +73,7 @@ class CourseReplay:
         batch = self._replay.batch
         records, step = batch.command.shape[1], self._record
         count = pieces.count(records * step)
-        if count < 2 or batch.warm_up or not self._anywhere:
+        if count < 2 or batch.warm_up or not self._anywhere or isinstance(self._replay, HostReplay):
             return self
         times = pieces.begins(records, count) * step - pieces.OVERLAP
         speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])

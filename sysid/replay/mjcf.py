@@ -67,7 +67,7 @@ def mjcf_model(
         parameters: dotted path -> (lowest, highest), or paths alone (a fifth to five times the file's value); by
             default gain, damping and friction of the driven wheels.
         wheels: joints or actuators of the driven wheels, left and right; by default the two that have "left" and
-            "right" in their names.
+            "right" in their names, or the two or three of each side of a skid-steered robot.
         wheel_radius, track: nominal, of controller and odometry [m]; by default those of the file.
         timestep: physics step [s]; by default the file's.
         effects: of the catalogue, around the model; for example command_delay.
@@ -83,7 +83,9 @@ def mjcf_model(
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry | Size] = {}
     sizes = sizes_of(robot)
-    names = (*names, *(name for name in sizes if calibrate and name not in names))
+    if calibrate:  # where wheels slip in every turn, the track has no part of its own
+        names = (*names, *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
+                 *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
     if robot.motors:
         gain, high = robot.drive_gain
         bounds["drive.kp"] = (gain, gain / 100, high, "N m s/rad")
@@ -96,11 +98,12 @@ def mjcf_model(
         if name in sizes:
             entries[name] = size = sizes[name]
             value = size.nominal
-            low, high = given or ((1 - NEAR) * value, (1 + NEAR) * value) if value else given or (-NEAR, NEAR)
+            usual = ((1 - NEAR) * value, (1 + NEAR) * value) if value else (-NEAR, NEAR)
+            low, high = given or usual
             bounds[name] = (float(np.clip(value, low, high)), low, high, size.unit)
             continue
         if name in SIZES:
-            raise ValueError(f"{path}: {name} cannot be fitted: a driven wheel rolls on something that is not a sphere, "
+            raise ValueError(f"{path}: {name} cannot be fitted: a driven wheel rolls on something that is no sphere, "
                              "cylinder or capsule. Give it one, or leave this parameter out.")
         entries[name] = entry = resolve(robot, name)
         value = entry.read(host)
@@ -151,7 +154,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
 
     def wheel_speeds(v: jax.Array, omega: jax.Array) -> jax.Array:
         half = omega * robot.track / 2
-        return jnp.stack([v - half, v + half]) / robot.wheel_radius
+        return jnp.stack([v - half, v + half])[robot.sides] / robot.wheel_radius
 
     def pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Reference point (3,) and heading ()."""
@@ -196,7 +199,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
 
     def observe(state: Motion) -> jax.Array:
         where, heading = pose(state.qpos)
-        left, right = sign * state.qvel[wheels] * robot.wheel_radius
+        left, right = (sign * state.qvel[wheels] * robot.wheel_radius).reshape(2, -1).mean(1)
         return jnp.stack([where[0], where[1], heading, (left + right) / 2, (right - left) / robot.track])
 
     def move(state: Motion, start: jax.Array) -> Motion:

@@ -20,7 +20,6 @@ from sysid.replay.delays import delayed
 from sysid.replay.records import Batch, Plant, Simulated
 from sysid.replay.rollout import Replay, simulate_one
 
-
 FEW = 4  # parameter sets whose readings are computed together at least
 
 

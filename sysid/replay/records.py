@@ -25,8 +25,8 @@ class Host:
     commands: Callable[[Any, jax.Array], jax.Array]
     """(params, commands (S, 2)) -> the same behind the effects on commands."""
     drive: Callable[[dict[str, np.ndarray], Any, np.ndarray, int, np.ndarray], np.ndarray]
-    """(values (N,) by name, states (N, B), commands (N, B, W + S, 2), warm-up steps W, starts (N, B, 3)) -> (N, B, S, 6)
-    x, y, yaw, v, omega, and 1 from where it diverged, after each step."""
+    """(values (N,) by name, states (N, B), commands (N, B, W + S, 2), warm-up steps W, starts (N, B, 3)) ->
+    (N, B, S, 6) x, y, yaw, v, omega, and 1 from where it diverged, after each step."""
     recorded: Plant
     """A plant whose commands are what was observed."""
 

@@ -37,9 +37,10 @@ class RobotDrive:
         first[..., place], first[..., speed] = states.qpos, states.qvel
         half = commands[..., 1] * robot.track / 2
         control = np.zeros((sets, trials, steps, host.nu))
-        for side, wheel in enumerate((commands[..., 0] - half, commands[..., 0] + half)):
-            gear = host.actuator_gear[robot.actuators[side], 0] if robot.motors else 1.0
-            control[..., robot.actuators[side]] = robot.sign[side] * wheel / robot.wheel_radius * gear
+        wanted = (commands[..., 0] - half, commands[..., 0] + half)
+        for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
+            gear = host.actuator_gear[one, 0] if robot.motors else 1.0
+            control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
         rows = sets * trials
         data = [mujoco.MjData(host) for _ in range(min(cores(), rows))]
         path, _ = rollout.rollout([models[i // trials] for i in range(rows)], data, first.reshape(rows, -1),
@@ -73,7 +74,8 @@ class RobotDrive:
         quaternion = qpos[..., robot.root + 3 : robot.root + 7]
         where = qpos[..., robot.root : robot.root + 3] + _rotated(quaternion, robot.point)
         forward = _rotated(quaternion, robot.forward)
-        left, right = (robot.sign[i] * qvel[..., robot.wheels[i]] * robot.wheel_radius for i in range(2))
+        rims = np.array(robot.sign) * qvel[..., list(robot.wheels)] * robot.wheel_radius
+        left, right = (rims[..., robot.sides == side].mean(-1) for side in (0, 1))
         yaw = np.arctan2(forward[..., 1], forward[..., 0])
         return np.stack([where[..., 0], where[..., 1], yaw, (left + right) / 2, (right - left) / robot.track], axis=-1)
 

@@ -53,8 +53,8 @@ class FitConfig:
     effects: tuple[str, ...] = ()
     """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
     calibrate: bool = True
-    """Whether wheel radii, track, scales of the odometry and the place of the tracked point are fitted as well, where an
-    outside pose shows them."""
+    """Whether wheel radii, track, scales of the odometry and the tracked point are fitted as well, where an outside
+    pose shows them."""
     profile: tuple[str, ...] = ()
     """Parameters whose profile likelihood is traced, or `all`: each takes a search of its own."""
     physics_dt: float = 0.0025
