@@ -22,7 +22,16 @@ from sysid.logs.log import Log, Prediction, Trial, check_same_vehicle
 from sysid.logs.sources import refuse_recording
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
-from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
+from sysid.replay.models import (
+    Model,
+    calibration_effects,
+    effects_around,
+    get_parameters,
+    measured_effects,
+    model_space,
+    set_parameters,
+    with_effects,
+)
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.replay.wheel_model import wheel_model
@@ -231,9 +240,14 @@ def _subject(
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
-        model = model.with_effects(config.effects)
+        calibrated = config.calibrate and not config.parameters
+        model = model.with_effects((*config.effects, *(effects_around(model, trials) if calibrated else ())))
         plant, params = model.plant, model.params if params is None else params
         space = model_space(params, config.parameters or None)
+        if not config.calibrate or not any(trial.ground_truth is not None for trial in trials):
+            why = "no outside pose shows it" if config.calibrate else "not selected"
+            for name in [one for one in space.names if one.startswith("wheels.") and one not in config.parameters]:
+                space = space.without(name, why)
     else:
         plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
         given = params is not None
@@ -242,7 +256,8 @@ def _subject(
         params = preset_params(log.spec, config.preset) if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
-        params = with_effects(params, (*config.effects, *measured))
+        sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
+        params = with_effects(params, (*config.effects, *measured, *sizes))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals
