@@ -289,8 +289,8 @@ MAP = (
     Field("origin", "m, m, rad", -1e6, 1e6, kind="numbers", count=3, remedy="It must be [x, y, yaw]."),
     Field("occupied_thresh", "-", 0.0, 1.0),
     Field("free_thresh", "-", 0.0, 1.0),
-    Field("negate", kind="whole", choices=(0, 1), remedy="Write a finite number, 0 or 1."),
-    Field("mode", kind="text", choices=("trinary", "scale"), needed=False, remedy="Save it as trinary."),
+    Field("negate", kind="whole", choices=(0, 1), remedy="Write 0, 1, false or true."),
+    Field("mode", kind="text", choices=("trinary", "scale", "raw"), needed=False),
 )
 """YAML file of a map, as map_server reads it."""
 
