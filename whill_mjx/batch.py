@@ -19,6 +19,7 @@ from whill_mjx.env import (
     observe,
     repainted,
     reset_state,
+    sense,
     step_state,
     time_step,
 )
@@ -77,6 +78,28 @@ class BatchEnv:
         """
         return self._split(self._step)(state, actions)
 
+    def begin_one(
+        self, origin: jax.Array, change: Callable[[VehicleParams, State], State] | None = None
+    ) -> tuple[BatchState, TimeStep]:
+        """Start an episode of one instance: its state without the instance axis, and its first time step.
+
+        Args:
+            origin: random key; the same one gives the same world, vehicle and start.
+            change: (parameters, state) -> state, applied before anything is observed; None changes nothing.
+        """
+        state, outcome = self._begin(origin)
+        if change is not None:
+            state = dataclasses.replace(state, env=change(state.params, state.env))
+            outcome = first_outcome(self.env, state.env)
+        env, obs = sense(self.env, state.params, state.env)
+        return dataclasses.replace(state, env=env), time_step(obs, outcome, jnp.array(True))
+
+    def step_one(self, state: BatchState, action: jax.Array) -> tuple[BatchState, TimeStep]:
+        """Advance one instance, from `begin_one`, by one environment step; nothing begins anew."""
+        env, outcome = step_state(self.env, state.params, state.env, action)
+        env, obs = sense(self.env, state.params, env)
+        return dataclasses.replace(state, env=env), time_step(obs, outcome, jnp.array(False))
+
     def observe_repainted(self, state: BatchState, worlds: int) -> jax.Array:
         """(K, N, H, W, 3) images of the same moment in K other worlds of the same shape (`env.repainted`).
 
@@ -93,13 +116,18 @@ class BatchEnv:
 
     def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome = jax.vmap(self._begin)(keys)
-        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)
+        state, obs = self._sense(state)
         return state, time_step(obs, outcome, jnp.ones(keys.shape[:1], bool))
 
     def _step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome, first = jax.vmap(self._advance)(state, actions)
-        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)  # once, after the choice between step and reset
+        state, obs = self._sense(state)  # once, after the choice between step and reset
         return state, time_step(obs, outcome, first)
+
+    def _sense(self, state: BatchState) -> tuple[BatchState, Any]:
+        """State with the memory of the sensors, and what they show (N, ...)."""
+        env, obs = jax.vmap(lambda one, params: sense(self.env, params, one))(state.env, state.params)
+        return dataclasses.replace(state, env=env), obs
 
     def _begin(self, origin: jax.Array, tries: jax.Array | int = 0) -> tuple[BatchState, Outcome]:
         key, params_key = jax.random.split(origin)

@@ -38,7 +38,7 @@ if __name__ == "__main__":
 import jax
 
 from dreamer import checkpoint, parallel
-from dreamer.export import PolicyContract, export_policy
+from dreamer.export import PolicyContract, export_policy, export_sensing
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
@@ -61,6 +61,7 @@ from whill_mjx.learning.setup import (
     find_preset,
     functional_env,
     make_training_env,
+    obs_shape_of,
     ppo_policy,
     step_driver,
     with_layout,
@@ -69,7 +70,7 @@ from whill_mjx.learning.setup import (
 )
 from whill_mjx.learning.shaping import SAFETY, Step, find_safety
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.tasks import LAYOUTS, TASKS
+from whill_mjx.tasks.tasks import LAYOUTS, named_task
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -97,7 +98,7 @@ class TrainOptions:
     log: Path | None = None
     """Driving-log dataset to fit the vehicle to; none takes the small one that ships with the project."""
     task: str = "obstacle_course"
-    """obstacle_course or corridor."""
+    """Name of a task (obstacle_course, corridor, ...), package.module:TASK or path/to/file.py:TASK."""
     preset: str = "auto"
     """paper, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
     learner: Literal["dreamer", "ppo"] = "dreamer"
@@ -129,7 +130,7 @@ class TrainOptions:
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
     """Let the world model also predict goal, speeds and free distances, which the simulator knows
-    (`whill_mjx.learning.privileged`). The
+    (`whill_mjx.sensors.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: Annotated[float | None, SHARE] = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
@@ -264,11 +265,11 @@ def preset_name(name: str) -> str:
 def choose_preset(options: TrainOptions) -> Preset:
     """The preset with the options' changes put in."""
     check_known("--preset", options.preset, PRESETS)
-    check_known("--task", options.task, TASKS)
+    task = named_task(options.task)
     check_known("--layout", options.layout, LAYOUTS)
     check_known("--safety", options.safety, SAFETY)
     name = preset_name(options.preset)
-    preset = with_layout(find_preset(name, options.task), options.layout)
+    preset = with_layout(find_preset(name, task, options.steps), options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     learner, baseline = preset.learner, preset.ppo
@@ -413,11 +414,10 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt
-    size = (course.env.height, course.env.width)
 
     @jax.jit
     def ends(params: Any) -> dict[str, jax.Array]:
-        step, carry = ppo_policy(preset, params, control_dt, size)
+        step, carry = ppo_policy(preset, params, control_dt, course.env)
         return rollout(course.env, vehicles, keys, step_driver(step, carry, preset.task.action_repeat)).ends
 
     def evaluate(params: Any, env_steps: int) -> dict[str, float]:
@@ -469,7 +469,7 @@ def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Co
     """What drives, and is exported: the step of one instance and its first carry."""
     control_dt = course.env.model.config.control_dt
     if options.learner == "ppo":
-        return ppo_policy(preset, result.params, control_dt, (course.env.height, course.env.width))
+        return ppo_policy(preset, result.params, control_dt, course.env)
     return dreamer_policy(preset, result.params, control_dt)
 
 
@@ -518,7 +518,10 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         camera=camera_contract(course.env.model, course.params),
     )
     step, carry = policy_of(options, preset, result, course)
+    shown = obs_shape_of(course.env)
     try:
+        if isinstance(shown, dict):
+            return export_sensing(path, step, carry, shown, result.params, contract, vehicle_file=vehicle)
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")

@@ -25,18 +25,6 @@ from whill_mjx.evaluation.intervals import wilson_interval
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
 CONDITIONS = tuple(name for name in NAMES if name != "latency") + ("latency_s",)
-_CAMERA = "camera_pitch_deg=-6:6:5 camera_z=-0.1:0.1:5"
-_COMMON = (
-    "start_y=-0.4:0.4:5 start_yaw_deg=-20:20:5",
-    "light=0.4:1.6:5 latency_s=0,0.1,0.2,0.3",
-    _CAMERA,
-    "body.mass=0.75x,1x,1.25x,1.5x command_delay.delay=0,0.1,0.2,0.3",
-)
-STANDARD = {
-    "corridor": ("obstacle_x=2,3 obstacle_y=-0.4:0.4:5", *_COMMON),
-    "obstacle_course": ("obstacle_shift_y=-0.3:0.3:7", *_COMMON),
-}
-"""What is looked at for each task if nothing else is asked for; the first row is the paper's, where it has one."""
 PATHS_KEPT = 40
 
 

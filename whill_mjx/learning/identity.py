@@ -13,6 +13,7 @@ import numpy as np
 
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import plain
+from whill_mjx.tasks.tasks import source_of
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -41,8 +42,9 @@ def identity_of(preset: Preset, learner: str, seed: int, vehicle: str, data: str
         settings |= {"ppo": chosen["ppo"], "total_steps": chosen["total_steps"]}  # its learning rate spans the run
     else:
         settings["dreamer"] = chosen["learner"]
-    name = getattr(preset.task, "name", "")
-    return {"learner": learner, "seed": seed, "task": name, "vehicle": vehicle, "data": data, **dict(_flat(settings))}
+    known = {"learner": learner, "seed": seed, "task": preset.task.name, "vehicle": vehicle, "data": data}
+    source = source_of(preset.task)
+    return known | ({"task_file": source} if source else {}) | dict(_flat(settings))
 
 
 def vehicle_label(spec: VehicleSpec, params: VehicleParams) -> str:
