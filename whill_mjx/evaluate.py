@@ -8,14 +8,13 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, OptionError, Range, listen, refusing, run
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
@@ -34,7 +33,8 @@ from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, run_sweep
 from whill_mjx.io.folders import RUN_FILE, claim_folder
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.tasks import Task, make_task, named_task
+from whill_mjx.tasks.options import named_task, read_fields
+from whill_mjx.tasks.tasks import Task, make_task
 
 SCRIPTED = ("planner", "random")
 KIND = "whill_mjx.evaluate"
@@ -195,7 +195,6 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     """
     name = options.task or (policy.task if policy else "obstacle_course")
     task = named_task(name)
-    known: dict[str, Any] = {field.name: getattr(task, field.name) for field in fields(task)}
     changes: dict[str, Any] = {}
     if policy and policy.task == name:
         changes = trained_fields(policy.path, name)
@@ -204,29 +203,10 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}
-    for text in options.set:
-        field, value = _named(text)
-        if field not in known:
-            raise ValueError(f"--set {text}: task {name!r} has no field {field!r} (known: {', '.join(sorted(known))}).")
-        changes[field] = _parse(value, known[field], text)
+    changes |= read_fields(task, options.set)
     if options.layout is not None:
         changes["layout"] = options.layout
     return make_task(name, **changes)
-
-
-def _parse(text: str, like: Any, whole: str) -> Any:
-    """A field's value from text, of the same type as its default."""
-    try:
-        parts = tuple(float(part) for part in text.split(",")) if isinstance(like, tuple) else ()
-        value = parts or type(like)(text)
-    except ValueError as error:
-        kind = {int: "whole number", float: "number", tuple: "list of numbers"}.get(type(like), type(like).__name__)
-        raise OptionError(f"--set {whole}: {text!r} is no {kind}. Correct it.") from error
-    if parts and len(parts) != len(like):
-        raise OptionError(f"--set {whole}: {len(parts)} numbers where {len(like)} are needed. Correct it.")
-    if not all(math.isfinite(one) for one in parts or (value,) if isinstance(one, float)):
-        raise OptionError(f"--set {whole}: must be finite. Correct it.")
-    return value
 
 
 def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:

@@ -7,6 +7,8 @@ first environment of a kind compiles, every other one is ready at once.
 from __future__ import annotations
 
 import dataclasses
+import math
+import numbers
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,7 +31,7 @@ COUNTED = ("timeout", "time_s", "episode_return")
 """Metrics of an end that are in no `info`: Gymnasium tells them otherwise."""
 FORKED = (
     "JAX was started before this process was forked, and its threads do not survive a fork: the environment would "
-    'hang. Use gymnasium.vector.AsyncVectorEnv(..., context="spawn") or "forkserver", or WhillVectorEnv, which computes all '
+    'hang. Use gymnasium.vector.AsyncVectorEnv(..., context="spawn"), or WhillVectorEnv, which computes all '
     "instances in one program."
 )
 
@@ -48,14 +50,14 @@ class Kind:
 
         def begin(origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
             change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
-            return self.batch.begin_one(origin, change)
+            return strong(self.batch.begin_one(origin, change))
 
         return jax.jit(begin)
 
     @cached_property
     def step(self) -> Any:
         """(state, action) -> state and time step of one instance."""
-        return jax.jit(self.batch.step_one)
+        return jax.jit(lambda state, action: strong(self.batch.step_one(state, action)))
 
     @cached_property
     def reset_all(self) -> Any:
@@ -63,19 +65,19 @@ class Kind:
 
         def begin(origins: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
             change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
-            return jax.vmap(lambda origin: self.batch.begin_one(origin, change))(origins)
+            return strong(jax.vmap(lambda origin: self.batch.begin_one(origin, change))(origins))
 
         return jax.jit(begin)
 
     @cached_property
     def step_all(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; nothing begins anew."""
-        return jax.jit(jax.vmap(self.batch.step_one))
+        return jax.jit(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
 
     @cached_property
     def step_or_reset(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; instances that have ended begin a new episode instead."""
-        return jax.jit(self.batch.step)
+        return jax.jit(lambda state, actions: strong(self.batch.step(state, actions)))
 
     @cached_property
     def restart(self) -> Any:
@@ -87,7 +89,7 @@ class Kind:
             def choose(new: jax.Array, old: jax.Array) -> jax.Array:
                 return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-            return jax.tree.map(choose, fresh, (state, steps))
+            return strong(jax.tree.map(choose, fresh, (state, steps)))
 
         return jax.jit(begin)
 
@@ -95,6 +97,15 @@ class Kind:
     def picture(self) -> Any:
         """State -> camera image (H, W, 3) uint8 of one instance."""
         return jax.jit(lambda state: observe(self.batch.env, state.env))
+
+
+def strong(tree: Any) -> Any:
+    """The arrays with types that do not give way: a state from a reset and one from a step are then of one program."""
+    return jax.tree.map(lambda leaf: leaf if _is_key(leaf) else jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 _KINDS: dict[Any, Kind] = {}
@@ -181,7 +192,7 @@ def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
         if name not in OPTIONS:
             raise ValueError(f"reset has no option {name!r} (known: {', '.join(OPTIONS)}). Correct the name, or leave "
                              "it out.")
-        if isinstance(value, bool) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
             raise ValueError(f"option {name} is {value!r}; it must be a finite number. Correct it.")
     return dataclasses.replace(nominal(), **{name: jnp.asarray(value, float) for name, value in options.items()})
 

@@ -27,7 +27,8 @@ from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
-from whill_mjx.tasks.tasks import LAYOUTS, TASKS, named_task
+from whill_mjx.tasks.options import named_task
+from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.gallery import gallery, walk

@@ -70,7 +70,8 @@ from whill_mjx.learning.setup import (
 )
 from whill_mjx.learning.shaping import SAFETY, Step, find_safety
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.tasks import LAYOUTS, named_task
+from whill_mjx.tasks.options import named_task, read_fields
+from whill_mjx.tasks.tasks import LAYOUTS
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -103,6 +104,8 @@ class TrainOptions:
     """paper, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
     learner: Literal["dreamer", "ppo"] = "dreamer"
     """The world model, or the model-free baseline with as many environment steps."""
+    set: tuple[str, ...] = ()
+    """Fields of the task, such as gates=1; they count more than those that the preset changes."""
     layout: str = "randomised"
     """randomised (a new world in each episode) or fixed."""
     seed: Annotated[int, SEED] = 0
@@ -269,7 +272,9 @@ def choose_preset(options: TrainOptions) -> Preset:
     check_known("--layout", options.layout, LAYOUTS)
     check_known("--safety", options.safety, SAFETY)
     name = preset_name(options.preset)
-    preset = with_layout(find_preset(name, task, options.steps), options.layout)
+    preset = find_preset(name, task, options.steps)
+    preset = dataclasses.replace(preset, task=dataclasses.replace(preset.task, **read_fields(task, options.set)))
+    preset = with_layout(preset, options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     learner, baseline = preset.learner, preset.ppo
@@ -494,7 +499,8 @@ def evaluate_policy(
         )
     except ImportError as error:
         say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
-    if options.videos and options.learner == "dreamer" and preset.learner.representation == "reconstruct":
+    seen = options.learner == "dreamer" and not course.env.sensors  # other observations make no picture
+    if options.videos and seen and preset.learner.representation == "reconstruct":
         stage("drawing what the world model predicts")
         try:
             key = jax.random.key(FINAL_SEED + options.seed)

@@ -83,6 +83,10 @@ def test_environments_of_one_kind_share_what_is_compiled(env):
     sizes = env._kind.reset._cache_size()
     other.reset(seed=0)
     assert env._kind.reset._cache_size() == sizes
+    env.step(STILL)
+    other.step(STILL)
+    other.step(STILL)  # from a state of a step, not of a reset
+    assert env._kind.step._cache_size() == 1
     assert WhillEnv(task="obstacle_course", height=8, width=8)._kind is not env._kind
 
 

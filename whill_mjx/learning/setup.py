@@ -130,6 +130,7 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     return dataclasses.replace(
         preset,
         learner=learner,
+        ppo=_changed(preset.ppo, budget.ppo, f"task {chosen.name!r}: budget {name!r}"),
         eval_every=budget.eval_every or max(1, budget.steps // 20),
         eval_episodes=budget.eval_episodes or preset.eval_episodes,
         instances=budget.instances or preset.instances,

@@ -61,6 +61,8 @@ class Budget:
     """Fields of the task that this preset changes."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the world model that it changes (`dreamer.DreamerConfig`)."""
+    ppo: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the model-free baseline that it changes (`whill_mjx.learning.ppo.PpoConfig`)."""
 
 
 @dataclass(frozen=True)

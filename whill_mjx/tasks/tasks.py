@@ -25,7 +25,6 @@ from typing import Any
 
 import jax
 
-from whill_mjx.io.command_line import OptionError
 from whill_mjx.tasks.base import LAYOUTS as LAYOUTS
 from whill_mjx.tasks.base import Budget as Budget
 from whill_mjx.tasks.base import Task as Task
@@ -38,7 +37,7 @@ from whill_mjx.tasks.obstacle_course import ObstacleCourse as ObstacleCourse
 
 GROUP = "whill_mjx.tasks"
 """Group of the entry points."""
-PARTS = ("base", "parts", "starts", "tasks", "terms")
+PARTS = ("base", "options", "parts", "starts", "tasks", "terms")
 """Files of this room that hold no task."""
 
 
@@ -140,15 +139,6 @@ def find_task(name: str) -> Task:
         there = ", ".join(known) or "none"
         raise ValueError(f"task {name!r}: {place} has no task {attribute!r} (known: {there}). Correct the name.")
     return known[attribute] if attribute in known else _as_task(getattr(module, attribute), f"task {name!r}")
-
-
-def named_task(name: str, option: str = "--task") -> Task:
-    """The task that an option of a command names; OptionError says what is wrong."""
-    try:
-        return find_task(name)
-    except (ValueError, TypeError) as error:
-        text = str(error).removeprefix(f"task {name!r}: ").replace(f"unknown task {name!r}", "unknown")
-        raise OptionError(f"{option} {name}: {text}") from error
 
 
 def make_task(name: str, **changes: Any) -> Task:
