@@ -49,6 +49,11 @@ class Preset:
     """Share of training episodes that begin anywhere on the way (`whill_mjx.tasks.starts`); evaluations never do."""
     second_tries: float = 0.0
     """Share of the training episodes without an arrival whose world is begun again (`whill_mjx.batch`)."""
+    looks: str | None = None
+    """What changes the picture from episode to episode: "plain" nothing, "paper" what the paper randomises, "rich"
+    a furnished room (`whill_mjx.world.rich`); None leaves it to the task."""
+    spread: float = 0.0
+    """Relative spread of the vehicle's parameters from episode to episode, in training."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -58,7 +63,7 @@ class Preset:
 
 
 def find_preset(name: str, task: str) -> Preset:
-    """Preset by name ("paper", "wallclock", "cpu" or "smoke") for a task; ValueError names the known ones.
+    """Preset by name ("paper", "transfer", "wallclock", "cpu" or "smoke") for a task; ValueError names the known ones.
 
     "paper" is the reference paper's setting: 16 instances, 22,000 control steps on the obstacle course and 200,000 in
     the corridor (at ratios of 384 and 160). Its updates are few, so it learns faster at first and explores more
@@ -68,7 +73,8 @@ def find_preset(name: str, task: str) -> Preset:
     with noise alone, two seeds in five learned a fixed layout. Its drives are short, so twice as many sequences of half
     the length make a batch, in less time. In the corridor, whose box may look like the floor behind it, what the
     simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen in four paints.
-    "wallclock" spends environment steps to save time: thousands of instances, few updates per step, and
+    "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, for a
+    policy that drives where nobody trained. "wallclock" spends environment steps to save time: thousands of instances, few updates per step, and
     an end when nearly all held-out episodes succeed. "cpu" is an easier course for 2 cores: forward speeds only, one
     gate, a decision every 0.5 s, a small network on 8x8 patches. "smoke" only shows that everything runs.
     """
@@ -88,6 +94,8 @@ def find_preset(name: str, task: str) -> Preset:
                 make_task(task), dataclasses.replace(learner, **own), steps, eval_every=1000 if on_course else 20_000,
                 eval_episodes=200, exploring_starts=0.5 if on_course else 0.0, second_tries=0.0 if on_course else 0.5,
             )  # fmt: skip
+        case "transfer":
+            return dataclasses.replace(find_preset("paper", task), looks="rich", spread=0.1)
         case "wallclock":
             learner = learner_preset(
                 "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
@@ -107,7 +115,7 @@ def find_preset(name: str, task: str) -> Preset:
             tiny = dataclasses.replace(tiny, batch_length=8, learning_starts=64, train_ratio=4.0, imag_horizon=4)
             small = PpoConfig(rollout=16, minibatches=2, epochs=1, width=32, channels=(8, 8, 8))
             return Preset(course, tiny, 400, instances=4, eval_every=200, eval_episodes=8, ppo=small)
-    known = "'paper', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
+    known = "'paper', 'transfer', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
     raise ValueError(f"unknown preset {name!r}; use {known}.")
 
 
@@ -237,7 +245,7 @@ def mirror_of(batch: BatchEnv) -> Mirror:
     Where looks are drawn at random, each of its worlds has its own, every second one with left and right as they are:
     what is learned from one drive is seen in several.
     """
-    paints = batch.env.random_looks or batch.env.photometric
+    paints = batch.env.repaints
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
         """Every second of the worlds (K, ...) as it is."""
@@ -262,10 +270,10 @@ def mirror_of(batch: BatchEnv) -> Mirror:
 
 def make_training_env(
     task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0, second_tries: float = 0.0,
+    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None,
 ) -> BatchEnv:  # fmt: skip
     """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
-    env, params = make_env(task, vehicle, exploring_starts=exploring_starts)
+    env, params = make_env(task, vehicle, exploring_starts=exploring_starts, looks=looks)
     return make_batch(env, params, instances, spread, devices, second_tries)
 
 
