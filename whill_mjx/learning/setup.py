@@ -283,7 +283,7 @@ def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[S
     params = jax.tree.map(jnp.asarray, params)
     return limited_policy(
         preset.task, preset.safety, lambda carry, image: agents.policy_step(learner, params, carry, image),
-        agents.policy_carry(learner, 2), control_dt * preset.task.action_repeat,
+        {**agents.policy_carry(learner, 2), agents.SURPRISE: jnp.zeros(1)}, control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 

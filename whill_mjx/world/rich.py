@@ -389,7 +389,7 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     value = dict(zip(PROPERTIES, jnp.where(_IS_LOG, scaled, level).T, strict=True))
     rest = u[:, 1 + len(PROPERTIES) :]
     warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
-    odd = rest[:, 14] < 0.06  # a tail of saturated paints
+    odd = rest[:, 14] < 0.12  # a tail of saturated paints
     base = _reflectance(value["value"], jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"]), rest[:, 0], warm)
     other = _reflectance(
         jnp.clip(value["value"] * value["second"], 0.02, 0.9), value["saturation"] * rest[:, 1], rest[:, 2], warm
