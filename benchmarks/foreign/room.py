@@ -17,9 +17,9 @@ from benchmarks.foreign import paint
 VARIANTS = ("plain", "furnished", "unseen")
 WIDTH, BEGIN, END = 2.4, -2.0, 6.5  # m
 GOAL = (4.5, 0.0)
-BODY = (0.4925, 0.277, 0.4)
+BODY = (0.3694, 0.277, 0.4)
 """Half sizes of the chair's outline [m]; its middle lies AHEAD of the drive axle."""
-AHEAD = 0.36
+AHEAD = 0.27
 
 
 @dataclass
