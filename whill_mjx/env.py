@@ -27,9 +27,12 @@ from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.eye import develop, mounted
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
-from whill_mjx.world.render import pinhole, render
+from whill_mjx.world.render import Quality, pinhole, render
+from whill_mjx.world.render.rich import floor_light
+from whill_mjx.world.rich import furnish, paint
 from whill_mjx.world.scene import Scene, clearance, collides, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
@@ -38,9 +41,10 @@ POSE_METRICS = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
 """Metrics of every frame."""
 RESERVED = (*POSE_METRICS, "timeout", "diverged", "time_s", "episode_return")
 """Names that a task's endings may not have."""
-LOOKS = {"plain": (False, False), "paper": (True, True)}
-"""Whether to draw looks at random, and to change the images photometrically, by the name of a task's looks."""
-
+LOOKS = ("plain", "paper", "rich")
+"""What changes the picture from episode to episode: nothing, what the paper randomises, a furnished room."""
+TRAIL = 5
+"""Poses kept for late images and for the lag of the exposure control."""
 DEFAULT_VEHICLE = "whill_cr_ramp"
 """The paper's identified WHILL with its ramp."""
 
@@ -62,11 +66,18 @@ class Env:
     exploring_starts: float = 0.0
     """Share of episodes that begin at a random free place on the way to the goal; for training
     (`whill_mjx.tasks.starts`)."""
+    rich: bool = False
+    """Furnish the room and draw materials, lights and film at random (`whill_mjx.world.rich`), instead of the above."""
     sensors: Sensors = ()
     """What is observed, as pairs of name and sensor; none shows the camera image alone, as an array."""
 
     def __post_init__(self) -> None:
         check_fields("environment", ENV, self)
+
+    @property
+    def repaints(self) -> bool:
+        """Whether two episodes in one world look different."""
+        return self.random_looks or self.photometric or self.rich
 
 
 @struct.dataclass
@@ -82,6 +93,7 @@ class State:
     episode_return: jax.Array  # () sum of the rewards since the start
     done: jax.Array  # () bool: the episode has ended; the next step of a batch starts a new one
     key: jax.Array  # random key of the episode
+    trail: jax.Array | None = None  # (TRAIL, 7) latest poses of the chassis, newest first; with rich looks only
     sensors: tuple = ()  # memory of the sensors
 
 
@@ -104,6 +116,7 @@ def make_env(
     height: int = 64,
     width: int = 64,
     exploring_starts: float = 0.0,
+    looks: str | None = None,
     observations: Mapping[str, Sensor] | Sequence[str] | None = None,
 ) -> tuple[Env, VehicleParams]:
     """Environment, and the nominal parameters of its vehicle.
@@ -117,28 +130,39 @@ def make_env(
             are the same.
         height, width: image size [pixels].
         exploring_starts: see `Env`.
+        looks: one of LOOKS, which sets `random_looks`, `photometric` and `rich`: "plain" draws nothing, "paper" what
+            the paper randomises, "rich" a furnished room. None takes those of the task, and none where all worlds are
+            the same; the two arguments count more than the task's.
         observations: sensors by name, or names of the package's sensors (`whill_mjx.sensors`); observations are then a
             dict. None takes those of the task, and the camera image alone, as an array, where it names none.
 
     Raises:
-        ValueError: unknown task, layout, vehicle or sensor; a share that is none.
+        ValueError: unknown task, layout, vehicle, looks or sensor; a share that is none; rich looks of a task that has
+            no lane to furnish.
     """
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
     spec, params = as_vehicle(vehicle)
     chosen = task.observations() if observations is None else observations
-    if task.looks not in LOOKS:
-        raise ValueError(f"task {task.name!r}: looks is {task.looks!r} (known: {', '.join(LOOKS)}). Correct it.")
-    painted, developed = LOOKS[task.looks] if task.randomised else LOOKS["plain"]
+    if looks is None:
+        looks = task.looks if task.randomised else "plain"
+    else:
+        random_looks = photometric = None
+    if looks not in LOOKS:
+        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
+    if looks == "rich" and not task.lane:
+        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
+                         "'rich'.")
     env = Env(
         build_model(spec),
         task,
         height,
         width,
-        painted if random_looks is None else random_looks,
-        developed if photometric is None else photometric,
+        looks == "paper" if random_looks is None else random_looks,
+        looks == "paper" if photometric is None else photometric,
         exploring_starts,
+        looks == "rich",
         as_sensors(chosen, known_sensors()),
     )
     return env, params
@@ -200,7 +224,13 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
     """State at the start of an episode, without its image."""
     key, world_key, looks_key, photometry_key = jax.random.split(key, 4)
     world = env.task.sample_world(world_key)
-    scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
+    if env.rich:
+        lone = world.scene.boxes.mask.shape[0] == env.task.walls + 1
+        scene = furnish(jax.random.fold_in(world_key, 1), world.scene, lone)
+        scene = paint(looks_key, scene)
+        world = dataclasses.replace(world, scene=scene)
+    else:
+        scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
     photometry = draw_photometry(photometry_key) if env.photometric else neutral()
     start = world.start
     if env.exploring_starts:
@@ -216,6 +246,7 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
         episode_return=jnp.zeros(()),
         done=jnp.zeros((), bool),
         key=key,
+        trail=jnp.broadcast_to(vehicle.qpos[:7], (TRAIL, 7)) if env.rich else None,
     )
     if not env.sensors:
         return state
@@ -227,6 +258,8 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
     random; shapes, places and motion stay."""
     looks_key, photometry_key, key = jax.random.split(key, 3)
     scene, photometry = state.scene, state.photometry
+    if env.rich:
+        scene = paint(looks_key, scene)
     if env.random_looks:
         marker = dataclasses.replace(scene.marker, colour=jnp.array(BLUE))  # as before its own shade was drawn
         scene = randomize_looks(looks_key, dataclasses.replace(scene, marker=marker))
@@ -273,6 +306,7 @@ def _control_period(
         step_count=step_count,
         episode_return=state.episode_return + reward,
         done=terminated | truncated,
+        trail=None if state.trail is None else jnp.concatenate([vehicle.qpos[None, :7], state.trail[:-1]]),
     )
     ends |= {"timeout": truncated, "diverged": vehicle.diverged}
     ends = {name: flag.astype(reward.dtype) for name, flag in ends.items()}
@@ -374,9 +408,40 @@ def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
 
 def observe(env: Env, state: State) -> jax.Array:
     """Camera image (H, W, 3) uint8 of one instance."""
+    if env.rich:
+        return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
     image = render(position, rotation, intrinsics, state.scene, env.height, env.width)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
+
+
+METERED = (0.8, 1.8, 3.5)
+"""Distances ahead of the camera at which the exposure control finds the light [m]."""
+SHUTTER = 1.0 / 40.0
+"""Time for which the shutter of a camera in a room is open [s]."""
+
+
+def _observe_rich(env: Env, state: State) -> jax.Array:
+    """The same with mount, exposure control, film and delay of the camera."""
+    eye, lights, trail = state.scene.rich.eye, state.scene.rich.lights, state.trail
+    assert trail is not None
+    position, rotation = camera_pose(env.model, trail[eye.delay])
+    position, rotation = mounted(eye, position, rotation)
+    fov = env.model.spec.camera.fov_y * eye.zoom
+    intrinsics = pinhole(fov, env.height, env.width)
+
+    then, before = camera_pose(env.model, trail[-1])
+    ahead = before[:2, 2] * jax.lax.rsqrt(jnp.sum(before[:2, 2] ** 2) + 1e-6)
+    metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
+    exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
+    rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
+    scene = dataclasses.replace(state.scene, rich=rich)
+    image = render(position, rotation, intrinsics, scene, env.height, env.width, RICH)
+    turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
+    return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)
+
+
+RICH = Quality(antialias=True)

@@ -60,8 +60,9 @@ class EvaluateOptions:
     """A new world in each episode, or always the same one; none takes that of the training, else randomised."""
     set: tuple[str, ...] = ()
     """Fields of the task, such as gates=1; those that the policy was trained with are found beside it."""
-    looks: Literal["task", "on", "off"] = "task"
-    """Random colours, light and photometric changes; task leaves it to the task."""
+    looks: Literal["task", "on", "off", "plain", "paper", "rich"] = "task"
+    """plain (nothing random), paper (random colours, light and photometric changes) or rich (furnished rooms,
+    docs/looks.md); task leaves it to the task. off and on are older names of plain and paper."""
     spread: Annotated[float, Range(0, 1, below=True)] = 0.0
     """Relative spread of the vehicle's parameters from episode to episode."""
     baselines: tuple[str, ...] = ()
@@ -220,9 +221,9 @@ def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:
 def make_course(options: EvaluateOptions, task: Task, policy: PolicyFile | None, vehicle: str | None) -> Course:
     """The environment with a vehicle: the given one, the options', the policy's, or the built-in one."""
     chosen: str | Path | None = vehicle or options.vehicle or (policy.vehicle if policy else None)
-    flag = {"task": None, "on": True, "off": False}[options.looks]
+    looks = {"task": None, "on": "paper", "off": "plain"}.get(options.looks, options.looks)
     height, width = (policy.height or 64, policy.width or 64) if policy else (64, 64)
-    env, params = make_env(task, chosen, random_looks=flag, photometric=flag, height=height, width=width)
+    env, params = make_env(task, chosen, height=height, width=width, looks=looks)
     rate = 1.0 / env.model.config.control_dt
     if policy and abs(policy.rate_hz - rate) > 1e-6:
         raise ValueError(f"{policy.path}/policy.json: rate_hz is {policy.rate_hz}; the simulator runs at {rate:g} Hz. "

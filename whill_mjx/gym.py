@@ -45,8 +45,7 @@ class WhillEnv(gymnasium.Env):
         observations: Mapping[str, Sensor] | Sequence[str] | None = None,
         height: int = 64,
         width: int = 64,
-        random_looks: bool | None = None,
-        photometric: bool | None = None,
+        looks: str | None = None,
         spread: float = 0.0,
     ):
         """Build the environment; nothing is compiled before the first `reset` of its kind.
@@ -59,7 +58,7 @@ class WhillEnv(gymnasium.Env):
             render_mode: "rgb_array" gives the camera image, "human" shows it in a window; None neither.
             observations: sensors by name, or names of the package's sensors; None takes the task's.
             height, width: size of the camera image [pixels].
-            random_looks, photometric: as in `make_env`.
+            looks: "plain", "paper" or "rich", as in `make_env`; None takes the task's.
             spread: relative spread of the vehicle's parameters, drawn anew for each episode.
 
         Raises:
@@ -68,7 +67,7 @@ class WhillEnv(gymnasium.Env):
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         self._arguments = {
             "task": task, "vehicle": vehicle, "layout": layout, "observations": observations, "height": height,
-            "width": width, "random_looks": random_looks, "photometric": photometric, "spread": spread,
+            "width": width, "looks": looks, "spread": spread,
         }  # fmt: skip
         self._state: Any = None
         self._image: np.ndarray | None = None

@@ -41,8 +41,7 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         observations: Mapping[str, Sensor] | Sequence[str] | None = None,
         height: int = 64,
         width: int = 64,
-        random_looks: bool | None = None,
-        photometric: bool | None = None,
+        looks: str | None = None,
         spread: float = 0.0,
     ):
         """Build the environment; nothing is compiled before the first `reset`.
@@ -52,8 +51,7 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
             autoreset_mode: NEXT_STEP (the fastest: an instance that has ended ignores its next action and begins anew),
                 SAME_STEP (it begins anew at once; the last frame is info["final_obs"]), or DISABLED
                 (`reset(options={"reset_mask": mask})` does).
-            task, vehicle, layout, render_mode, observations, height, width, random_looks, photometric, spread: as of
-                `WhillEnv`.
+            task, vehicle, layout, render_mode, observations, height, width, looks, spread: as of `WhillEnv`.
 
         Raises:
             ValueError: of `WhillEnv`; a number of instances below 1; an unknown mode.
@@ -66,7 +64,7 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         self._kind = find_kind({
             "task": task, "vehicle": vehicle, "layout": layout, "observations": observations, "height": height,
-            "width": width, "random_looks": random_looks, "photometric": photometric, "spread": spread,
+            "width": width, "looks": looks, "spread": spread,
         })  # fmt: skip
         self.single_observation_space, self.single_action_space = self._kind.observation_space, self._kind.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

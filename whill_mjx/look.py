@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
 
@@ -50,8 +50,9 @@ class Look:
     """Picture to write, or video with the ending .mp4 or .gif."""
     layout: str = "randomised"
     """randomised or fixed."""
-    looks: bool = False
-    """Also draw colours, light and textures at random, and change the images photometrically."""
+    looks: Literal["plain", "paper", "rich"] = "plain"
+    """plain, paper (colours, light and textures at random, and images changed photometrically) or rich (furnished
+    rooms, docs/looks.md)."""
     worlds: Annotated[int, Range(1, 100)] = 6
     """Columns of the sheet."""
     steps: Annotated[int, Range(1, 10_000)] = 18
@@ -193,7 +194,7 @@ def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:
-    return make_env(options.scene, layout=options.layout, random_looks=options.looks, photometric=options.looks)
+    return make_env(options.scene, layout=options.layout, looks=options.looks)
 
 
 def main(options: Look) -> None:

@@ -83,7 +83,7 @@ FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the 
 SHIPPED_LOG = "chair"
 LEAST_FREE = 32_000_000
 """Bytes that must be free for a training's folder; a checkpoint of the smallest preset takes some of them."""
-PRESETS = ("auto", "paper", "wallclock", "cpu", "smoke")
+PRESETS = ("auto", "paper", "transfer", "wallclock", "cpu", "smoke")
 Vehicle = tuple[VehicleSpec, VehicleParams, dict[str, Any]]
 """Spec, parameters and provenance."""
 
@@ -101,13 +101,16 @@ class TrainOptions:
     task: str = "obstacle_course"
     """Name of a task (obstacle_course, corridor, ...), package.module:TASK or path/to/file.py:TASK."""
     preset: str = "auto"
-    """paper, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
+    """paper, transfer, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
     learner: Literal["dreamer", "ppo"] = "dreamer"
     """The world model, or the model-free baseline with as many environment steps."""
     set: tuple[str, ...] = ()
     """Fields of the task, such as gates=1; they count more than those that the preset changes."""
     layout: str = "randomised"
     """randomised (a new world in each episode) or fixed."""
+    looks: Literal["plain", "paper", "rich"] | None = None
+    """What changes the picture from episode to episode: nothing, what the paper randomises, or a furnished room with
+    other materials, light and camera (docs/looks.md). None takes the preset's."""
     seed: Annotated[int, SEED] = 0
     """Seed of the training."""
     steps: Annotated[int | None, COUNT] = None
@@ -300,6 +303,7 @@ def choose_preset(options: TrainOptions) -> Preset:
         eval_every=preset.eval_every if options.eval_every is None else options.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
+        looks=preset.looks if options.looks is None else options.looks,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
@@ -385,10 +389,10 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     """Train the world model and its policy, with an evaluation every `eval_every` steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
-        second_tries=preset.second_tries,
+        preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
+        preset.looks,
     )  # fmt: skip
-    held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
+    held_out = make_training_env(preset.task, vehicle, preset.eval_episodes, looks=preset.looks)
     evaluate = evaluation_of(held_out, preset, options.seed)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
@@ -413,8 +417,8 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     """Train the model-free baseline with as many environment steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
-        second_tries=preset.second_tries,
+        preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
+        preset.looks,
     )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
@@ -466,7 +470,7 @@ def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Train
 
 def make_course(preset: Preset, vehicle: Path) -> Course:
     """The environment of evaluations."""
-    batch = make_training_env(preset.task, vehicle, 1)
+    batch = make_training_env(preset.task, vehicle, 1, looks=preset.looks)
     return Course(batch.env, batch.params)
 
 

@@ -22,7 +22,8 @@ OUTPUTS = ("config.json", "best", "best.json", "policy_best", "policy_last", "dr
            "reward_curve.png", "drives.png", "failures.png", "camera.mp4", "failures.mp4", "prediction.gif",
            "index.html", "tensorboard")  # fmt: skip
 """Names that a training writes besides the results that all commands share."""
-SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries")
+SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries",
+            "looks", "spread")
 """Fields of a preset that change the result of both learners; evaluations choose the best parameters."""
 
 

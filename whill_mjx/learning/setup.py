@@ -51,6 +51,11 @@ class Preset:
     """Share of training episodes that begin anywhere on the way (`whill_mjx.tasks.starts`); evaluations never do."""
     second_tries: float = 0.0
     """Share of the training episodes without an arrival whose world is begun again (`whill_mjx.batch`)."""
+    looks: str | None = None
+    """What changes the picture from episode to episode: "plain" nothing, "paper" what the paper randomises, "rich"
+    a furnished room (`whill_mjx.world.rich`); None leaves it to the task."""
+    spread: float = 0.0
+    """Relative spread of the vehicle's parameters from episode to episode, in training."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -59,11 +64,11 @@ class Preset:
     """End when two evaluations in a row have had this share of successes."""
 
 
-PRESETS = ("paper", "wallclock", "cpu", "smoke")
+PRESETS = ("paper", "transfer", "wallclock", "cpu", "smoke")
 
 
 def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset:
-    """Preset by name ("paper", "wallclock", "cpu" or "smoke") for a task, which brings its own budget.
+    """Preset by name ("paper", "transfer", "wallclock", "cpu" or "smoke") for a task, which brings its own budget.
 
     "paper" is the reference paper's setting: 16 instances and few steps. Its updates are few, so it learns faster at
     first and explores more than DreamerV3's defaults; it also learns from the mirrored world and predicts what the
@@ -73,6 +78,8 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     many sequences of half the length make a batch, in less time. In the corridor, whose box may look like the floor
     behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
     in four paints.
+    "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, for a
+    policy that drives where nobody trained.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
     cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
     shows that everything runs.
@@ -86,10 +93,10 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
         ValueError: unknown preset or task, a budget with a wrong setting, or no budget and no steps.
     """
     if name not in PRESETS:
-        known = "'paper', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
+        known = "'paper', 'transfer', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
         raise ValueError(f"unknown preset {name!r}; use {known}.")
     chosen = make_task(task) if isinstance(task, str) else task
-    budget = chosen.budgets.get(name)
+    budget = chosen.budgets.get(name, chosen.budgets.get("paper") if name == "transfer" else None)
     if budget is None and name == "smoke":
         budget = Budget(400, eval_every=200)
     if budget is None and steps is None:
@@ -99,12 +106,14 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     budget = budget or Budget(steps or 0)
     chosen = _changed(chosen, budget.fields, f"task {chosen.name!r}: budget {name!r}")
     match name:
-        case "paper":
+        case "paper" | "transfer":
             learner = learner_preset(
                 "size12m", lr=1.5e-4, entropy_scale=1e-3, replay_capacity=250_000, average_rate=0.002,
                 greedy_share=0.25, decode_only=(TRUTH,),
             )  # fmt: skip
             preset = Preset(chosen, learner, budget.steps, eval_episodes=200)
+            if name == "transfer":
+                preset = dataclasses.replace(preset, looks="rich", spread=0.1)
         case "wallclock":
             learner = learner_preset(
                 "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
@@ -124,7 +133,7 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
             slow = dataclasses.replace(chosen, **{"action_repeat": 5, **budget.fields})
             preset = Preset(slow, tiny, budget.steps, instances=4, eval_episodes=8, ppo=small)
     learner = _changed(preset.learner, budget.learner, f"task {chosen.name!r}: budget {name!r}")
-    if name == "paper":  # the falling rate spans the run
+    if name in ("paper", "transfer"):  # the falling rate spans the run
         updates = int(budget.steps * learner.train_ratio) // learner.replayed_per_update
         learner = dataclasses.replace(learner, lr_decay=max(learner.warmup + 1, updates))
     return dataclasses.replace(
@@ -308,7 +317,7 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
             lambda state, obs, worlds: {name: mirrors[name](value)[None] for name, value in obs.items()},
             lambda action, worlds: (action * jnp.array([1.0, -1.0]))[None],
         )
-    paints = batch.env.random_looks or batch.env.photometric
+    paints = batch.env.repaints
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
         """Every second of the worlds (K, ...) as it is."""
@@ -333,10 +342,10 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
 
 def make_training_env(
     task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0, second_tries: float = 0.0,
+    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None,
 ) -> BatchEnv:  # fmt: skip
     """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
-    env, params = make_env(task, vehicle, exploring_starts=exploring_starts)
+    env, params = make_env(task, vehicle, exploring_starts=exploring_starts, looks=looks)
     return make_batch(env, params, instances, spread, devices, second_tries)
 
 
@@ -346,7 +355,7 @@ def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[S
     params = jax.tree.map(jnp.asarray, params)
     return limited_policy(
         preset.task, preset.safety, lambda carry, image: agents.policy_step(learner, params, carry, image),
-        agents.policy_carry(learner, 2), control_dt * preset.task.action_repeat,
+        {**agents.policy_carry(learner, 2), agents.SURPRISE: jnp.zeros(1)}, control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 

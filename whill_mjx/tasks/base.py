@@ -76,7 +76,10 @@ class Task:
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS
     """What `evaluate --sweep standard` varies."""
     looks: ClassVar[str] = "plain"
-    """How randomised worlds look (`whill_mjx.world.looks`): "plain" as they are drawn, "paper" painted at random."""
+    """How randomised worlds look (`whill_mjx.env.LOOKS`): "plain" as they are drawn, "paper" painted at random, "rich"
+    furnished."""
+    lane: ClassVar[bool] = False
+    """Whether the first boxes are the left, right and far wall of a lane, as `rich` looks need."""
     walls: ClassVar[int] = 4
     """How many of the first boxes of a scene are walls; sweeps move those behind them."""
     per_period: ClassVar[tuple[str, ...]] = ("time",)

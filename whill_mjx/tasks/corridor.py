@@ -22,6 +22,7 @@ class Corridor(Task):
 
     name: ClassVar[str] = "corridor"
     looks: ClassVar[str] = "paper"
+    lane: ClassVar[bool] = True
     walls: ClassVar[int] = 3
     sweeps: ClassVar[tuple[str, ...]] = ("obstacle_x=2,3 obstacle_y=-0.4:0.4:5", *COMMON_SWEEPS)
     budgets: ClassVar[dict[str, Budget]] = {

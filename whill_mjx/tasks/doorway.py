@@ -19,6 +19,7 @@ class Doorway(Task):
 
     name: ClassVar[str] = "doorway"
     looks: ClassVar[str] = "paper"
+    lane: ClassVar[bool] = True
     walls: ClassVar[int] = 3
     sweeps: ClassVar[tuple[str, ...]] = ("obstacle_shift_y=-0.3:0.3:7", *COMMON_SWEEPS)
 

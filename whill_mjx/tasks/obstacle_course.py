@@ -25,6 +25,7 @@ class ObstacleCourse(Task):
     """
 
     name: ClassVar[str] = "obstacle_course"
+    lane: ClassVar[bool] = True
     walls: ClassVar[int] = 3
     sweeps: ClassVar[tuple[str, ...]] = ("obstacle_shift_y=-0.3:0.3:7", *COMMON_SWEEPS)
     budgets: ClassVar[dict[str, Budget]] = {
