@@ -25,7 +25,7 @@ from whill_mjx.env import (
 )
 from whill_mjx.io.fields import BATCH, check_fields
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
-from whill_mjx.world.randomize import randomize_params
+from whill_mjx.world.randomize import Variation, randomize_params, vary_params
 
 
 @struct.dataclass
@@ -54,6 +54,9 @@ class BatchEnv:
     second_tries: float = 0.0
     """Share of the episodes without an arrival after which the same world is begun again, with the same vehicle and
     start; for training. What fails is met more often so (cf. prioritised level replay, Jiang et al. 2021)."""
+
+    variations: tuple[Variation, ...] = ()
+    """Parameters of the vehicle that are drawn from their ranges, anew for each episode."""
 
     def __post_init__(self) -> None:
         check_fields("batch", BATCH, self)
@@ -132,6 +135,8 @@ class BatchEnv:
     def _begin(self, origin: jax.Array, tries: jax.Array | int = 0) -> tuple[BatchState, Outcome]:
         key, params_key = jax.random.split(origin)
         params = randomize_params(params_key, self.params, self.spread) if self.spread else self.params
+        if self.variations:
+            params = vary_params(jax.random.fold_in(params_key, 1), params, self.variations)
         params = jax.tree.map(jnp.asarray, params)
         state = reset_state(self.env, params, key)
         return BatchState(state, params, origin, jnp.asarray(tries, jnp.int32)), first_outcome(self.env, state)
@@ -164,7 +169,8 @@ class BatchEnv:
 
 
 def make_batch(
-    env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0
-) -> BatchEnv:
+    env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0,
+    variations: tuple[Variation, ...] = (),
+) -> BatchEnv:  # fmt: skip
     """`count` instances of `env`; see `BatchEnv` for the rest."""
-    return BatchEnv(env, params, count, spread, tuple(devices), second_tries)
+    return BatchEnv(env, params, count, spread, tuple(devices), second_tries, tuple(variations))

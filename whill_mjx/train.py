@@ -64,6 +64,7 @@ from whill_mjx.learning.setup import (
     obs_shape_of,
     ppo_policy,
     step_driver,
+    variations_of,
     with_layout,
     with_repeat,
     with_settings,
@@ -74,7 +75,7 @@ from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
-from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
 STOPPED = "stopped; give the same command again to go on from the last checkpoint."
 Stage = Callable[[str], None]
@@ -144,6 +145,12 @@ class TrainOptions:
     second_tries: Annotated[float | None, SHARE] = None
     """Share of the training episodes without an arrival after which the same world is begun again, which a simulator
     can do; evaluations never do. None takes the preset's."""
+    spread: Annotated[float | None, Range(0, 1, below=True)] = None
+    """Relative spread of all parameters of the vehicle from episode to episode of the training; none takes the
+    preset's."""
+    vary: tuple[str, ...] = ()
+    """Parameters of the vehicle drawn anew in each episode of the training: body.mass=0.9x:1.1x, an effect such as
+    command_delay.delay=0:0.2 (added where the vehicle lacks it), or fit for all intervals of the vehicle file."""
     instances: Annotated[int | None, COUNT] = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
@@ -187,6 +194,10 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
     if options.log is not None and not options.log.exists():
         raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
+    if any(text != "fit" for text in preset.vary):
+        variations_of([text for text in preset.vary if text != "fit"], None)
+    if "fit" in preset.vary and options.vehicle is not None:
+        variations_of(["fit"], options.vehicle)
     if processes > 1 and options.learner == "ppo":
         raise ValueError("the baseline trains in one process; start it alone or choose --learner dreamer.")
     devices = choose_devices(options.devices)
@@ -304,6 +315,8 @@ def choose_preset(options: TrainOptions) -> Preset:
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
         looks=preset.looks if options.looks is None else options.looks,
+        spread=preset.spread if options.spread is None else options.spread,
+        vary=options.vary or preset.vary,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
@@ -346,7 +359,9 @@ def prepare_vehicle(
     if fitted is not None:
         write_whole(target, fitted.read_text())
     else:
-        save_vehicle(target, *vehicle[:2], provenance=vehicle[2])
+        source = options.vehicle if given is not None else None
+        known_intervals = load_intervals(source) if source is not None and source.is_file() else None
+        save_vehicle(target, *vehicle[:2], known_intervals, provenance=vehicle[2])
 
 
 def _shipped_log() -> Path:
@@ -390,7 +405,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     devices = choose_devices(options.devices)
     batch = make_training_env(
         preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
-        preset.looks,
+        preset.looks, preset.vary,
     )  # fmt: skip
     held_out = make_training_env(preset.task, vehicle, preset.eval_episodes, looks=preset.looks)
     evaluate = evaluation_of(held_out, preset, options.seed)
@@ -418,7 +433,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     devices = choose_devices(options.devices)
     batch = make_training_env(
         preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
-        preset.looks,
+        preset.looks, preset.vary,
     )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)

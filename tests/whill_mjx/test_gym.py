@@ -112,9 +112,9 @@ def test_options_change_the_episode_and_unknown_ones_are_refused(env):
 
 
 def test_a_vector_begins_in_the_worlds_of_single_environments(env):
-    many = WhillVectorEnv(3, **SMALL)
+    many = WhillVectorEnv(2, **SMALL)
     obs, _ = many.reset(seed=7)
-    single = [env.reset(seed=7 + index)[0] for index in range(3)]
+    single = [env.reset(seed=7 + index)[0] for index in range(2)]
     np.testing.assert_array_equal(obs, np.stack(single))
 
 

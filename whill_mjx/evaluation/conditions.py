@@ -91,7 +91,7 @@ def seen_under(condition: Condition, env: Env, state: State) -> State:
     turn = quaternion_from_angles(
         jnp.zeros(()), jnp.deg2rad(condition.camera_pitch_deg), jnp.deg2rad(condition.camera_yaw_deg)
     )
-    at = jnp.array([mount.x, 0.0, mount.z])
+    at = jnp.array([mount.x, mount.y, mount.z])
     shift = jnp.stack([condition.camera_x, condition.camera_y, condition.camera_z])
     # Turned about the camera, which then is displaced: chassis' = chassis * move(at + shift) * turn * move(-at).
     offset = at + shift - rotation_from_quaternion(turn) @ at

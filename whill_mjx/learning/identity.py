@@ -22,8 +22,10 @@ OUTPUTS = ("config.json", "best", "best.json", "policy_best", "policy_last", "dr
            "reward_curve.png", "drives.png", "failures.png", "camera.mp4", "failures.mp4", "prediction.gif",
            "index.html", "tensorboard")  # fmt: skip
 """Names that a training writes besides the results that all commands share."""
+LATER = ("y", "roll", "yaw")
+"""Fields of the camera that older vehicles do not have; at zero they change nothing."""
 SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries",
-            "looks", "spread")
+            "looks", "spread", "vary")
 """Fields of a preset that change the result of both learners; evaluations choose the best parameters."""
 
 
@@ -52,7 +54,9 @@ def vehicle_label(spec: VehicleSpec, params: VehicleParams) -> str:
     """Name of a vehicle with a checksum of its spec, effects and parameters, whatever else its file says."""
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
     values = {jax.tree_util.keystr(path): float(np.float32(leaf)) for path, leaf in leaves}
-    content = [dataclasses.asdict(spec), [effect.name for effect in params.effects], values]
+    about = dataclasses.asdict(spec)
+    about["camera"] = {name: value for name, value in about["camera"].items() if value or name not in LATER}
+    content = [about, [effect.name for effect in params.effects], values]
     return f"{spec.name} {hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]}"
 
 

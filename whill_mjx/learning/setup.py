@@ -27,6 +27,8 @@ from whill_mjx.learning.shaping import Safety, Step, limit_action, limited_polic
 from whill_mjx.sensors import privileged
 from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
+from whill_mjx.vehicle.vehicle_file import load_intervals
+from whill_mjx.world.randomize import Variation, read_variation
 
 PAINTS = 15
 """Worlds of other looks that the mirror shows at most; any number could be drawn, but each takes memory."""
@@ -56,6 +58,8 @@ class Preset:
     a furnished room (`whill_mjx.world.rich`); None leaves it to the task."""
     spread: float = 0.0
     """Relative spread of the vehicle's parameters from episode to episode, in training."""
+    vary: tuple[str, ...] = ()
+    """Parameters of the vehicle drawn from a range in each episode of the training, as `variations_of` reads them."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -342,11 +346,30 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
 
 def make_training_env(
     task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None,
+    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None, vary: Sequence[str] = (),
 ) -> BatchEnv:  # fmt: skip
     """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
     env, params = make_env(task, vehicle, exploring_starts=exploring_starts, looks=looks)
-    return make_batch(env, params, instances, spread, devices, second_tries)
+    return make_batch(env, params, instances, spread, devices, second_tries, variations_of(vary, vehicle))
+
+
+def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Variation, ...]:
+    """What is drawn in each episode: NAME=LOW:HIGH of one parameter, or "fit" for all intervals of the vehicle file.
+
+    Raises:
+        ValueError: a text that is neither, or a vehicle without intervals.
+    """
+    found: list[Variation] = []
+    for text in texts:
+        if text != "fit":
+            found.append(read_variation(text))
+            continue
+        intervals = load_intervals(vehicle) if vehicle is not None and Path(vehicle).is_file() else {}
+        if not intervals:
+            raise ValueError(f"vary 'fit': {vehicle} has no intervals. Give a file that sysid.fit wrote, or ranges "
+                             "such as body.mass=0.9x:1.1x.")
+        found += [Variation(name, low, high) for name, (low, high) in intervals.items()]
+    return tuple(found)
 
 
 def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[Step, dict[str, Any]]:

@@ -170,10 +170,11 @@ def _deliver(sensor: Sensor, line: Line, now: jax.Array, value: jax.Array, key: 
     lost = jax.random.uniform(lost_key) < sensor.dropout
     last = jnp.max(line.taken)
     due = first | (math.isinf(sensor.rate_hz) or _ticks(sensor, now) > _ticks(sensor, last))
-    slot = line.count % line.taken.shape[0]
+    slots = jnp.arange(line.taken.shape[0])
+    here = due & (slots == line.count % slots.size)
 
-    def put(row: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.where(due, row.at[slot].set(new), row)
+    def put(row: jax.Array, new: jax.Array) -> jax.Array:  # no scatter, which runs instance by instance on a processor
+        return jnp.where(here.reshape(-1, *[1] * (row.ndim - 1)), new, row)
 
     past, taken = put(line.past, value), put(line.taken, now)
     arrives = put(line.arrives, jnp.where(lost, jnp.inf, now + jnp.maximum(late, 0.0)))
