@@ -60,6 +60,19 @@ def test_its_rewards_endings_and_observations_are_those_of_the_step(file):
     assert [name for name, _ in env.sensors] == ["goal", "lidar", "odometry"]
 
 
+@pytest.mark.quick
+def test_the_commands_take_its_file_and_its_fields(file):
+    from whill_mjx.evaluate import EvaluateOptions, choose_task
+    from whill_mjx.train import TrainOptions, choose_preset
+
+    options = TrainOptions(task=f"{file}:Parking", preset="cpu", layout="fixed", set=("bay_x=2.8", "action_repeat=3"))
+    task = choose_preset(options).task
+    assert (task.bay_x, task.layout, task.action_repeat) == (2.8, "fixed", 3)
+    chosen = choose_task(EvaluateOptions(policy="random", task=f"{file}:Parking", set=("max_steps=20",)), None)
+    assert chosen.name == "parking" and chosen.max_steps == 20
+
+
+@pytest.mark.long
 def test_it_is_trained_and_evaluated_from_the_command_line(file, tmp_path):
     from whill_mjx import evaluate, train
 
