@@ -40,8 +40,8 @@ COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
 TOKEN_VARIABLE = "BRIDGE_TOKEN"
 """Environment variable with the token of episode control; on a command line everybody could read it."""
-SCAN_RANGE = 5.0
-"""Range of the scanner [m]."""
+SCAN_RANGE, SCAN_HEIGHT, SCAN_RAYS = 10.0, 0.2, 360
+"""Range of the scanner [m], its height above the ground [m], rays around the vehicle."""
 TRUTH_DEVIATION = (1e-3, 1e-3)
 """Standard deviations that the ground truth states, of a position [m] and a heading [rad]."""
 ODOMETRY_DEVIATION = (0.05, 0.05)
@@ -115,18 +115,27 @@ class ChairSimulator:
         import jax
 
         from whill_mjx import env as environment
-        from whill_mjx.learning.privileged import scan
+        from whill_mjx.sensors.lidar import distances
         from whill_mjx.tasks.tasks import make_task
+        from whill_mjx.vehicle.kinematics import reference_pose
         from whill_mjx.world.render import pinhole
 
         fields = {**changes, "action_repeat": 1}
-        env, params = environment.make_env(make_task(task, **fields), vehicle, height=size[0], width=size[1])
+        env, params = environment.make_env(
+            make_task(task, **fields), vehicle, height=size[0], width=size[1], observations={}
+        )  # the camera alone, whatever the task observes
         self.period = float(env.model.config.control_dt)
         self._low = np.array([env.task.v_min, -env.task.omega_max])
         self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
         camera = pinhole(env.model.spec.camera.fov_y, *size)
         self.intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        self._scan = jax.jit(lambda state: scan(env, state))
+        angles = np.arange(SCAN_RAYS) * 2 * np.pi / SCAN_RAYS
+
+        def scan(state: Any) -> Any:
+            x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+            return distances(x, y, yaw + angles, state.scene.boxes, SCAN_RANGE, SCAN_HEIGHT, SCAN_HEIGHT)
+
+        self._scan = jax.jit(scan)
         self._key = jax.random.key
         self._reset = jax.jit(lambda key: environment.reset(env, params, key))
         self._step = jax.jit(lambda state, action: environment.step(env, params, state, action))

@@ -129,6 +129,18 @@ class Policy:
             return np.full(2, np.nan)
         return self._low + self._span * (np.asarray(action, np.float64) + 1) / 2
 
+    @property
+    def novelty(self) -> float:
+        """How little what was seen lately agrees with what the policy expected [nat]; NaN where its file has no score.
+
+        It is the carry "surprise": a running mean of the divergence between the world model's state before and after
+        each image.
+        """
+        for spec, value in zip(self.contract.carry, self._carry, strict=True):
+            if spec.name == "surprise":
+                return float(np.mean(value))
+        return float("nan")
+
 
 def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:
     """Raise where the archive of the weights is there, and is another than the exported one or no archive at all."""

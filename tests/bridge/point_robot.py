@@ -37,7 +37,7 @@ class PointRobot:
         done = reached or self.steps >= self.longest
         return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
                      odometry=(self.x, self.y, self.yaw, v, omega),
-                     ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 5.0, 1.0]))
+                     ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 10.0, 1.0]))
 
 
 class EndlessRobot(PointRobot):

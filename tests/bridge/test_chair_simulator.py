@@ -30,9 +30,9 @@ def test_scan_shows_the_free_distance_shrink_ahead_and_grow_behind(chair):
         frame = chair.step(0.3, 0.0)
     moved = np.hypot(frame.x - start.x, frame.y - start.y)
     ahead, behind = 0, len(frame.ranges) // 2
-    assert start.ranges.shape == frame.ranges.shape and np.all((frame.ranges > 0) & (frame.ranges <= 5))
-    assert start.ranges[ahead] - frame.ranges[ahead] == pytest.approx(moved, abs=0.1) or frame.ranges[ahead] == 5
-    assert frame.ranges[behind] - start.ranges[behind] == pytest.approx(moved, abs=0.1) or start.ranges[behind] == 5
+    assert start.ranges.shape == frame.ranges.shape and np.all((frame.ranges > 0) & (frame.ranges <= 10))
+    assert start.ranges[ahead] - frame.ranges[ahead] == pytest.approx(moved, abs=0.1) or frame.ranges[ahead] == 10
+    assert frame.ranges[behind] - start.ranges[behind] == pytest.approx(moved, abs=0.1) or start.ranges[behind] == 10
     assert np.any(frame.ranges != start.ranges)
 
 

@@ -1,0 +1,64 @@
+"""What only the simulator knows: for critics and for targets of a world model, never for a policy that is to drive.
+
+The vector is in the body frame, centred on the footprint (x ahead, y to the left): goal, speeds, and the free distance
+in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's symlog resolves the near ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.sensors.lidar import distances
+from whill_mjx.vehicle.kinematics import body_twist, reference_pose
+from whill_mjx.world.scene import Boxes, Footprint, footprint
+
+UNIT = 0.1  # m
+RANGE = 5.0  # m, largest free distance
+RAYS = 48  # 3 m away they lie 0.39 m apart: at least one meets a box as wide as the corridor's
+SIZE = 4 + RAYS
+ANGLES = np.arange(RAYS) * 2 * np.pi / RAYS  # rad, from straight ahead to the left; mirrored, ray k is ray -k
+
+
+@dataclass(frozen=True)
+class Privileged(Sensor):
+    """(52,) goal x, y, forward speed, yaw rate, free distances in 48 directions; in units of 0.1 m and 0.1 rad."""
+
+    name: ClassVar[str] = "privileged"
+
+    def reading(self, env: Any) -> Reading:
+        return Reading((SIZE,))
+
+    def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
+        return memory, truth(view.env, view.state)
+
+    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
+        return mirrored(value)
+
+
+def truth(env: Any, state: Any) -> jax.Array:
+    """(SIZE,) float32: goal x, y, forward speed, yaw rate, free distances; of one instance."""
+    x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
+    v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
+    body = footprint(env.model.spec, x, y, yaw)
+    dx, dy = env.task.goal(state.scene) - jnp.stack([body.x, body.y])
+    ahead, aside = dx * jnp.cos(yaw) + dy * jnp.sin(yaw), dy * jnp.cos(yaw) - dx * jnp.sin(yaw)
+    near = jnp.stack([ahead, aside, v, omega]) / UNIT
+    return jnp.concatenate([near, free_distances(body, state.scene.boxes) / UNIT]).astype(jnp.float32)
+
+
+def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
+    """(RAYS,) m from the footprint's centre to the first box in each direction of ANGLES, at most RANGE."""
+    return distances(body.x, body.y, body.yaw + ANGLES, boxes, RANGE, 0.0, body.height)
+
+
+def mirrored(values: jax.Array) -> jax.Array:
+    """The vectors (..., SIZE) of the world mirrored left to right."""
+    sign = jnp.array([1.0, -1.0, 1.0, -1.0])
+    rays = values[..., 4:][..., (-np.arange(RAYS)) % RAYS]
+    return jnp.concatenate([values[..., :4] * sign, rays], -1)
