@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.foreign.__main__ import drive
 from benchmarks.foreign.room import VARIANTS, make_room
+from benchmarks.foreign.run import drive
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
