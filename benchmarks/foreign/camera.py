@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.foreign.drive import PERIOD, Pose
 
-RENDERED = 192
+RENDERED = 128
 """Edge of the rendered picture, which is averaged down to the policy's [pixels]."""
 
 
@@ -78,7 +78,7 @@ class Camera:
         light = light * float(self.gain) * self.white.astype(np.float32) * shade[..., None]
         light = 255.0 * np.clip(light / 255.0, 0, 1) ** self.gamma
         if self.blur > 0.2:
-            light = cv2.GaussianBlur(light, (0, 0), 3 * self.blur)
+            light = cv2.GaussianBlur(light, (0, 0), 2 * self.blur)
         light = cv2.resize(light, (size, size), interpolation=cv2.INTER_AREA)
         light = light + self.random.normal(0, self.noise, light.shape)
         sent = np.clip(light + 0.5, 0, 255).astype(np.uint8)

@@ -76,7 +76,7 @@ class _Xml:
     def compile(self, lights: str, visual: str) -> mujoco.MjModel:
         xml = f"""
 <mujoco><compiler angle="degree"/>
-  <visual><global offwidth="256" offheight="256"/><quality shadowsize="1024" offsamples="4"/>
+  <visual><global offwidth="128" offheight="128"/><quality shadowsize="512" offsamples="4"/>
     <map znear="0.005" zfar="30"/>{visual}</visual>
   <asset>{"".join(self.asset)}</asset>
   <default><geom contype="0" conaffinity="0"/></default>
