@@ -75,8 +75,9 @@ def find_preset(name: str, task: str) -> Preset:
     simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen in four paints.
     "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, for a
     policy that drives where nobody trained. "wallclock" spends environment steps to save time: thousands of instances,
-    few updates per step, and an end when nearly all held-out episodes succeed. "cpu" is an easier course for 2 cores: forward speeds only, one
-    gate, a decision every 0.5 s, a small network on 8x8 patches. "smoke" only shows that everything runs.
+    few updates per step, and an end when nearly all held-out episodes succeed. "cpu" is an easier course for 2 cores:
+    forward speeds only, one gate, a decision every 0.5 s, a small network on 8x8 patches. "smoke" only shows that
+    everything runs.
     """
     easy: dict[str, Any] = {"v_min": 0.0, "gates": 1} if task == "obstacle_course" else {}
     match name:

@@ -307,7 +307,7 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
     "panels": {"value": (0.25, 0.85), "cell_s": (0.3, 1.4), "cell_t": (0.5, 3.0), "joint": (0.003, 0.02),
                "joint_tone": (0.1, 0.7), "tone": (0.0, 0.08), "gloss": (0.0, 0.1)},
     "tiles": {"value": (0.1, 0.7), "cell_s": (0.1, 0.65), "cell_t": (0.1, 0.65), "joint": (0.003, 0.012),
-              "joint_tone": (-0.5, 0.6), "tone": (0.0, 0.15), "fill": (-0.5, 0.5), "second": (0.4, 1.5),
+              "joint_tone": (-0.5, 0.9), "tone": (0.0, 0.15), "fill": (-0.5, 0.5), "second": (0.4, 1.5),
               "gloss": (0.0, 0.4)},
     "planks": {"value": (0.08, 0.5), "saturation": (0.2, 0.7), "cell_s": (0.6, 2.2), "cell_t": (0.07, 0.22),
                "shift": (0.23, 0.5), "joint": (0.002, 0.008), "joint_tone": (0.2, 0.8), "tone": (0.05, 0.3),
@@ -319,6 +319,8 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
                  "joint": (0.0, 0.012)},
     "linoleum": {"value": (0.1, 0.5), "saturation": (0.0, 0.35), "cell_s": (0.015, 0.06), "cell_t": (0.015, 0.06),
                  "fill": (0.0, 0.5), "second": (0.5, 1.6), "gloss": (0.1, 0.6)},
+    "stones": {"value": (0.1, 0.6), "saturation": (0.0, 0.2), "cell_s": (0.03, 0.15), "cell_t": (0.03, 0.15),
+               "shift": (0.1, 0.5), "fill": (0.1, 0.6), "second": (0.2, 2.5), "tone": (0.0, 0.4), "gloss": (0.0, 0.4)},
     "print": {"value": (0.1, 0.9), "saturation": (0.0, 0.8), "cell_s": (0.03, 0.3), "cell_t": (0.02, 0.2),
               "fill": (0.1, 0.7), "second": (0.1, 3.0), "tone": (0.0, 0.5)},
     "stripes": {"value": (0.2, 0.8), "saturation": (0.0, 0.3), "cell_s": (0.03, 0.4), "cell_t": (20.0, 30.0),
@@ -332,7 +334,7 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
 WARM = ("brick", "planks", "cardboard")
 """Families whose hue lies between red and yellow."""
 CHOICE: dict[int, tuple[str, ...]] = {
-    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster"),
+    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster", "stones", "brick"),
     MARKER: ("plaster",),
     WALL: ("plaster", "plaster", "brick", "panels", "tiles", "concrete", "planks", "stripes"),
     OBSTACLE: ("cardboard", "cardboard", "cardboard", "cardboard", "paint", "print", "planks", "black"),
