@@ -50,6 +50,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="clock of the policy's rate; stamp: for a simulator that is not in real time")
     parser.add_argument("--blind", choices=("warn", "slow", "stop"), default="warn",
                         help="what a black or saturated camera causes")
+    parser.add_argument("--novel", choices=("ignore", "slow", "stop"), default="stop",
+                        help="what surroundings unlike the training cause, where the policy file has a score for them")
     parser.add_argument("--resume", choices=("auto", "arm"), default="auto",
                         help="after a stop that passes by itself: drive again, or wait for an operator")
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on bridge/rearm")
@@ -150,7 +152,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return 2
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
-        controller = Controller(policy, safety, on_blind=options.blind, pace_by_stamp=options.pace == "stamp",
+        controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
+                                pace_by_stamp=options.pace == "stamp",
                                 crop=options.crop and tuple(options.crop))
         drive = DriveNode(node, controller, options)
         try:
