@@ -5,6 +5,7 @@
 
     for i in $(seq 44); do python -m benchmarks.undeclared --nulls 200 --reference-sets 44 --part $i/44 & done; wait
     for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
+    for i in $(seq 16); do python -m benchmarks.undeclared --sensor-noise 0.5 2 4 --share & done; wait
     python -m benchmarks.undeclared --collect
 
 The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes
@@ -65,6 +66,10 @@ class Benchmark:
     """Logs of each effect and multiple."""
     noise: Annotated[float, NOT_NEGATIVE] = 1.0
     """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
+    sensor_noise: tuple[float, ...] = ()
+    """Factors on the disturbances and the sensor noise of further logs alone, whose reference days keep the usual ones:
+    `noisy_nulls` with nothing in them, and `seeds` of each effect at four times that size."""
+    noisy_nulls: int = 40
     vehicle: Literal["chair", "scooter", "robot"] = "chair"
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
@@ -104,7 +109,8 @@ def main(settings: Benchmark) -> None:
     """Run what was asked for."""
     if settings.shared:
         shared(settings)
-    if settings.nulls or settings.own_sets or settings.base or settings.scales or settings.pairs or settings.left_out:
+    if (settings.nulls or settings.own_sets or settings.base or settings.scales or settings.pairs or settings.left_out
+            or settings.sensor_noise):
         plant(settings)
     if settings.speed:
         contact.speed(settings.work / "plant", settings.refit_nulls)
@@ -167,6 +173,9 @@ def plant(settings: Benchmark) -> None:
         judge(listed)
     if settings.scales:
         judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
+    if settings.sensor_noise:
+        judge(contact.noisy_jobs(work, settings.sensor_noise, settings.noisy_nulls, settings.seeds, part, driven,
+                                 settings.only))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:

@@ -115,7 +115,8 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
                       "deviations")
         print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
-    fitted = "vehicle.toml" if not settings.model else "model.toml"
+    other = settings.model or log.fields.get("input") == "wheels"
+    fitted = "model.toml" if other else "vehicle.toml"
     print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
 
 

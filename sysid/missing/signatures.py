@@ -134,7 +134,7 @@ def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
 
 def white_leftover(reference: Reference, one: Leftover, mask: np.ndarray) -> np.ndarray:
     """(n,) white noise of a reference drive, put into the bins of another drive of weights `mask` (K, C)."""
-    series = (one.series - reference.expected_on_others(one)) * one.mask
+    series = reference.noise_of(one) * one.mask
     inside = np.flatnonzero(one.mask.prod(-1) > 0)
     last = inside[-1] + 1 if len(inside) else len(series)
     fitted = np.resize(series[:last], mask.shape)  # a longer drive repeats a shorter one's noise

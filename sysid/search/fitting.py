@@ -22,10 +22,20 @@ from sysid.logs.log import Log, Prediction, Trial, check_same_vehicle
 from sysid.logs.sources import refuse_recording
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
-from sysid.replay.models import Model, get_parameters, measured_effects, model_space, set_parameters, with_effects
+from sysid.replay.models import (
+    Model,
+    calibration_effects,
+    effects_around,
+    get_parameters,
+    measured_effects,
+    model_space,
+    set_parameters,
+    with_effects,
+)
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
-from sysid.search import least_squares, slopes, starts, tpe
+from sysid.replay.wheel_model import wheel_model
+from sysid.search import least_squares, slopes, starts, thin, tpe
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import (
     FEATURE_ITERATIONS,
@@ -186,6 +196,7 @@ class Problem:
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
     trials = _training(log, config)
+    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
@@ -223,13 +234,20 @@ def _subject(
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is None and log.fields.get("input") == "wheels":
+        model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
-        model = model.with_effects(config.effects)
+        calibrated = config.calibrate and not config.parameters
+        model = model.with_effects((*config.effects, *(effects_around(model, trials) if calibrated else ())))
         plant, params = model.plant, model.params if params is None else params
         space = model_space(params, config.parameters or None)
+        if not config.calibrate or not any(trial.ground_truth is not None for trial in trials):
+            why = "no outside pose shows it" if config.calibrate else "not selected"
+            for name in [one for one in space.names if one.startswith("wheels.") and one not in config.parameters]:
+                space = space.without(name, why)
     else:
         plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
         given = params is not None
@@ -238,8 +256,10 @@ def _subject(
         params = preset_params(log.spec, config.preset) if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
-        params = with_effects(params, (*config.effects, *measured))
+        sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
+        params = with_effects(params, (*config.effects, *measured, *sizes))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+        space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals
 
 

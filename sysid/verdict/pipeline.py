@@ -26,6 +26,7 @@ from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
 from sysid.verdict.search import search
+from sysid.verdict.sensor_noise import compared, with_noise
 
 
 def find_missing(
@@ -56,6 +57,9 @@ def find_missing(
     drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
+    noise = compared(drives, at, reference, config.thresholds.alpha)
+    usual, ready = ready, with_noise(ready, noise)
+    reference = ready.reference
     evidence, slopes = gather(drives, reference, found, full, progress)
     gathered = time.perf_counter()
     refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
@@ -67,7 +71,7 @@ def find_missing(
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(evidence, found, refitter, ready.wander, outcome.scan, config.thresholds,
+        nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
                                 config.refit_nulls, config.seed, progress, outcome.pairs)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     alone = stands_alone(log.training, reference.known)
@@ -76,11 +80,11 @@ def find_missing(
         outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds, wheels)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, ready.wander.p_excess))
+        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, usual.wander.p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result

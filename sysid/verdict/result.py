@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import Log
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, Wander
@@ -120,6 +121,8 @@ class Result:
     null_refits: NullRefits | None = None
     stood: tuple[Stood, ...] = ()
     """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
+    noise: NoiseLevels | None = None
+    """Noise of each channel over that of the reference days; None without such days."""
 
     @property
     def reference(self) -> Reference:
