@@ -57,6 +57,8 @@ class PolicyContract:
     """Control rate [1/s]."""
     action_repeat: int = 1
     """The policy is evaluated on every k-th tick; its command is held in between."""
+    novelty: tuple[float, float] | None = None
+    """Surprise [nat] from which the vehicle slows down, and at which it stops; needs a carry "surprise"."""
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Camera of the training, as plain JSON: pose and field of view, and the frame in which the pose is given."""
 
@@ -357,6 +359,7 @@ def _describe(contract: PolicyContract, vehicle_sha256: str) -> dict[str, Any]:
         "camera": dict(contract.camera),
         "task": contract.task,
         "vehicle_sha256": vehicle_sha256,
+        **({"novelty": list(contract.novelty)} if contract.novelty else {}),
     }
 
 

@@ -44,6 +44,7 @@ from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
+from whill_mjx.evaluation.novelty import largest_surprise, limits
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.folders import Claim, claim_folder, write_whole
@@ -80,6 +81,7 @@ from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_ve
 STOPPED = "stopped; give the same command again to go on from the last checkpoint."
 Stage = Callable[[str], None]
 """Gets a line when a stage of the command begins."""
+NOVELTY_SEED, NOVELTY_EPISODES = 3_000_017, 200  # episodes in which a policy meets its own world
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
 LEAST_FREE = 32_000_000
@@ -543,6 +545,10 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         camera=camera_contract(course.env.model, course.params),
     )
     step, carry = policy_of(options, preset, result, course)
+    if "surprise" in carry:
+        keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
+        largest, _ = largest_surprise(course.env, course.params, step, carry, keys)
+        contract = dataclasses.replace(contract, novelty=limits(largest))
     shown = obs_shape_of(course.env)
     try:
         if isinstance(shown, dict):

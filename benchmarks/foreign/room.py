@@ -76,7 +76,7 @@ class _Xml:
     def compile(self, lights: str, visual: str) -> mujoco.MjModel:
         xml = f"""
 <mujoco><compiler angle="degree"/>
-  <visual><global offwidth="256" offheight="256"/><quality shadowsize="1024" offsamples="4"/>
+  <visual><global offwidth="128" offheight="128"/><quality shadowsize="512" offsamples="4"/>
     <map znear="0.005" zfar="30"/>{visual}</visual>
   <asset>{"".join(self.asset)}</asset>
   <default><geom contype="0" conaffinity="0"/></default>
@@ -126,10 +126,13 @@ def _goal(xml: _Xml, colour, stand: str | None = None) -> None:
 
 
 def _plain(xml: _Xml, random, start, carton_at) -> Room:
-    pale, dark = xml.material(colour=(0.78, 0.76, 0.72), specular=0), xml.material(colour=(0.66, 0.65, 0.61), specular=0)
+    pale = xml.material(colour=(0.78, 0.76, 0.72), specular=0)
+    dark = xml.material(colour=(0.66, 0.65, 0.61), specular=0)
     xml.asset.append(
-        '<texture name="sky" type="skybox" builtin="gradient" rgb1="0.62 0.74 0.88" rgb2="0.80 0.86 0.92" width="64" height="384"/>'
-        '<texture name="check" type="2d" builtin="checker" rgb1="0.50 0.50 0.48" rgb2="0.42 0.42 0.41" width="64" height="64"/>'
+        '<texture name="sky" type="skybox" builtin="gradient" rgb1="0.62 0.74 0.88" rgb2="0.80 0.86 0.92" '
+        'width="64" height="384"/>'
+        '<texture name="check" type="2d" builtin="checker" rgb1="0.50 0.50 0.48" rgb2="0.42 0.42 0.41" '
+        'width="64" height="64"/>'
         '<material name="floor" texture="check" texrepeat="1 1" texuniform="true" specular="0"/>'
     )  # fmt: skip
     _shell(xml, [pale, pale, dark, dark], "floor", 2.0, None)
@@ -221,8 +224,8 @@ def _unseen(xml: _Xml, random, start, carton_at) -> Room:
     for _ in range(int(random.integers(2, 7))):
         poster = xml.material(paint.letters(random, random.uniform(0, 1, 3), random.uniform(0, 1, 3)), uniform=False)
         side = int(random.choice([-1, 1]))
-        xml.wall(side, random.uniform(-0.5, 6), random.uniform(0.2, 0.45), random.uniform(0.9, 1.7), random.uniform(0.15, 0.5),
-                 0.008, poster)  # fmt: skip
+        place = (random.uniform(-0.5, 6), random.uniform(0.2, 0.45), random.uniform(0.9, 1.7))
+        xml.wall(side, *place, random.uniform(0.15, 0.5), 0.008, poster)
     size = (random.uniform(0.12, 0.3), random.uniform(0.12, 0.3), random.uniform(0.12, 0.4))
     yaw = random.uniform(-math.pi / 2, math.pi / 2)
     across = size[0] * abs(math.sin(yaw)) + size[1] * abs(math.cos(yaw))
@@ -250,7 +253,8 @@ def _things(xml: _Xml, random, carton_at, across: float, along: float) -> list[t
         x = random.uniform(0.9, 6.2)
         beside = abs(x - carton_at[0]) < along + long + 1.0
         free = WIDTH / 2 + abs(carton_at[1]) - across - 2 * deep
-        if (beside and side == wider and free < 1.05) or any(abs(x - other[0]) < long + other[2] + 0.05 for other in placed):
+        taken = any(abs(x - other[0]) < long + other[2] + 0.05 for other in placed)
+        if taken or (beside and side == wider and free < 1.05):
             continue
         y = side * (WIDTH / 2 - deep - 0.01)
         skin = xml.material(colour=tuple(random.uniform(0.03, 0.85, 3) * (1, 1, 0.8)))
@@ -270,7 +274,8 @@ def _things(xml: _Xml, random, carton_at, across: float, along: float) -> list[t
             green = xml.material(colour=(random.uniform(0.05, 0.2), random.uniform(0.25, 0.5), 0.08))
             xml.geom("ellipsoid", (deep, deep, tall / 2), (x, y, 0.3 + tall / 2), green, True)
         else:  # a crate with a picture
-            crate = xml.material(paint.letters(random, random.uniform(0, 1, 3), random.uniform(0, 1, 3)), cube=True, uniform=False)
+            print_ = paint.letters(random, random.uniform(0, 1, 3), random.uniform(0, 1, 3))
+            crate = xml.material(print_, cube=True, uniform=False)
             xml.geom("box", (long, deep, tall / 2), (x, y, tall / 2), crate, True)
         placed.append((x, y, long, deep))
     return placed

@@ -25,6 +25,8 @@ MAX_CARRY = 64
 """Most entries of the recurrent state; presets have three."""
 MAX_STATE_BYTES = 16 * MIB
 """Largest recurrent state [bytes]: it is copied in every step. Presets have less than 100 kB."""
+SURPRISE = "surprise"
+"""Name of the carry that holds a running mean of how little the images agree with what was expected [nat]."""
 CAMERA_FRAMES = ("base_footprint", "chassis")
 """Frames of the camera: `chassis` in files that name none."""
 CAMERA_RULES = {"x": (10.0, "m"), "y": (10.0, "m"), "z": (10.0, "m"), "roll": (math.pi, "rad"),
@@ -60,6 +62,8 @@ class Contract:
     """Pose and field of view of the training's camera; `frame` is always there."""
     task: str
     vehicle_sha256: str
+    novelty: tuple[float, float] | None = None
+    """Surprise [nat] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
     def tensors(self) -> tuple[list[Tensor], list[Tensor]]:
         """Return the inputs and outputs that the network must have, in order."""
@@ -155,6 +159,7 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text"),
         vehicle_sha256=fields.rule("vehicle_sha256", lambda value: value == "" or _is_digest(value),
                                    "must be empty or a SHA-256 (64 hexadecimal digits)"),
+        novelty=_parse_novelty(fields, carry),
     )
 
 
@@ -248,6 +253,18 @@ def _parse_entry(entry: Fields) -> Tensor:
         name=entry.rule("name", _is_text, "must be text"), shape=tuple(shape),
         dtype=entry.rule("dtype", lambda value: isinstance(value, str) and value in DTYPES.values(),
                          f"must be one of {list(DTYPES.values())}"))
+
+
+def _parse_novelty(fields: Fields, carry: tuple[Tensor, ...]) -> tuple[float, float] | None:
+    """Return the limits of the policy's surprise, where the file has them."""
+    if "novelty" not in fields.table:
+        return None
+    known = any(entry.name == SURPRISE for entry in carry)
+    slow, stop = fields.rule(
+        "novelty", lambda value: (known and isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
+                                  and 0 < value[0] < value[1]),
+        f"must be two rising numbers above 0 [nat], beside a carry '{SURPRISE}'")
+    return float(slow), float(stop)
 
 
 def _parse_tensors(fields: Fields, inputs: int, outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

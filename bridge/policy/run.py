@@ -10,6 +10,7 @@ import numpy as np
 from bridge.policy.contract import (
     AGENT_KIND,
     KIND,
+    SURPRISE,
     AgentContract,
     Contract,
     check_kind,
@@ -137,7 +138,7 @@ class Policy:
         each image.
         """
         for spec, value in zip(self.contract.carry, self._carry, strict=True):
-            if spec.name == "surprise":
+            if spec.name == SURPRISE:
                 return float(np.mean(value))
         return float("nan")
 

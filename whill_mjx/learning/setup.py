@@ -376,9 +376,12 @@ def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[S
     """The trained agent as the step of one instance, limits included, and its first carry."""
     learner = preset.learner
     params = jax.tree.map(jnp.asarray, params)
+    carry = agents.policy_carry(learner, 2)
+    if preset.looks == "rich":
+        carry[agents.SURPRISE] = jnp.zeros(1)
     return limited_policy(
         preset.task, preset.safety, lambda carry, image: agents.policy_step(learner, params, carry, image),
-        {**agents.policy_carry(learner, 2), agents.SURPRISE: jnp.zeros(1)}, control_dt * preset.task.action_repeat,
+        carry, control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 

@@ -115,7 +115,7 @@ class _Draws:
 
 
 def furnish(key: jax.Array, scene: Scene, lone: bool) -> Scene:
-    """The scene with a ceiling (most have one), doors, posters, lamps, and things along the walls; walls reach the ceiling.
+    """The scene with a ceiling (most have one), doors, posters, lamps, and things along the walls.
 
     Args:
         key: random key.
@@ -161,9 +161,7 @@ def _other_carton(draw: _Draws, carton: Boxes) -> Boxes:
     across = half[0] * jnp.abs(jnp.sin(yaw)) + half[1] * jnp.abs(jnp.cos(yaw))
     shrink = jnp.minimum(1.0, (0.28 + jnp.abs(carton.centre[0, 1])) / across)
     half = half * jnp.stack([shrink, shrink, jnp.ones(())])
-    return dataclasses.replace(
-        carton, centre=carton.centre.at[0, 2].set(half[2]), half=half[None], yaw=yaw[None]
-    )
+    return dataclasses.replace(carton, centre=carton.centre.at[0, 2].set(half[2]), half=half[None], yaw=yaw[None])
 
 
 def _things(draw: _Draws, room: Room, marker: Marker, lone: bool) -> tuple[Boxes, Rounds, Boxes]:
@@ -291,8 +289,8 @@ def _flat(x, y, z, half_x, half_z, thick: float, mask) -> Boxes:
     return Boxes(centre, half, jnp.zeros(1), jnp.ones((1, 3)), jnp.asarray(mask)[None])
 
 
-PROPERTIES = ("value", "saturation", "second", "cell_s", "cell_t", "shift", "joint", "joint_tone", "tone", "fill", "blotch",
-              "blotch_size", "grain", "grain_s", "grain_t", "gloss")  # fmt: skip
+PROPERTIES = ("value", "saturation", "second", "cell_s", "cell_t", "shift", "joint", "joint_tone", "tone", "fill",
+              "blotch", "blotch_size", "grain", "grain_s", "grain_t", "gloss")  # fmt: skip
 _LOG = ("cell_s", "cell_t", "blotch_size", "grain_s", "grain_t", "value")
 """Properties whose logarithm is uniform."""
 PLAIN: dict[str, tuple[float, float]] = {
@@ -309,7 +307,7 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
     "panels": {"value": (0.25, 0.85), "cell_s": (0.3, 1.4), "cell_t": (0.5, 3.0), "joint": (0.003, 0.02),
                "joint_tone": (0.1, 0.7), "tone": (0.0, 0.08), "gloss": (0.0, 0.1)},
     "tiles": {"value": (0.1, 0.7), "cell_s": (0.1, 0.65), "cell_t": (0.1, 0.65), "joint": (0.003, 0.012),
-              "joint_tone": (-0.5, 0.6), "tone": (0.0, 0.15), "fill": (-0.5, 0.5), "second": (0.4, 1.5),
+              "joint_tone": (-0.5, 0.9), "tone": (0.0, 0.15), "fill": (-0.5, 0.5), "second": (0.4, 1.5),
               "gloss": (0.0, 0.4)},
     "planks": {"value": (0.08, 0.5), "saturation": (0.2, 0.7), "cell_s": (0.6, 2.2), "cell_t": (0.07, 0.22),
                "shift": (0.23, 0.5), "joint": (0.002, 0.008), "joint_tone": (0.2, 0.8), "tone": (0.05, 0.3),
@@ -321,6 +319,8 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
                  "joint": (0.0, 0.012)},
     "linoleum": {"value": (0.1, 0.5), "saturation": (0.0, 0.35), "cell_s": (0.015, 0.06), "cell_t": (0.015, 0.06),
                  "fill": (0.0, 0.5), "second": (0.5, 1.6), "gloss": (0.1, 0.6)},
+    "stones": {"value": (0.1, 0.6), "saturation": (0.0, 0.2), "cell_s": (0.03, 0.15), "cell_t": (0.03, 0.15),
+               "shift": (0.1, 0.5), "fill": (0.1, 0.6), "second": (0.2, 2.5), "tone": (0.0, 0.4), "gloss": (0.0, 0.4)},
     "print": {"value": (0.1, 0.9), "saturation": (0.0, 0.8), "cell_s": (0.03, 0.3), "cell_t": (0.02, 0.2),
               "fill": (0.1, 0.7), "second": (0.1, 3.0), "tone": (0.0, 0.5)},
     "stripes": {"value": (0.2, 0.8), "saturation": (0.0, 0.3), "cell_s": (0.03, 0.4), "cell_t": (20.0, 30.0),
@@ -334,7 +334,7 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
 WARM = ("brick", "planks", "cardboard")
 """Families whose hue lies between red and yellow."""
 CHOICE: dict[int, tuple[str, ...]] = {
-    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster"),
+    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster", "stones", "brick"),
     MARKER: ("plaster",),
     WALL: ("plaster", "plaster", "brick", "panels", "tiles", "concrete", "planks", "stripes"),
     OBSTACLE: ("cardboard", "cardboard", "cardboard", "cardboard", "paint", "print", "planks", "black"),
@@ -355,7 +355,9 @@ _RANGES = np.array(
 )  # (F, properties, 2)
 _IS_LOG = np.array([p in _LOG for p in PROPERTIES])
 _CHOICES = 24
-_CHOICE = np.array([[_NAMES.index(CHOICE[r][i * len(CHOICE[r]) // _CHOICES]) for i in range(_CHOICES)] for r in range(14)])
+_CHOICE = np.array(
+    [[_NAMES.index(CHOICE[role][i * len(CHOICE[role]) // _CHOICES]) for i in range(_CHOICES)] for role in range(14)]
+)
 
 
 def paint(key: jax.Array, scene: Scene) -> Scene:
@@ -390,7 +392,8 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     rest = u[:, 1 + len(PROPERTIES) :]
     warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
     odd = rest[:, 14] < 0.12  # a tail of saturated paints
-    base = _reflectance(value["value"], jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"]), rest[:, 0], warm)
+    saturation = jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"])
+    base = _reflectance(value["value"], saturation, rest[:, 0], warm)
     other = _reflectance(
         jnp.clip(value["value"] * value["second"], 0.02, 0.9), value["saturation"] * rest[:, 1], rest[:, 2], warm
     )
@@ -399,7 +402,8 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
 
     is_wall, is_carton = roles == WALL, roles == OBSTACLE
     # Walls have a skirting or a painted lower part, cartons a band of tape or print.
-    skirting = jnp.where(rest[:, 4] < 0.55, 0.04 + 0.12 * rest[:, 5], jnp.where(rest[:, 4] < 0.75, 0.8 + 0.5 * rest[:, 5], 0.0))
+    low, high = 0.04 + 0.12 * rest[:, 5], 0.8 + 0.5 * rest[:, 5]
+    skirting = jnp.where(rest[:, 4] < 0.55, low, jnp.where(rest[:, 4] < 0.75, high, 0.0))
     tape = 0.05 + 0.6 * rest[:, 5]
     none = jnp.full(labels, -1.0)
     top = jnp.where(is_wall, skirting, jnp.where(is_carton & (rest[:, 4] < 0.5), tape + 0.02 + 0.1 * rest[:, 6], none))
@@ -460,7 +464,8 @@ def _lights(key: jax.Array, scene: Scene) -> Lights:
     sun = jnp.stack([azimuth, side, slope])
     sun = sun / jnp.linalg.norm(sun)
     strength = draw(0.5, 4.0) * draw.chance(0.3)
-    window = jnp.stack([side * half_width, draw(begin + 0.5, end - 0.5), draw(1.2, 1.8), draw(0.2, 0.8), draw(0.2, 0.6)])
+    middle = side * half_width, draw(begin + 0.5, end - 0.5), draw(1.2, 1.8)
+    window = jnp.stack([*middle, draw(0.2, 0.8), draw(0.2, 0.6)])
 
     casters = _casters(draw, scene, position, power)
     return Lights(
@@ -471,8 +476,8 @@ def _lights(key: jax.Array, scene: Scene) -> Lights:
 
 def _casters(draw: _Draws, scene: Scene, position, power) -> jax.Array:
     """(C, 10) numbers of what throws soft shadows on the floor: obstacles, things and the board."""
-    solid = jax.tree.map(lambda leaf: leaf[3:], scene.boxes)
-    solid = jax.tree.map(lambda leaf: jnp.concatenate([leaf[: -THINGS - 2], leaf[-THINGS - 1 :]]), solid)  # not the back
+    # Not the walls: the first three, and the back one before the things.
+    solid = jax.tree.map(lambda leaf: jnp.concatenate([leaf[3 : -THINGS - 2], leaf[-THINGS - 1 :]]), scene.boxes)
     offset = solid.centre[:, None, :2] - position[:, :2]  # (C, LIGHTS, 2)
     high = position[:, 2] - solid.centre[:, None, 2]
     weight = power / (jnp.sum(offset**2, -1) + high**2)

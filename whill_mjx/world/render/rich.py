@@ -106,7 +106,8 @@ def _light(lights, normal, point) -> list:
     back = jnp.abs(lights.window[0] - y) / jnp.abs(lights.sun[1])  # way back to the plane of the window
     beside = jnp.abs(x + back * lights.sun[0] - lights.window[1])
     above = jnp.abs(z + back * lights.sun[2] - lights.window[2])
-    inside = jnp.clip((lights.window[3] - beside) * 12.0, 0.0, 1.0) * jnp.clip((lights.window[4] - above) * 12.0, 0.0, 1.0)
+    inside = jnp.clip((lights.window[3] - beside) * 12.0, 0.0, 1.0)
+    inside = inside * jnp.clip((lights.window[4] - above) * 12.0, 0.0, 1.0)
     inside = inside * jnp.clip(beside * 20.0 - 0.3, 0.0, 1.0)  # the bar in the middle of the window
     cosine = normal[0] * lights.sun[0] + normal[1] * lights.sun[1] + normal[2] * lights.sun[2]
     patch = inside * jnp.maximum(cosine, 0.0)
