@@ -14,8 +14,8 @@ import numpy as np
 
 from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
-from sysid.logs.metrics import relative_pose
 from sysid.logs.measured import is_known
+from sysid.logs.metrics import relative_pose
 from sysid.logs.rosbag import clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.text_files import integrate_speeds, read_drives, text_files
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -55,8 +55,8 @@ class ConvertConfig:
     truth_turned: float = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     input: Literal["auto", "commands", "wheels"] = "auto"
-    """What drives the model: commands, or measured wheel speeds (of joint states or odometry) in their place; auto takes
-    the latter where no recording has commands."""
+    """What drives the model: commands, or measured wheel speeds (of joint states or odometry); auto takes the latter
+    where no recording has commands."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
@@ -102,8 +102,8 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
     """
     if not config.source.exists():
-        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of one of them, "
-                                "or a measured set.")
+        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of them, or a "
+                                "measured set.")
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
@@ -175,8 +175,8 @@ def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive],
     found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
-        raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert those "
-                         "without commands into a dataset of their own.")
+        raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
+                         "those without into a dataset of their own.")
     decided = list(dict.fromkeys(str(column) for one in found for column in one.columns))
     for one in found:
         source = Source(config.source, {column.role.partition(".")[0]: column.file for column in one.columns})
@@ -366,8 +366,8 @@ def write_dataset(
     if known and any((folder / "trials").glob("*")):
         log = load_log(folder)  # trials are not added to what cannot be loaded
         if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
-            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, which that of the new trials "
-                             "is not. Choose another --out.")
+            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
+                             "trials is another. Choose another --out.")
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
         accepted, refused = _write_accepted(partial, drives)

@@ -144,10 +144,11 @@ def read_bag(
                              f"another topic with {OPTIONS[stream]}, or '' to go without.")
         values = table[finite]
         if values.shape[1] != len(COLUMNS[stream]):
-            received, stamped, values = _of_wheels(stream, short_type(known[topic]), received, stamped, values, geometry)
-            if np.median(np.diff(received)) > COARSE:
-                notes.append(f"{topic}: a state each {np.median(np.diff(received)):.2g} s is coarse: delays and lags below "
-                             "that do not show. Ask the driver for 20 ms (publish_interval_ms)")
+            kind = short_type(known[topic])
+            received, stamped, values = _of_wheels(stream, kind, received, stamped, values, geometry)
+            if (step := float(np.median(np.diff(received)))) > COARSE:
+                notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. "
+                             "Ask the driver for 20 ms (publish_interval_ms)")
         streams[stream] = BagStream(topic, known[topic], received, stamped, values)
     return Bag(path, streams, notes)
 
@@ -216,12 +217,13 @@ def choose_topics(
 def _wheel_topic(path: Path, known: dict[str, str], listing: str) -> dict[str, str]:
     """The topic whose wheel speeds are the input."""
     for kind in WHEELS:
-        fitting = [name for name, one in known.items() if short_type(one) == kind and name not in TOPICS["ground_truth"]]
+        fitting = [name for name, one in known.items()
+                   if short_type(one) == kind and name not in TOPICS["ground_truth"]]
         usual = [name for name in TOPICS["odometry"] if name in fitting]
         if len(fitting) == 1 or usual:
             return {"command": (usual or fitting)[0]}
-    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState or an "
-                     "Odometry with --command-topic.")
+    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState "
+                     "or an Odometry with --command-topic.")
 
 
 def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
