@@ -59,6 +59,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
+    for path, one in zip((arguments.dataset, *arguments.reference), (log, *references), strict=True):
+        if one.fields.get("input") == "wheels":
+            raise ValueError(f"{path}: its input is measured wheel speeds; what a vehicle lacks shows only after commands. "
+                             "Record them, or fit the wheels with python -m sysid.fit.")
     vehicle = None
     if arguments.vehicle is not None:
         from whill_mjx.vehicle.vehicle_file import load_vehicle

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from sysid import command_line
+from sysid.logs.log import read_fields
 from sysid.logs.measured import load_any
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import parameter_table, table
@@ -49,6 +50,9 @@ def main(arguments: Arguments) -> None:
     if arguments.close_loop and arguments.model:
         raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
                          "model. Leave one of the two out.")
+    if arguments.close_loop and (dataset / "dataset.toml").exists() and read_fields(dataset / "dataset.toml").get(
+            "input") == "wheels":
+        raise ValueError(f"{dataset}: --close-loop needs commands, and its input is measured wheel speeds. Leave it out.")
     settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
     log = load_any(dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
     for note in log.notes:

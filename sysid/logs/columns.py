@@ -322,7 +322,8 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
         parts = [signal(f"{stream}.{one}") for one in ("qw", "qx", "qy", "qz")]
         if all(part is not None for part in parts) and len({len(part[0]) for part in parts if part}) == 1:
             w, x, y, z = (part[1] for part in parts if part)
-            headings[stream] = parts[0][0], np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+            t = next(part[0] for part in parts if part)
+            headings[stream] = t, np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
         elif yaw := signal(f"{stream}.yaw"):
             headings[stream] = yaw[0], np.unwrap(yaw[1])
     ways = {stream: _way(signal(f"{stream}.x"), signal(f"{stream}.y")) for stream in ("odometry", "ground_truth")}

@@ -16,7 +16,7 @@ from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.rosbag import PACKED, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.text_files import integrate_speeds, read_drives, text_files
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
@@ -132,7 +132,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
 
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
-        drives = [trial_drive(trial) for trial in log.trials]
+        drives = [_moved(trial_drive(trial), config.truth_ahead, config.truth_turned) for trial in log.trials]
         if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
             notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
     if not drives:
@@ -243,8 +243,9 @@ def _recording_name(path: Path) -> str:
     """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
     if not path.is_file():
         return path.name
-    alone = path.stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
-    return path.absolute().parent.name if alone else path.stem
+    stem = Path(path.stem).stem if path.suffix in PACKED else path.stem
+    alone = stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
+    return path.absolute().parent.name if alone else stem
 
 
 def cut(
@@ -334,6 +335,18 @@ def trial_drive(trial: Trial) -> Drive:
             pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
         pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
+
+
+def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
+    """The drive with its outside pose at the drive-axle centre and along the vehicle, as of `cut`."""
+    if drive.ground_truth is None or ahead == turned == 0.0:
+        return drive
+    truth = drive.ground_truth.copy()
+    truth[:, 3] -= np.deg2rad(turned)
+    truth[:, 1] -= ahead * np.cos(truth[:, 3])
+    truth[:, 2] -= ahead * np.sin(truth[:, 3])
+    truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
+    return replace(drive, ground_truth=truth)
 
 
 def write_dataset(
