@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
 from sysid.logs.rosbag import PACKED, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.text_files import integrate_speeds, read_drives, text_files
+from whill_mjx.io.command_line import Range
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
@@ -38,11 +39,11 @@ class ConvertConfig:
     """Dataset folder; made where it does not exist, else the trials are added."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
-    wheel_radius: float | None = None
+    wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
     """Nominal wheel radius [m], where it is not the vehicle's."""
-    track: float | None = None
+    track: Annotated[float | None, Range(0.01, 5)] = None
     """Nominal track [m], where it is not the vehicle's."""
-    mass: float | None = None
+    mass: Annotated[float | None, Range(0.01, 1e4)] = None
     """Mass [kg], where it is not the vehicle's."""
     command_topic: str | None = None
     """Twist or TwistStamped sent to the vehicle."""
@@ -50,9 +51,9 @@ class ConvertConfig:
     """The vehicle's own Odometry; '' goes without."""
     truth_topic: str | None = None
     """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
-    truth_ahead: float = 0.0
+    truth_ahead: Annotated[float, Range(-10, 10)] = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
-    truth_turned: float = 0.0
+    truth_turned: Annotated[float, Range(-360, 360)] = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     input: Literal["auto", "commands", "wheels"] = "auto"
     """What drives the model: commands, or measured wheel speeds (of joint states or odometry); auto takes the latter
@@ -61,7 +62,7 @@ class ConvertConfig:
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
     """One trial per bag, or one per drive between standstills."""
-    pause: float = 2.0
+    pause: Annotated[float, Range(0, 3600)] = 2.0
     """Least standstill between two drives [s]."""
     held_out: tuple[str, ...] = ()
     """Trials that are never to be fitted."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from whill_mjx.io import fields as tables
+from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
@@ -312,10 +313,27 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
         raise ValueError(f"{path}: {error}") from None
 
 
+def check_same_vehicle(log: Log, spec: VehicleSpec, place: str, rule: str) -> None:
+    """Raise ValueError where a vehicle of another geometry is given beside a log.
+
+    Args:
+        place: where it was given.
+        rule: the rule that is broken, in words.
+    """
+    for name in ("wheel_radius", "track", "wheelbase", "drive"):
+        mine, theirs = getattr(log.spec, name), getattr(spec, name)
+        if mine != theirs:
+            raise ValueError(f"{place}: {name} is {theirs}, but {mine} in {log.name!r}. {rule}; correct dataset.toml "
+                             "or leave it out.")
+
+
 def hash_files(folder: Path) -> str:
     """SHA-256 over names and contents of all data files of a dataset."""
     digest = hashlib.sha256()
+    results = {path.parent for path in folder.rglob(RUN_FILE)}  # of commands that were given a place in here
     for path in sorted(folder.rglob("*")):
+        if not results.isdisjoint(path.parents):
+            continue
         if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
             digest.update(str(path.relative_to(folder)).encode() + b"\0")
             with path.open("rb") as file:

@@ -11,7 +11,7 @@ import pytest
 from conftest import shared_folder
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.reader import zstd
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import sysid.convert as convert_module
 from sysid.logs.conversion import ConvertConfig, convert
@@ -20,6 +20,7 @@ from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_t
 from sysid.logs.measured import load_any, load_drive
 from sysid.logs.rosbag import yaw_of
 from sysid.logs.sources import refuse_recording
+from sysid.logs.wheel_states import CHAIR_DEFINITION, CHAIR_STATE, JOYSTICK_FIELDS
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -524,3 +525,28 @@ def test_a_bag_of_joint_states_and_an_outside_pose_has_wheel_speeds_as_its_input
     assert log.fields["input"] == "wheels" and trial.odometry is None and trial.ground_truth is not None
     middle = int(np.searchsorted(trial.command.t, 5.0))
     assert (trial.command.v[middle], trial.command.omega[middle]) == pytest.approx((0.5, 1.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("joystick", [True, False])
+def test_a_bag_with_the_states_of_a_chair_has_odometry(tmp_path, joystick):
+    kind = f"whill_msgs/msg/{CHAIR_STATE}"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(CHAIR_DEFINITION + (JOYSTICK_FIELDS if joystick else ""), kind))
+    state, twist_kind = store.types[kind], "geometry_msgs/msg/Twist"
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        commands = writer.add_connection("/whill/controller/cmd_vel", twist_kind, typestore=store)
+        states = writer.add_connection("/whill/states/model_cr2", kind, typestore=store)
+        for t in np.arange(0.0, 12.0, 0.05):
+            stamp, angle = int((T0 + t) * 1e9), 0.5 * max(t - 2.0, 0.0) / 0.1325
+            speed = 0.5 * 3.6 * (t > 2.0)
+            writer.write(commands, stamp, store.serialize_cdr(twist(0.5 * (t > 2.0), 0.0), twist_kind))
+            fields = {"battery_power": 90, "battery_current": 1.0, "right_motor_angle": -np.angle(np.exp(1j * angle)),
+                      "left_motor_angle": np.angle(np.exp(1j * angle)), "right_motor_speed": -speed,
+                      "left_motor_speed": speed, "power_on": 1, "speed_mode_indicator": 0, "error": 0,
+                      **({"joy_front": 0, "joy_side": 0} if joystick else {})}
+            writer.write(states, stamp, store.serialize_cdr(state(**fields), kind))
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    stream = log.trials[0].odometry
+    assert stream.x[-1] == pytest.approx(0.5 * (stream.t[-1] - 2.0), abs=0.01)
+    assert stream.v[100] == pytest.approx(0.5, abs=1e-3) and abs(stream.omega).max() < 1e-3
+    assert any("odometry from /whill/states/model_cr2" in note for note in notes)

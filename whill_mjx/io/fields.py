@@ -165,8 +165,11 @@ def _optional(*fields: Field) -> tuple[Field, ...]:
 
 CAMERA = _optional(
     Field("x", "m", -10.0, 10.0),
+    Field("y", "m", -10.0, 10.0),
     Field("z", "m", -10.0, 10.0),
+    Field("roll", "rad", -3.2, 3.2),
     Field("pitch", "rad", -1.6, 1.6),
+    Field("yaw", "rad", -3.2, 3.2),
     Field("fov_y", "rad", 0.01, 3.1),
 )
 """[spec.camera] of a vehicle file."""
@@ -203,11 +206,12 @@ VEHICLE = (
     Field("schema", kind="whole", choices=(1,)),
     Field("kind", kind="text", choices=("micromobility-vehicle",), remedy="Give a vehicle file."),
     Field("spec", kind="table"),
-    Field("body", kind="table"),
-    Field("effects", kind="list"),
+    Field("base", kind="text", choices=("paper", "physical"), needed=False),
+    Field("body", kind="table", needed=False),
+    Field("effects", kind="list", needed=False),
     Field("provenance", kind="table", needed=False),
 )
-"""A vehicle file."""
+"""A vehicle file; without `body` and `effects` these are a base model's for the spec."""
 
 EFFECT = (Field("name", kind="text"), Field("parameters", kind="table"))
 """One of [[effects]] of a vehicle file."""
@@ -289,8 +293,8 @@ MAP = (
     Field("origin", "m, m, rad", -1e6, 1e6, kind="numbers", count=3, remedy="It must be [x, y, yaw]."),
     Field("occupied_thresh", "-", 0.0, 1.0),
     Field("free_thresh", "-", 0.0, 1.0),
-    Field("negate", kind="whole", choices=(0, 1), remedy="Write a finite number, 0 or 1."),
-    Field("mode", kind="text", choices=("trinary", "scale"), needed=False, remedy="Save it as trinary."),
+    Field("negate", kind="whole", choices=(0, 1), remedy="Write 0, 1, false or true."),
+    Field("mode", kind="text", choices=("trinary", "scale", "raw"), needed=False),
 )
 """YAML file of a map, as map_server reads it."""
 
