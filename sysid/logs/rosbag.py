@@ -185,7 +185,7 @@ def _unpacked(path: Path, folder: Path) -> Path:
         with zstd.open(path, "rb") as source, target.open("wb") as out:
             while part := source.read(1 << 20):
                 if out.tell() > UNPACKED_BYTES:
-                    raise ValueError(f"{path}: is larger than {UNPACKED_BYTES / 1e9:g} GB unpacked. Unpack and split it.")
+                    raise ValueError(f"{path}: is larger than {UNPACKED_BYTES / 1e9:g} GB unpacked. Split it.")
                 out.write(part)
     except (zstd.ZstdError, EOFError) as error:
         raise ValueError(f"{path}: cannot be unpacked ({error}). Copy it again, or unpack it with zstd -d.") from None
