@@ -21,6 +21,7 @@ from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanit
 from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of, with_timeout
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.next_drives import next_drives
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from sysid.search import thin
 from whill_mjx.vehicle.presets import preset_params
@@ -355,3 +356,17 @@ def test_a_first_glance_passes_all_drives_with_the_same_commands():
     other = trial_of(Command(t, -base, 0.5 * base[::-1]))
     first, second, third = (replicates.glance(replicates.course_of(trial)) for trial in (one, late, other))
     assert replicates.may_be_alike(first, second) and not replicates.may_be_alike(first, third)
+
+
+def test_the_next_drives_show_what_a_log_lacks_with_ramps_within_the_space():
+    straight = log_of(trial_of(Command(np.arange(0.0, 9.0, 0.1), np.full(90, 0.3), np.zeros(90))))
+    blind = blind_spots(straight, {one.name: excitation(one) for one in straight.trials})
+    drives = next_drives(straight, blind, (3.0, 3.0), 0.4)
+    assert len(drives) == 3 and drives[0].why == "no turn" and np.ptp(drives[0].command.omega) > 0.2
+    for drive in drives:
+        command, dt = drive.command, np.diff(drive.command.t)
+        assert max(abs(command.v).max(), abs(command.omega).max()) <= 0.8 and abs(command.v).max() <= 0.4
+        assert (abs(np.diff(command.v)) <= 0.5 * dt + 1e-9).all() and (abs(np.diff(command.omega)) <= dt + 1e-9).all()
+        assert command.v[-1] == command.omega[-1] == command.v[0] == 0.0 and max(drive.size) < 3.0 * np.sqrt(2)
+    assert next_drives(straight, blind, (0.5, 0.5), 0.4) == [] or all(
+        max(one.size) < 0.5 for one in next_drives(straight, blind, (0.5, 0.5), 0.4))
