@@ -71,6 +71,10 @@ def main(arguments: Arguments) -> None:
         check_storage(settings)
         model = check_settings(log, settings)
         references = [load_any(path) for path in arguments.reference]
+        if arguments.close_loop:
+            from sysid.verdict.pipeline import check_logs
+
+            check_logs(log, references)
     chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
               "chained": arguments.chained, **settings_of(settings)}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):
