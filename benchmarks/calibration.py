@@ -28,6 +28,7 @@ from sysid.replay.model_files import SUFFIXES
 from sysid.replay.robot_check import check_robot
 from sysid.search.fitting import fit_log, predict
 from sysid.search.settings import FitConfig
+from whill_mjx.io import command_line
 
 CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
 MANOEUVRES = ("turn", "s_curve", "reverse", "figure_eight", "stop_and_go")
@@ -106,6 +107,4 @@ def main(config: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark))
+    command_line.run(Benchmark, main, __doc__, positional=False)

@@ -16,11 +16,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from benchmarks.harness import figure, record, time_calls
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import RICH, Env, State, make_env, reset_state
+from whill_mjx.io import command_line
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.world.render import pinhole, render
 from whill_mjx.world.render.pallas import render_pallas
@@ -145,4 +145,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    command_line.run(Options, main, __doc__, positional=False)
