@@ -62,6 +62,10 @@ def main(arguments: Arguments) -> None:
         if arguments.close_loop and arguments.model:
             raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
                              "model. Leave one of the two out.")
+        if arguments.reference and not arguments.close_loop:
+            raise ValueError("--reference: only --close-loop asks for drives of other days. Add it or leave this out.")
+        if arguments.wheels and not arguments.model:
+            raise ValueError("--wheels: only a --model has joints or actuators to name. Add it or leave this out.")
         settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
         log = load_any(arguments.dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
         check_storage(settings)
