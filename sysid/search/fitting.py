@@ -196,7 +196,6 @@ class Problem:
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
     trials = _training(log, config)
-    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
@@ -223,6 +222,7 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
     """The training trials with the channels that are fitted."""
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    thin.check_moves(log)
     return tuple(_keep_channels(trial, config.channels) for trial in log.training)
 
 
