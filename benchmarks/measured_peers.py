@@ -23,8 +23,8 @@ from sysid.logs.log import PoseStream, Prediction, Trial, command_in_force
 
 DT = 0.05  # s
 BACK = 24  # steps of driving on as in the first instant, before the start: as late as a pose may be
-YAW_WEIGHT = 2.0  # m per rad: what counts beside the position
-HIDDEN, RATE, EPOCHS, DECAY = 32, 3e-3, 600, 1e-4
+YAW_WEIGHT = 1.0  # m per rad: what counts beside the position
+HIDDEN, RATE, EPOCHS, DECAY = 32, 3e-3, 300, 1e-4
 SCALES = np.array([4.0, 3.0])  # m/s and rad/s that inputs are divided by
 
 START = {"linear": 0.9, "angular": 0.6, "lag": 0.4, "delay": 0.1, "limit": 6.0, "late": 0.0, "slip": 0.0,
