@@ -61,13 +61,13 @@ def main(arguments: Arguments) -> dict[str, Any]:
     references = [load_any(path) for path in arguments.reference]
     vehicle = None
     if arguments.vehicle is not None:
-        from whill_mjx.vehicle.vehicle_file import load_vehicle
+        from sysid.missing.fit_statistics import load_fitted
 
         if references:
             raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
                              "them.")
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")
-        _, vehicle, _ = load_vehicle(arguments.vehicle)
+        vehicle = load_fitted(arguments.vehicle)
     config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                         without=arguments.without, refit_nulls=arguments.refit_nulls)
     if arguments.decision == "posterior":
