@@ -70,6 +70,14 @@ def detect_format(path: str | Path) -> str:
     raise ValueError(f"{path}: {about(path)}")
 
 
+def is_known(path: Path) -> bool:
+    """Whether a folder is a dataset or a measured set."""
+    try:
+        return bool(detect_format(path))
+    except (ValueError, FileNotFoundError):
+        return False
+
+
 def drive_spec(run: str) -> VehicleSpec:
     """Nominal geometry of the robot that drove `run` (the constants and their sources are in
     whill_mjx.vehicle.specs)."""

@@ -24,6 +24,7 @@ ROUNDED = 0.02  # s that times of two tables may differ by, row by row, where th
 NEAR = 0.25
 """Distance of two commands (root mean square over a drive), as a share of the larger one, at which a model still leaves
 nearly the same of both. What it leaves grows at least in proportion to the command: three quarters of it are common."""
+GLANCE = 0.5  # s between the instants at which drives are compared first
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,39 @@ def near(a: Course, b: Course, most: float) -> bool:
     return bool((apart <= NEAR * size + NONE * np.sqrt(len(ours))).all())
 
 
+@dataclass(frozen=True)
+class Glance:
+    """Commands at some instants since the first motion, and between which values they lie around them."""
+
+    values: np.ndarray  # (K, 2)
+    low: np.ndarray  # (K, 2)
+    high: np.ndarray  # (K, 2)
+    length: float  # s of motion; nan where there is none
+
+
+def glance(course: Course) -> Glance:
+    """What is compared of a drive first."""
+    if not course.moves or course.end - course.begin > LONGEST:
+        return Glance(*(np.zeros((0, 2)),) * 3, float("nan"))
+    around = 2 * TIMING[1]  # s by which two commands of replicates may be apart in time
+    t = np.arange(0.0, course.end - course.begin, GLANCE)
+    near = np.arange(-around, around + TABLE_DT, TABLE_DT)
+    table = course.at((t[:, None] + near).ravel()).reshape(len(t), len(near), 2)
+    return Glance(course.at(t), table.min(axis=1), table.max(axis=1), course.end - course.begin)
+
+
+def may_be_alike(a: Glance, b: Glance) -> bool:
+    """Whether two drives may have the same commands: whatever `shift_between` accepts passes."""
+    count = min(len(a.values), len(b.values))
+    if not count:
+        return True
+    if abs(a.length - b.length) > 2 * TIMING[1]:
+        return False
+    allowed = VALUE[0] + VALUE[1] * np.maximum(np.abs(a.high), np.abs(a.low)).max(axis=0)
+    values = a.values[:count]
+    return bool(((values >= b.low[:count] - allowed) & (values <= b.high[:count] + allowed)).all())
+
+
 def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
     """Indices of trials of one manoeuvre with the same commands, in order of first appearance; single ones too.
 
@@ -114,11 +148,14 @@ def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]
         most: how much earlier or later than in the first of them the commands may come in the recording [s].
     """
     courses = [course_of(trial) for trial in trials]
+    glances = [glance(course) for course in courses]
     groups: list[list[int]] = []
     of_manoeuvre: dict[str, list[list[int]]] = {}
     for i, trial in enumerate(trials):
         mine = of_manoeuvre.setdefault(trial.manoeuvre, [])
         for group in mine:
+            if not may_be_alike(glances[group[0]], glances[i]):
+                continue
             shift = shift_between(courses[group[0]], courses[i])
             if shift is not None and abs(shift) <= most:
                 group.append(i)

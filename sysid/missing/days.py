@@ -60,6 +60,10 @@ class Reference:
     known: bool
     """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
     remark: str
+    noise: np.ndarray | float = 1.0
+    """(C,) noise of the drives in question over that of the reference days."""
+    simulated: bool = False
+    """Whether `leftovers` are drawn from what a vehicle file says of its fit: there are no reference days."""
 
     @property
     def shared(self) -> float:
@@ -70,14 +74,15 @@ class Reference:
         apart = []
         for number in {one.day for one in self.leftovers}:
             mine = [one for one in self.leftovers if one.day == number]
-            series = np.stack([one.series - self.expected_on_others(one) for one in mine])
+            series = np.stack([self.noise_of(one) for one in mine])
             white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
             courses = np.zeros(len(mine), int)
             for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
                 courses[group] = course
             apart.append(scatter(white, courses))
         finite = [one for one in apart if np.isfinite(one)]
-        return float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
+        usual = float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
+        return usual * float(np.mean(1 / np.square(self.noise)))
 
     def expected(self, trial: Trial, bins: int) -> np.ndarray:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
@@ -87,6 +92,14 @@ class Reference:
     def expected_on_others(self, one: Leftover) -> np.ndarray:
         """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
         return expected_without(self.leftovers, one) if self.known else np.zeros_like(one.series)
+
+    def noise_of(self, one: Leftover) -> np.ndarray:
+        """(K, C) what is noise of a reference drive, as large as in the drives in question."""
+        return (one.series - self.expected_on_others(one)) * self.noise
+
+    def noisier(self, factor: np.ndarray) -> Reference:
+        """The same for drives in which each channel's noise is larger by a factor (C,)."""
+        return replace(self, whitener=self.whitener.scaled(factor), noise=self.noise * factor)
 
     def target_of(self, drives: Binned) -> np.ndarray:
         """(B, K, C) measured features less what the model is known to leave of such drives."""
@@ -141,10 +154,12 @@ class Wander:
     """Root mean square of it over the days, for a new one; 0 where reference days do not show it."""
     scatter: float = 0.0
     """Excess of what a reference day's replicates do not share."""
+    level: float = 1.0
+    """Mean square of the white residual where nothing is missing: less with sensors quieter than on those days."""
 
     def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
         """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
-        return max(float(np.nan_to_num(scatter(residual, courses) - self.scatter)), 0.0)
+        return max(float(np.nan_to_num((scatter(residual, courses) + 1) / self.level - 1 - self.scatter)), 0.0)
 
     def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""

@@ -27,6 +27,7 @@ from sysid.logs.log import Prediction, Trial
 from sysid.replay.records import Measured
 from sysid.replay.rollout import padded
 from whill_mjx.io.fields import shown
+from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.vehicle_file import load_statistics, read_vehicle
 
 DIGITS = 5  # of numbers in the file
@@ -82,11 +83,11 @@ class FittedVehicle:
     statistics: FitStatistics | None = None
 
 
-def load_fitted(path: Path) -> FittedVehicle:
-    """A vehicle file with its statistics; ValueError where they do not fit together."""
-    _, params, _ = read_vehicle(path)
+def load_fitted(path: Path) -> tuple[VehicleSpec, FittedVehicle]:
+    """The spec of a vehicle file, and the vehicle with its statistics; ValueError where they do not fit together."""
+    spec, params, _ = read_vehicle(path)
     table = load_statistics(path)
-    return FittedVehicle(params, None if table is None else _from_table(path, table))
+    return spec, FittedVehicle(params, None if table is None else _from_table(path, table))
 
 
 def statistics_of(

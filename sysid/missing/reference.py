@@ -129,7 +129,7 @@ def of_vehicle(
     drives = drives.weighted(at, left.factors, log.spec.track)
     leftovers = _drawn(log.training, drives.mask, left)
     return Reference(params, space, u, spread, np.zeros((1, space.size)), left.whitener, left.factors, leftovers,
-                     drives.features.width, True, remark)
+                     drives.features.width, True, remark, simulated=True)
 
 
 def _own_leftovers(drives: Drives, space: Space, u: np.ndarray, log: Log, progress: Progress | None) -> Leftovers:

@@ -54,7 +54,7 @@ def known(tmp_path_factory):
 
 def test_what_a_fit_knows_survives_the_file(known):
     file, statistics, _, _ = known
-    read = load_fitted(file).statistics
+    read = load_fitted(file)[1].statistics
     assert read.names == NAMES and read.leftovers.measured == CHANNELS
     np.testing.assert_allclose(read.leftovers.whitener.scale, statistics.leftovers.whitener.scale, rtol=1e-3)
     np.testing.assert_allclose(read.covariance(("other", NAMES[1]), np.array([1.0, 2.0])), [[0, 0], [0, 0.05**2]])
@@ -70,7 +70,7 @@ def test_what_a_fit_knows_survives_the_file(known):
 
 def test_the_vehicle_of_the_file_is_kept_and_its_drives_in_question_are_not_taken_for_known(known):
     file, _, plain, sloping = known
-    vehicle = load_fitted(file)
+    _, vehicle = load_fitted(file)
     found = find_missing(sloping, config=CONFIG, vehicle=vehicle)
     kept, given = (base_values(one) for one in (found.reference.params, vehicle.params))
     assert kept == pytest.approx(given, rel=1e-5)  # not moved to the drives in question
@@ -84,7 +84,7 @@ def test_the_vehicle_of_the_file_is_kept_and_its_drives_in_question_are_not_take
 @pytest.mark.long
 def test_of_an_older_file_the_noise_is_assumed(known):
     file, _, _, sloping = known
-    older = find_missing(sloping, config=CONFIG, vehicle=FittedVehicle(load_fitted(file).params))
+    older = find_missing(sloping, config=CONFIG, vehicle=FittedVehicle(load_fitted(file)[1].params))
     assert older.search.verdict == "named" and "slope" in older.search.classes[0]
     assert "noise is assumed" in older.reference.remark
 
