@@ -18,10 +18,12 @@ from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.collision import first_contact, free_distance, obstacles_of, poses_between
+from whill_mjx.world.maps.walls import shown
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import pinhole, render
-from whill_mjx.world.scene import Scene, clearance, collides, footprint
+from whill_mjx.world.scene import Scene, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode."""
@@ -213,9 +215,9 @@ def _control_period(
     task = env.task
     vehicle = drive(env.model, params, state.vehicle, command)
     vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
+    vehicle, collided = _stopped(env, state, vehicle)
     x, y, yaw = reference_pose(env.model, vehicle.qpos)
     distance = jnp.linalg.norm(goal_position(state.scene) - jnp.stack([x, y]))
-    collided = collides(footprint(env.model.spec, x, y, yaw), state.scene.boxes) & ~vehicle.diverged
     reached = (distance <= task.goal_radius) & ~collided & ~vehicle.diverged
     progress = jnp.where(vehicle.diverged, 0.0, state.goal_distance - distance)
     terms = reward_terms(task, progress, command[1] - state.command[1], reached, collided)
@@ -242,6 +244,20 @@ def _control_period(
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 
+def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[VehicleState, jax.Array]:
+    """The vehicle after a control period, where it first touched something if it did, and whether it did."""
+    task, spec = env.task, env.model.spec
+    before, after = (footprint(spec, *reference_pose(env.model, qpos)) for qpos in (state.vehicle.qpos, vehicle.qpos))
+    fastest = max(abs(task.v_min), abs(task.v_max))
+    duration = env.model.config.control_dt
+    poses = poses_between(fastest, task.omega_max, duration, spec.body_length / 2, spec.body_width / 2)
+    obstacles = obstacles_of(state.scene, after.x, after.y)
+    collided, share = first_contact(before, after, obstacles, poses)
+    collided = collided & ~vehicle.diverged
+    there = state.vehicle.qpos + share * (vehicle.qpos - state.vehicle.qpos)
+    return dataclasses.replace(vehicle, qpos=jnp.where(collided, there, vehicle.qpos)), collided
+
+
 def first_outcome(env: Env, state: State) -> Outcome:
     """Outcome that goes with the first frame of an episode."""
     false, zero = jnp.zeros((), bool), jnp.zeros(())
@@ -258,7 +274,7 @@ def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
         "v": v,
         "omega": omega,
         "goal_distance": state.goal_distance,
-        "clearance": clearance(footprint(env.model.spec, x, y, yaw), state.scene.boxes),
+        "clearance": free_distance(footprint(env.model.spec, x, y, yaw), state.scene),
     }
 
 
@@ -266,7 +282,8 @@ def observe(env: Env, state: State) -> jax.Array:
     """Camera image (H, W, 3) uint8 of one instance."""
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
-    image = render(position, rotation, intrinsics, state.scene, env.height, env.width)
+    scene = shown(state.scene, position, rotation, intrinsics, env.width)
+    image = render(position, rotation, intrinsics, scene, env.height, env.width)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
