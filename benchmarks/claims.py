@@ -892,6 +892,28 @@ CLAIMS = (
     ),
     Claim(
         MISSING,
+        "Sensors and floor noisier or quieter than on the reference days",
+        "undeclared",
+        "Disturbances and sensor noise of the log times a factor; the reference days keep the usual ones. 40 logs with "
+        "nothing missing for each factor.",
+        ("figure", "0.5", "2", "4"),
+        (
+            (
+                "false alarms",
+                *(f"{{false_alarms_sensor_noise_{level}}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "upper 95 % bound of their rate",
+                *(f"{{false_alarm_upper_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "noise factors inside their 95 % interval, of 200",
+                *(f"{{noise_factor_coverage_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+        ),
+    ),
+    Claim(
+        MISSING,
         "How long the loop takes",
         "undeclared",
         "27 drives of 22 s and six reference days, compilation included.",

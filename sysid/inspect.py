@@ -1,7 +1,8 @@
-"""Looks at a driving log before it is fitted: `python -m sysid.inspect DATASET [--out DIR] [--json]`.
+"""Looks at a driving log or a robot file before it is fitted: `python -m sysid.inspect DATASET|ROBOT [--out DIR]`.
 
 Says how regularly each stream was sampled, how the clocks differ, whether units and signs are right, what each trial
-excites, how well replicates repeat, and what no fit can find in the log.
+excites, how well replicates repeat, and what no fit can find in the log. Of a robot file (URDF, xacro, MJCF) it says
+what was understood: wheels, radius, track, mass, what stands on the floor, how it drives, and what is missing.
 """
 
 from __future__ import annotations
@@ -12,9 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
+
 from sysid import command_line
 from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.log import Log
+from whill_mjx.io.folders import claim_folder
+
+KIND = "sysid.inspect"
+OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png")
 
 
 @dataclass(frozen=True)
@@ -22,15 +32,41 @@ class InspectConfig:
     """Options of the command."""
 
     dataset: Path
-    """Folder of a dataset, of DRIVE runs or of MRCLAM."""
+    """Folder of a dataset, of DRIVE runs or of MRCLAM; or a robot file."""
     select: tuple[str, ...] = ()
     """Part of a measured set: RUN, GROUP or RUN:FROM-TO. By default all runs of one robot."""
     format: Literal["auto", "dataset", "drive_norlab", "mrclam"] = "auto"
     """Form of the data; found out by default."""
+    wheels: tuple[str, ...] = ()
+    """Of a robot file: joints or actuators of the driven wheels, left and right."""
     json: bool = False
     """Print JSON instead of text."""
     out: Path | None = None
-    """Folder for inspect.txt, inspect.json and inspect.png."""
+    """Folder for inspect.txt, inspect.json and inspect.png; the picture of a robot file goes to the
+    current folder without one."""
+
+
+def inspect_robot(config: InspectConfig) -> dict[str, Any]:
+    """What a robot file is understood as: printed, with a picture."""
+    from dataclasses import asdict
+
+    from sysid.pages.report import plain
+    from sysid.pages.robot_plot import write_robot
+    from sysid.replay.mjcf_file import load_robot
+    from sysid.replay.robot_check import check_robot, describe_robot
+
+    robot = load_robot(config.dataset, config.wheels)
+    check = check_robot(robot)
+    found = {"wheel_radius": robot.wheel_radius, "track": robot.distance, "driven_wheels": len(robot.wheels),
+             "mass": float(robot.host.body_mass.sum()), "notes": list(robot.notes), **asdict(check),
+             "drives_straight": check.drives_straight}
+    print(json.dumps(plain(found), indent=1) if config.json else "\n".join(describe_robot(robot, check)))
+    if config.out is not None:
+        config.out.mkdir(parents=True, exist_ok=True)
+    picture = (config.out or Path()) / f"{config.dataset.name.partition('.')[0]}.png"
+    write_robot(picture, robot, check.loads)
+    print(f"wrote {picture}", file=sys.stderr)
+    return found
 
 
 def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
@@ -39,7 +75,7 @@ def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
     from sysid.pages.report import write_report
     from whill_mjx.logs.dataset import write_text
 
-    paths = [folder / "inspect.txt", folder / "inspect.json", folder / "inspect.png"]
+    paths = [folder / name for name in OUTPUTS]
     write_text(paths[0], text(found) + "\n")
     write_report(paths[1], found)
     write_plot(paths[2], log, found)
@@ -48,14 +84,29 @@ def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
 
 def main(config: InspectConfig) -> dict[str, Any]:
     """Load, look, print and write."""
-    from sysid.pages.report import plain
+    from sysid.replay.model_files import SUFFIXES
 
-    log = load_whole(config.dataset, config.select, config.format)
-    found = inspect(log)
-    print(json.dumps(plain(found), indent=1) if config.json else text(found))
-    if config.out is not None:
+    if config.dataset.suffix in SUFFIXES:
+        with refusing():
+            return inspect_robot(config)
+    with refusing():
+        log = load_whole(config.dataset, config.select, config.format)
+    if config.out is None:
+        return look(config, log)
+    with claim_folder(config.out, KIND, OUTPUTS) as claim:
+        claim.settle({})  # another look replaces an earlier one as a whole
+        found = look(config, log)
         for path in write(config.out, log, found):
             print(f"wrote {path}", file=sys.stderr)
+    return found
+
+
+def look(config: InspectConfig, log: Log) -> dict[str, Any]:
+    """What was found, printed."""
+    from sysid.pages.report import plain
+
+    found = inspect(log)
+    print(json.dumps(plain(found), indent=1) if config.json else text(found))
     return found
 
 

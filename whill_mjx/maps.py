@@ -13,7 +13,7 @@ listen()
 import numpy as np  # noqa: E402
 
 from whill_mjx.io.folders import check_place, write_whole  # noqa: E402
-from whill_mjx.world.maps import GridMap, Reach, load_footprints, load_map, make_map_scene, wall_segments  # noqa: E402
+from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments  # noqa: E402
 from whill_mjx.world.maps.picture import from_above  # noqa: E402
 
 
@@ -35,15 +35,6 @@ class Import:
     """Longer side of the picture."""
 
 
-def read_grid(path: Path, cell: float) -> GridMap:
-    """Occupancy grid of a map of any known kind, by the ending of its name."""
-    if path.suffix in (".osm", ".gml", ".xml"):
-        return load_footprints(path, cell)
-    if path.suffix in (".yaml", ".yml"):
-        return load_map(path)
-    raise OptionError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml). Give one of them.")
-
-
 def main(options: Import) -> None:
     """Write picture and scene, and print what was found."""
     if options.action != "import":
@@ -51,7 +42,7 @@ def main(options: Import) -> None:
     picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
     check_place("--out", picture)
     with refusing():
-        grid = read_grid(options.file, options.cell)
+        grid = read_map(options.file, options.cell)
         made = make_map_scene(grid, Reach(passing=options.width / 2))
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
     steps, places = len(wall_segments(grid)), made.places

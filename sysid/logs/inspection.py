@@ -69,7 +69,7 @@ def inspect(log: Log) -> dict[str, Any]:
                if any(found.values())},
             **({"ground_truth after odometry": _pooled(list(clocks.values()))} if any(clocks.values()) else {})},
         "pose_jitter": _median([pose_jitter(trial) for trial in log.trials]),
-        "sanity": sanity(log),
+        "sanity": sanity(log, responses),
         "trials": [{"trial": trial.name, "group": trial.group, "manoeuvre": trial.manoeuvre, "seconds": trial.duration,
                     "held_out": trial.held_out, "excitation": asdict(excitations[trial.name]),
                     "streams": {name: asdict(one) | {"rate": one.rate} for name, one in qualities[trial.name].items()},

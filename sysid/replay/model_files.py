@@ -47,7 +47,8 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
         from sysid.replay.mjcf import mjcf_model
 
         inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
-        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track)
+        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track,
+                          calibrate=not inside)
     if path.suffix != ".py":
         raise ValueError(f"{path}: a model is {', '.join(SUFFIXES)} or .py. Rename the file or write an adapter.")
     loader = importlib.util.spec_from_file_location(path.stem, path)

@@ -231,7 +231,7 @@ def zero_stamps(rows):
 
 
 @pytest.mark.parametrize(("edit", "options", "rule"), [
-    (drop(COMMAND), {}, r"no command topic found \(topics with messages: .*--command-topic"),
+    (drop(COMMAND), {"input": "commands"}, r"no command topic found \(topics with messages: .*--command-topic"),
     (drop(ODOMETRY, 1), {}, "topic /whill/odom has 1 usable messages.*--odometry-topic"),
     (None, {"odometry_topic": "/nowhere"}, "no topic '/nowhere'.*Correct --odometry-topic"),
     (None, {"command_topic": ODOMETRY}, "/whill/odom is nav_msgs/msg/Odometry; command must be"),
@@ -409,9 +409,9 @@ def given(bag, tmp_path):
     ("bags", r"a folder of ROS bags \(figure_1\). Convert it first: python -m sysid.convert"),
     ("bags/figure_1", "a ROS bag. Convert it first: python -m sysid.convert"),
     ("drive.db3", "a ROS bag. Convert it first: python -m sysid.convert"),
-    ("poses.txt", "a trajectory in TUM form .* ground_truth.csv"),
-    ("texts", "a folder of text files, not a dataset. poses.txt is a trajectory in TUM form"),
-    ("wheels.csv", "a text file with the columns time, left, right. A trial is a folder"),
+    ("poses.txt", "a trajectory in TUM form .* commands or wheel speeds, then: python -m sysid.convert"),
+    ("texts", r"a folder of text files \(poses.txt\), not a dataset. Convert it first"),
+    ("wheels.csv", "a text file with the columns time, left, right. Convert it first: python -m sysid.convert"),
     ("run", "the folder of a fit. Give the folder of the dataset"),
     ("log/trials/figure_1", "one trial, not a dataset. Give the folder that holds dataset.toml"),
     ("log/dataset.toml", "a file of a dataset. Give its folder"),

@@ -170,7 +170,7 @@ def turned(pose, degrees):
     (lambda pose: turned(pose, -90), "the outside pose moves 90 deg to the left of its own heading"),
     (lambda pose: replace(pose, y=-pose.y), "the frame is left-handed"),
     (lambda pose: replace(pose, x=pose.y, y=pose.x), "the frame is left-handed"),
-    (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes 5.0 s later .* another clock"),
+    (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes (4.9|5.0|5.1) s later .* another clock"),
 ])
 def test_an_outside_pose_that_contradicts_the_odometry_is_named_and_no_sign_is_said_to_be_reversed(change, said):
     good = trial_of(lively())
@@ -188,7 +188,7 @@ def reset_at_9_s(o):
 @pytest.mark.parametrize(("change", "said"), [
     (reset_at_9_s, "at 9.[01] s.* its pose jumps by .* it was reset there"),
     (lambda o: replace(o, v=o.v * np.cos(o.yaw)), "the twist is in the frame odom"),
-    (lambda o: replace(o, v=0 * o.v), "its speeds v are all zero though its pose moves"),
+    (lambda o: replace(o, v=0 * o.v), "its pose moves .*, but its speeds v are all zero"),
     (lambda o: replace(o, x=-o.y, y=o.x), "its pose moves 90 deg to the left of its own heading"),
 ])
 def test_odometry_whose_pose_and_speeds_contradict_each_other_is_named(change, said):

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.world.lidar import Scanner, first_hits, scan
+from whill_mjx.sensors.lidar import Lidar
+from whill_mjx.world.lidar import disturbed, first_hits, sent_from
 from whill_mjx.world.maps import FREE, OCCUPIED, GridMap, distance_field
 from whill_mjx.world.maps.walls import map_walls
-from whill_mjx.world.scene import Marker, Scene, box, default_looks, no_boxes, stack_boxes
+from whill_mjx.world.scene import Footprint, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 from whill_mjx.world.solids import Solids, person, post, rod, stack_rounds
 
 pytestmark = pytest.mark.quick
 GREY = (0.5, 0.5, 0.5)
 MARKER = Marker(jnp.array([50.0, 0.0, 1.0]), jnp.array([0.02, 0.3, 0.3]), jnp.zeros(()), jnp.array(GREY))
-ZERO = jnp.zeros(3)
 
 
 def furnished():
@@ -92,25 +92,37 @@ def wall_ahead():
     return Scene(box(5.0, 0.0, 0.2, 40.0, 2.0, GREY), MARKER, default_looks())
 
 
-def test_a_moving_scanner_measures_each_ray_from_where_it_was():
-    scanner = Scanner(rays=101, field_of_view=1.0, period=0.1)
-    still = np.asarray(scan(scanner, wall_ahead(), ZERO, ZERO, jax.random.key(0)))
-    moving = np.asarray(scan(scanner, wall_ahead(), ZERO, jnp.array([2.0, 0.0, 0.0]), jax.random.key(0)))
-    np.testing.assert_allclose(still, 4.9 / np.cos(scanner.angles()), rtol=1e-5)
-    age = 0.1 * (1.0 - (np.arange(101) + 1) / 101)
-    np.testing.assert_allclose(moving, (4.9 + 2.0 * age) / np.cos(scanner.angles()), rtol=1e-5)
-    turning = np.asarray(scan(scanner, wall_ahead(), ZERO, jnp.array([0.0, 0.0, 1.0]), jax.random.key(0)))
-    np.testing.assert_allclose(turning, 4.9 / np.cos(scanner.angles() - age), rtol=1e-5)
+@pytest.mark.parametrize(("speed", "yaw_rate"), [(0.0, 0.0), (2.0, 0.0), (0.0, 1.0), (1.5, -0.8)])
+def test_a_moving_scanner_measures_each_ray_from_where_it_was(speed, yaw_rate):
+    angles, age = np.linspace(-0.5, 0.5, 101), 0.1 * (1.0 - (np.arange(101) + 1) / 101)
+    x, y, yaw = sent_from(jnp.zeros(3), jnp.array([speed, yaw_rate]), 101, 0.1)
+    found = np.asarray(first_hits(wall_ahead(), x, y, yaw + jnp.asarray(angles), 0.3))
+    turn = -yaw_rate * age
+    back = -speed * age * np.cos(turn / 2)
+    np.testing.assert_allclose(found, (4.9 - back) / np.cos(turn + angles), rtol=2e-5)
+    assert float(x[-1]) == float(yaw[-1]) == 0.0
 
 
 def test_range_noise_and_dropouts_are_as_stated():
-    scanner = Scanner(rays=4000, field_of_view=0.2, noise=0.03, dropouts=0.1)
-    scene = wall_ahead()
-    measured = np.asarray(scan(scanner, scene, ZERO, ZERO, jax.random.key(1)))
-    lost = np.isinf(measured)
+    true = jnp.linspace(1.0, 5.0, 4000)
+    measured = np.asarray(disturbed(true, jax.random.key(1), 0.03, 0.1, 0.0, 10.0))
+    lost = measured == 10.0
     assert lost.mean() == pytest.approx(0.1, abs=0.02)
-    error = (measured - 4.9 / np.cos(scanner.angles()))[~lost]
+    error = (measured - np.asarray(true))[~lost]
     assert error.std() == pytest.approx(0.03, rel=0.1) and abs(error.mean()) < 0.003
-    short = dataclasses.replace(scanner, farthest=4.0)
-    assert np.isinf(np.asarray(scan(short, scene, ZERO, ZERO, jax.random.key(1)))).all()
-    assert len(set(np.round(Scanner(rays=360).angles() % (2 * np.pi), 6))) == 360
+    cut = np.asarray(disturbed(true, jax.random.key(1), 0.0, 0.0, 2.0, 4.0))
+    assert (cut[(true < 2.0) | (true > 4.0)] == 4.0).all() and (cut[(true > 2.0) & (true < 4.0)] < 4.0).all()
+
+
+def test_the_sensor_meets_round_things_and_the_walls_of_a_map():
+    sensor = Lidar(rays=4, reach=6.0, z=0.3)
+    body = Footprint(*(jnp.asarray(v) for v in (0.0, 0.0, -np.pi / 4, 0.5, 0.3, 0.9)))
+
+    def read(scene):
+        moment = SimpleNamespace(body=body, scene=scene, twist=jnp.zeros(2))
+        return np.asarray(sensor.measure((), SimpleNamespace(moment=moment), jax.random.key(0))[1])
+
+    corners = np.array([[2.0, -3.0], [2.0, 3.0], [-2.5, 3.0], [-2.5, -3.0]])
+    walls = map_walls(np.stack([corners, np.roll(corners, -1, 0)], 1), keep=4)
+    scene = Scene(no_boxes(4), MARKER, default_looks(), Solids(None, post(0.0, 1.5, 1.0, 0.2, GREY)), walls=walls)
+    np.testing.assert_allclose(read(scene), [2.5, 3.0, 2.0, 1.3], atol=1e-5)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.tasks.tasks import Task, World, goal_position
+from whill_mjx.tasks.base import Task, World
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.world.scene import clearance, footprint
+from whill_mjx.world.collision import free_distance
+from whill_mjx.world.scene import footprint
 
 TRIES = 64
 """Poses drawn at one distance from the goal, of which the first free one is taken."""
@@ -36,7 +37,7 @@ def anywhere(task: Task, spec: VehicleSpec, world: World, key: jax.Array) -> jax
         world: of the episode.
         key: consumed.
     """
-    goal = goal_position(world.scene)
+    goal = task.goal(world.scene)
     way = goal - world.start[:2]
     length = jnp.linalg.norm(way)
     along = way / length
@@ -48,7 +49,7 @@ def anywhere(task: Task, spec: VehicleSpec, world: World, key: jax.Array) -> jax
         place = world.start[:2] + far * along + aside * ASIDE * jnp.stack([-along[1], along[0]])
         ahead = goal - place
         yaw = jnp.arctan2(ahead[1], ahead[0]) + turned * TURNED
-        free = clearance(footprint(spec, place[0], place[1], yaw), world.scene.boxes) >= CLEAR
+        free = free_distance(footprint(spec, place[0], place[1], yaw), world.scene) >= CLEAR
         free &= jnp.linalg.norm(ahead) >= task.goal_radius + SHORT
         return jnp.append(place, yaw), free
 

@@ -1,4 +1,6 @@
-"""Scans of a 2-D laser scanner in the same scene that the camera sees, exact against every shape, on the device.
+"""Rays of a 2-D laser scanner in the same scene that the camera sees, exact against every shape, on the device.
+
+`whill_mjx.sensors.lidar` makes a sensor of them.
 
 A ray is a half line in the plane of the scanner. It meets upright boxes, walls of a map, cylinders and capsules
 (people); a distance field is followed along the ray (sphere tracing, Hart 1996).
@@ -6,11 +8,8 @@ A ray is a half line in the plane of the scanner. It meets upright boxes, walls 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from whill_mjx.world.maps.field import DistanceField, distance_at
 from whill_mjx.world.maps.walls import cast
@@ -23,63 +22,38 @@ CLOSE = 1e-3
 """Distance at which a traced ray has arrived [m]."""
 
 
-@dataclass(frozen=True)
-class Scanner:
-    """A 2-D laser scanner. Static."""
-
-    rays: int = 360
-    field_of_view: float = 2 * np.pi
-    """Angle from the first to the last ray [rad]; a full turn leaves out the ray that would come twice."""
-    height: float = 0.3
-    """Height of its plane above the ground [m]."""
-    nearest: float = 0.05
-    """Shorter distances give no return [m]."""
-    farthest: float = 12.0
-    """Longer distances give no return [m]."""
-    noise: float = 0.0
-    """Standard deviation of a distance [m]."""
-    dropouts: float = 0.0
-    """Share of rays that give no return by chance."""
-    period: float = 0.1
-    """Duration of one scan [s]; the first ray is the oldest."""
-
-    def angles(self) -> np.ndarray:
-        """(rays,) rad, to the left of straight ahead, from right to left."""
-        whole = self.field_of_view >= 2 * np.pi - 1e-6
-        return np.linspace(-self.field_of_view / 2, self.field_of_view / 2, self.rays, endpoint=not whole)
-
-
-def scan(
-    scanner: Scanner,
-    scene: Scene,
-    pose: jax.Array,
-    twist: jax.Array,
-    key: jax.Array,
-    field: DistanceField | None = None,
-) -> jax.Array:
-    """Distances (rays,) [m] of one scan; inf where nothing returns.
+def sent_from(pose: jax.Array, twist: jax.Array, rays: int, period: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """x, y [m] and yaw [rad], each (rays,), of a moving scanner when each ray of a scan was sent; the first is oldest.
 
     Args:
-        scanner: static.
-        scene: its boxes, solids and walls; they stand still during the scan.
-        pose: (3,) x [m], y [m], yaw [rad] of the scanner when the scan ends.
-        twist: (3,) its speed ahead and to the left [m/s] and its yaw rate [rad/s]; zero freezes it during the scan.
-        key: of noise and dropouts.
-        field: of a map without straight walls.
+        pose: (3,) x [m], y [m], yaw [rad] when the scan ends.
+        twist: (2,) the scanner's speed ahead [m/s] and its yaw rate [rad/s].
+        rays: number of rays.
+        period: duration of the scan [s]; 0 is a scan at one moment.
     """
-    # The scanner's own motion, back from the end of the scan to when each ray was sent.
-    age = scanner.period * (1.0 - (jnp.arange(scanner.rays) + 1.0) / scanner.rays)
-    yaw = pose[2] - twist[2] * age
-    middle = pose[2] - twist[2] * age / 2
-    x = pose[0] - age * (twist[0] * jnp.cos(middle) - twist[1] * jnp.sin(middle))
-    y = pose[1] - age * (twist[0] * jnp.sin(middle) + twist[1] * jnp.cos(middle))
-    distance = first_hits(scene, x, y, yaw + jnp.asarray(scanner.angles(), jnp.float32), scanner.height, field,
-                          scanner.farthest)
+    age = period * (1.0 - (jnp.arange(rays) + 1.0) / rays)
+    middle = pose[2] - twist[1] * age / 2  # an arc is left in the direction of its middle
+    back = age * twist[0]
+    return pose[0] - back * jnp.cos(middle), pose[1] - back * jnp.sin(middle), pose[2] - twist[1] * age
+
+
+def disturbed(
+    distance: jax.Array, key: jax.Array, noise: float, dropouts: float, nearest: float, reach: float
+) -> jax.Array:
+    """Distances (R,) [m] as a scanner reports them, at most `reach`, which also stands for no return.
+
+    Args:
+        distance: (R,) true ones.
+        key: of noise and dropouts.
+        noise: standard deviation [m].
+        dropouts: share of rays without a return.
+        nearest: shorter distances give no return [m].
+        reach: largest distance [m].
+    """
     noise_key, drop_key = jax.random.split(key)
-    measured = distance + scanner.noise * jax.random.normal(noise_key, distance.shape)
-    lost = jax.random.uniform(drop_key, distance.shape) < scanner.dropouts
-    lost |= (distance < scanner.nearest) | (distance > scanner.farthest)
-    return jnp.where(lost, jnp.inf, measured)
+    measured = distance + noise * jax.random.normal(noise_key, distance.shape)
+    lost = (jax.random.uniform(drop_key, distance.shape) < dropouts) | (distance < nearest) | (distance > reach)
+    return jnp.where(lost, reach, jnp.clip(measured, 0.0, reach))
 
 
 def first_hits(

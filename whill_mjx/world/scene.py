@@ -6,6 +6,7 @@ World frame: x forward along the course, y left, z up, ground at z = 0. Lengths 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -90,6 +91,9 @@ class Scene:
     solids: Solids | None = None  # seen; rounds collide, blocks do not
     finish: Finish | None = None  # textures, lamps and fog
     walls: MapWalls | None = struct.field(pytree_node=False, default=None)  # of a map: seen and hit
+    ghosts: Boxes | None = None  # upright boxes that are seen, but nothing collides with them
+    hidden: jax.Array | None = None  # (P,) bool: boxes that are hit but not seen, for something else shows them
+    rich: Any = None  # materials, lights and film of `whill_mjx.world.rich`; they replace colours, looks and finish
 
 
 def default_looks() -> Looks:

@@ -20,8 +20,8 @@ class Reach:
 
     passing: float = 0.45
     """Clearance on the way: half the vehicle's width and some room."""
-    standing: float = 0.75
-    """Clearance at start and goal: the vehicle can turn on the spot."""
+    standing: float = 0.95
+    """Clearance at start and goal: the farthest corner of a WHILL Model CR from its driven axle, and some room."""
     nearest: float = 3.0
     """Shortest way from start to goal."""
     farthest: float = 12.0

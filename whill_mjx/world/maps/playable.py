@@ -5,12 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from whill_mjx.world.maps.footprints import load_footprints
 from whill_mjx.world.maps.grid import GridMap
+from whill_mjx.world.maps.nav2 import load_map
 from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
 from whill_mjx.world.maps.walls import map_walls
@@ -35,7 +38,17 @@ class MapScene:
     places: Places
 
 
-def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 48, seed: int = 0) -> MapScene:
+def read_map(path: str | Path, cell: float = 0.1) -> GridMap:
+    """Occupancy grid of a map of any known kind, by the ending of its name; footprints get cells of `cell` [m]."""
+    ending = Path(path).suffix.lower()
+    if ending in (".osm", ".gml", ".xml"):
+        return load_footprints(path, cell)
+    if ending in (".yaml", ".yml"):
+        return load_map(path)
+    raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml). Give one of them.")
+
+
+def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, seed: int = 0) -> MapScene:
     """Walls and places of a grid.
 
     Args:
@@ -60,9 +73,10 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 48, se
 
 def map_scene_sampler(made: MapScene) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:
     """Function of a key that draws the scene and the start (3,) [m, m, rad] of an episode; pure, of one instance."""
-    start, goal = jnp.asarray(made.places.start, jnp.float32), jnp.asarray(made.places.goal, jnp.float32)
+    starts, goals = made.places.start.astype(np.float32), made.places.goal.astype(np.float32)
 
     def sample(key: jax.Array) -> tuple[Scene, jax.Array]:
+        start, goal = jnp.asarray(starts), jnp.asarray(goals)
         which, turn = jax.random.split(key)
         pair = jax.random.randint(which, (), 0, start.shape[0])
         begin = start[pair].at[2].add(jax.random.uniform(turn, minval=-TURNED, maxval=TURNED))

@@ -15,8 +15,8 @@ from whill_mjx.world.maps.grid import FREE, OCCUPIED, GridMap, wall_segments
 NARROW = 3
 """Cells: a streak or speck has to be this wide to count."""
 DEVIATION = 1.42
-"""Cells: largest distance of the outline of cells from its straight wall. The corners of the cells along a straight line
-lie in a band of sqrt(2) cells at most, whatever its direction."""
+"""Cells: largest distance of the outline of cells from its straight wall. The corners of the cells along a straight
+line lie in a band of sqrt(2) cells at most, whatever its direction."""
 
 
 def open_space(grid: GridMap) -> np.ndarray:

@@ -112,7 +112,7 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     return dataclasses.replace(scene, boxes=boxes)
 
 
-def map_walls(segments: np.ndarray, keep: int = 48, height: float = 2.2) -> MapWalls:
+def map_walls(segments: np.ndarray, keep: int = 64, height: float = 2.2) -> MapWalls:
     """Walls (S, 2, 2) [m] of a map, of which an image shows `keep` at most, with the lists of those within reach.
 
     A list holds every wall within `NEAR` of any place in its square; the lists are as long as the longest of them.
