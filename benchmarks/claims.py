@@ -980,6 +980,23 @@ CLAIMS = (
             ("sentences over 35 words in README and docs", "{sentences_over_35_words}"),
         ),
     ),
+    Claim(
+        "The code itself",
+        "Nothing lost, nothing silent",
+        "reliability",
+        "Damaged files, mistaken commands, kills and Ctrl-C at random moments; each count should be 0.",
+        ("figure", "value", "of"),
+        (
+            ("damaged files: undocumented exceptions", "{fuzz_undocumented}", "{fuzz_undocumented|.readers} readers"),
+            ("damaged files: hangs", "{fuzz_hangs}", "{fuzz_hangs|.readers} readers"),
+            ("damaged files: more than 500 MB", "{fuzz_memory}", "{fuzz_memory|.readers} readers"),
+            ("mistaken commands: tracebacks", "{option_tracebacks}", "{option_tracebacks|.command_lines} lines"),
+            ("kills: work lost beyond a minute", "{kills_lost}", "{kills_lost|.kills} kills"),
+            ("kills: other bits in the end", "{kills_different}", "{kills_different|.kills} kills"),
+            ("kills: half-written files", "{kills_half_written}", "{kills_half_written|.kills} kills"),
+            ("Ctrl-C to exit, 95 % [s]", "{ctrl_c_p95_s}", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
+        ),
+    ),
     # Bridge
     Claim(
         BRIDGE,

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 
+from benchmarks import kept
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
 from benchmarks.undeclared_plant import capped, power_sizes
@@ -138,9 +138,9 @@ def ready_vehicle(work: Path, reference: int) -> Prepared:
         ready = prepared(work, reference, USUAL, LoopConfig())
         temporary = path.with_name(f"{path.name}.{os.getpid()}")
         params = jax.tree.map(np.asarray, ready.reference.params)  # arrays that any version reads
-        temporary.write_bytes(pickle.dumps((replace(ready.reference, params=params), ready.wander)))
+        temporary.write_bytes(kept.dumps((replace(ready.reference, params=params), ready.wander)))
         os.replace(temporary, path)
-    fitted, wander = pickle.loads(path.read_bytes())
+    fitted, wander = kept.loads(path.read_bytes())
     spec = reference_days(work, USUAL, reference)[0].spec
     found = hypotheses(spec, fitted.params)
     full = with_catalogue(fitted.params, found)

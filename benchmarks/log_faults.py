@@ -66,7 +66,7 @@ def healthy(random: Random, turning: float = 0.0, whole: bool = False) -> Robot:
     """
     name = str(random.choice(["chair", *SIMULATED]))
     able = [drive for drive in bases()[name] if _turned(drive) >= turning]
-    chosen = [able[i] for i in random.choice(len(able), min(random.integers(1, 5), len(able)), replace=False)]
+    chosen = [able[i] for i in random.choice(len(able), min(int(random.integers(1, 5)), len(able)), replace=False)]
     size, speed = np.exp(random.uniform(np.log(0.3), np.log(2.5))), np.exp(random.uniform(np.log(0.6), np.log(1.6)))
     side = random.choice([-1.0, 1.0])
     rates = {"command": random.choice([0.0, 5.0, 10.0, 20.0]), "odometry": random.choice([10.0, 20.0, 30.0, 50.0]),

@@ -64,7 +64,7 @@ def damaged_files(count: int) -> Figures:
     """Readers that let out another exception, hang or need too much, of `count` damaged files each."""
     rooms = ("whill_mjx/test_damaged_files.py", "bridge/test_damaged_policy_files.py")
     apart = ("sysid/test_damaged_logs.py",), ("dreamer/test_damaged_policies.py",)  # each room has a conftest
-    cases, failed = 0, []
+    cases, failed = 0, list[str]()
     for room in (rooms, *apart):
         more, messages = tested([f"tests/{path}" for path in room], DAMAGED_FILES=str(count))
         cases, failed = cases + more, failed + messages

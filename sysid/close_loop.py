@@ -94,6 +94,9 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
     check_logs(log, references)
+    for path, other in zip(arguments.reference, references, strict=True):
+        if other.sha256 == log.sha256:
+            raise ValueError(f"--reference {path}: has the drives in question themselves. Give drives of other days.")
     vehicle = None
     if arguments.vehicle is not None:
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")

@@ -78,8 +78,9 @@ def main(config: DesignConfig) -> list[Path]:
         min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
         float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
         config.seconds)
-    chosen, plans, space, before = propose(spec, params, limits, noise, config.channels, intervals, config.criterion,
-                                           config.count, config.parameters or None)
+    with refusing():
+        chosen, plans, space, before = propose(spec, params, limits, noise, config.channels, intervals,
+                                               config.criterion, config.count, config.parameters or None)
     paths = []
     for number, plan in enumerate(chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")

@@ -62,11 +62,19 @@ def main(arguments: Arguments) -> None:
         if arguments.close_loop and arguments.model:
             raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
                              "model. Leave one of the two out.")
+        if arguments.reference and not arguments.close_loop:
+            raise ValueError("--reference: only --close-loop asks for drives of other days. Add it or leave this out.")
+        if arguments.wheels and not arguments.model:
+            raise ValueError("--wheels: only a --model has joints or actuators to name. Add it or leave this out.")
         settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
         log = load_any(arguments.dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
         check_storage(settings)
         model = check_settings(log, settings)
         references = [load_any(path) for path in arguments.reference]
+        if arguments.close_loop:
+            from sysid.verdict.pipeline import check_logs
+
+            check_logs(log, references)
     chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
               "chained": arguments.chained, **settings_of(settings)}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):

@@ -71,7 +71,7 @@ def main(arguments: Arguments) -> list[Trace]:
         log = load_any(arguments.dataset)
         config = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
         check_settings(log, config)
-    with claim_folder(arguments.out, KIND, OUTPUTS) as claim:
+    with claim_folder(arguments.out, "sysid.searches", OUTPUTS) as claim:
         claim.settle({})  # timings are made anew
         return compare(arguments, log, make_problem(log, config))
 

@@ -72,6 +72,8 @@ def mistakes(tmp_path_factory):
     (folder / "training" / "run.json").write_text('{"kind": "whill_mjx.train", "identity": {"seed": 0}}')
     (folder / "model.txt").write_text("")
     (folder / "other.py").write_text("x = 1\n")
+    (folder / "broken.py").write_text("def model(:\n")
+    (folder / "exits.py").write_text("import sys; sys.exit(3)\n")
     return folder
 
 
@@ -105,6 +107,11 @@ def mistakes(tmp_path_factory):
     ("fit", "data --storage nope --method tpe", "storage 'nope' is neither"),
     ("fit", "data --storage journal:a.log", "--storage journal:a.log: --method features has no global search"),
     ("fit", "data --close-loop --reference nowhere", "nowhere"),
+    ("fit", "data --reference data", "--reference: only --close-loop asks for drives of other days"),
+    ("fit", "data --wheels left right", "--wheels: only a --model has joints"),
+    ("fit", "data --model exits.py", "exits.py: ends in SystemExit when it is run (3)"),
+    ("fit", "data --model broken.py", "broken.py: ends in SyntaxError when it is run"),
+    ("close_loop", "data --reference data", "--reference data: has the drives in question themselves"),
     ("fit", "data --out file", "--out file: is a file, not a folder"),
     ("fit", "data --out file/new", "file is a file, not a folder"),
     ("fit", "data --out mine", "--out mine: holds vehicle.toml of something else"),

@@ -238,9 +238,9 @@ def make_driver(source: str, policy: PolicyFile | None, course: Course, options:
     if source == "random":
         return random_driver(course.env.task.action_repeat)
     policy = policy or load_policy(find_policy(source), options.runtime)
-    task, shown = course.env.task, {name: sensor.reading(course.env).shape for name, sensor in course.env.sensors}
-    wanted = policy.observation or (policy.height, policy.width, 3)
-    shown = shown or (course.env.height, course.env.width, 3)
+    task, sensors = course.env.task, {name: sensor.reading(course.env).shape for name, sensor in course.env.sensors}
+    wanted: Any = policy.observation or (policy.height, policy.width, 3)
+    shown: Any = sensors or (course.env.height, course.env.width, 3)
     if wanted != shown:
         raise ValueError(f"{policy.path}: observes {wanted}, but the task shows {shown}. Evaluate it on its own "
                          "task.")

@@ -162,7 +162,7 @@ def _to_host(leaf: Any) -> Any:
 
 
 def _from_host(leaf: Any) -> Any:
-    return jax.random.wrap_key_data(leaf.data) if isinstance(leaf, _Key) else jax.numpy.asarray(leaf)
+    return jax.random.wrap_key_data(jax.numpy.asarray(leaf.data)) if isinstance(leaf, _Key) else jax.numpy.asarray(leaf)
 
 
 def _info(metrics: dict[str, jax.Array]) -> dict[str, Any]:

@@ -124,14 +124,13 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated = np.array(self._step.terminated), np.array(self._step.truncated)
         ended = terminated | truncated
         self._ended = ended.copy()
+        obs, now = self._observed(self._step)
         if self.autoreset_mode != AutoresetMode.SAME_STEP or not ended.any():
-            obs, info = self._observed(self._step)
-            return obs, reward, terminated, truncated, info
-        final_obs, final = self._observed(self._step)
+            return obs, reward, terminated, truncated, now
         info: dict[str, Any] = {}
         for index in np.flatnonzero(ended):
-            last = jax.tree.map(lambda leaf, index=index: leaf[index], final_obs)
-            told = {name: value[index].item() for name, value in final.items() if not name.startswith("_")}
+            last = jax.tree.map(lambda leaf, index=index: leaf[index], obs)
+            told = {name: value[index].item() for name, value in now.items() if not name.startswith("_")}
             info = self._add_info(info, {"final_obs": last, "final_info": told}, int(index))
         self._state, self._step = self._kind.restart(self._state, self._step, ended, self._origins(None, ended))
         obs, now = self._observed(self._step)
@@ -153,8 +152,8 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
             if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
                 raise ValueError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; it must be ({count},) bool "
                                  "with at least one True.")
-        if seed is None or np.isscalar(seed):
-            seeds = [None if seed is None else seed + index for index in range(count)]
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + index for index in range(count)]
         else:
             seeds = list(seed)
         if len(seeds) != count:

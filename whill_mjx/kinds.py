@@ -173,7 +173,7 @@ def space_of(env: Any) -> gymnasium.Space:
     """Observation space of an environment: a box of bytes, or a dict of the sensors' boxes."""
     if not env.sensors:
         return gymnasium.spaces.Box(0, 255, (env.height, env.width, 3), np.uint8)
-    boxes = {}
+    boxes: dict[str, gymnasium.Space] = {}
     for name, sensor in env.sensors:
         reading = sensor.reading(env)
         boxes[name] = gymnasium.spaces.Box(reading.low, reading.high, reading.shape, reading.dtype)

@@ -40,8 +40,8 @@ SPELLED = {
 STREAM_WORDS = {
     "command": ("cmd", "command", "commands", "commanded", "desired", "des", "ref", "reference", "setpoint", "target",
                 "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested"),
-    "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc", "fb",
-                 "reported"),
+    "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc",
+                 "fb", "reported"),
     "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
                      "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
 }
@@ -146,8 +146,9 @@ def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndar
     """Poses of which no name says whether they are odometry's are so where they begin at the origin, as odometry does;
     elsewhere nobody can know."""
     roles = {one.role for one in found}
+    words = set(STREAM_WORDS["odometry"])
     nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw") and one.why
-                and not _stream_said(one.name, "odometry") and not set(_words(one.file)) & set(STREAM_WORDS["odometry"])]
+                and not _stream_said(one.name, "odometry") and not set(_words(one.file)) & words]
     if not nameless or {"odometry.v", "odometry.omega"} & roles:
         return found
     starts = [arrays[one.file, one.name] for one in nameless]
@@ -160,8 +161,8 @@ def _by_name(table: Table, name: str) -> Column | None:
     plain, unit = _split_unit(name)
     words = _words(plain)
     joined = "".join(words)
-    if not words or NOT_PLANAR & set(words[-2:]) and not re.search(r"(angular|gyro|rate|orientation|quat\w*|rotation)z$",
-                                                                   joined):
+    turns = re.search(r"(angular|gyro|rate|orientation|quat\w*|rotation)z$", joined)
+    if not words or NOT_PLANAR & set(words[-2:]) and not turns:
         return None
     stamp_part = words[-1] in ("secs", "sec", "nsecs", "nsec", "nanosec")
     if (set(words) & set(TIME_WORDS) and not set(words[-1:]) & {"x", "y", "z", "w"} or stamp_part
@@ -181,7 +182,8 @@ def _by_name(table: Table, name: str) -> Column | None:
 
 def _quantity(words: list[str]) -> str | None:
     text = " ".join(words)
-    side = "left" if {"left", "l", "lw", "wl"} & set(words) else "right" if {"right", "r", "rw", "wr"} & set(words) else ""
+    sides = {"left": {"left", "l", "lw", "wl"}, "right": {"right", "r", "rw", "wr"}}
+    side = next((one for one, known in sides.items() if known & set(words)), "")
     if side and re.search(r"^\w+$|wheel|motor|joint|\bw\b|vel|speed|rpm|enc|angle|pos|\blw\b|\brw\b|omega|cmd", text):
         angle = re.search(r"angle|pos|position|enc(oder)?$|ticks", text) and not re.search(r"vel|speed|rpm", text)
         return f"{side}_angle" if angle else side
@@ -195,7 +197,8 @@ def _quantity(words: list[str]) -> str | None:
     joined = "".join(words)
     for quantity, known in QUANTITY_WORDS.items():
         if last in known or joined in known or any(joined.endswith(one) for one in known if len(one) > 4):
-            return "omega" if quantity in ("yaw", "v") and re.search(r"yaw ?rate|yaw (vel|speed|rate)|ang", text) else quantity
+            rate = quantity in ("yaw", "v") and re.search(r"yaw ?rate|yaw (vel|speed|rate)|ang", text)
+            return "omega" if rate else quantity
     for quantity, known in QUANTITY_WORDS.items():
         if set(words) & {one for one in known if len(one) > 1}:
             return quantity
@@ -319,7 +322,8 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
         parts = [signal(f"{stream}.{one}") for one in ("qw", "qx", "qy", "qz")]
         if all(part is not None for part in parts) and len({len(part[0]) for part in parts if part}) == 1:
             w, x, y, z = (part[1] for part in parts if part)
-            headings[stream] = parts[0][0], np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+            t = next(part[0] for part in parts if part)
+            headings[stream] = t, np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
         elif yaw := signal(f"{stream}.yaw"):
             headings[stream] = yaw[0], np.unwrap(yaw[1])
     ways = {stream: _way(signal(f"{stream}.x"), signal(f"{stream}.y")) for stream in ("odometry", "ground_truth")}
@@ -327,17 +331,17 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
              for stream in ("odometry", "ground_truth")}
     settle("odometry.v", _first(ways["odometry"], ways["ground_truth"]), "as the pose moves")
     settle("odometry.omega", _first(turns["odometry"], turns["ground_truth"]), "as the pose turns")
-    settle("command.v", _first(signal("odometry.v"), ways["odometry"], ways["ground_truth"]), "as the vehicle moves", 0.5)
-    settle("command.omega", _first(signal("odometry.omega"), turns["odometry"], turns["ground_truth"]),
-           "as the vehicle turns", 0.5)
+    for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
+        measured = _first(signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
+        settle(f"command.{role}", measured, why, 0.5)
     settled = []
     for one in found:
         one = known.get(one.role, one) if one.role != "time" else one
-        kind = UNITS["speed"] | UNITS["rate"] if one.role.rpartition(".")[2] in ("left", "right") else UNITS[kind_of(one.role)]
+        wheel = one.role.rpartition(".")[2] in ("left", "right")
+        kind = UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(one.role)]
         if one.unit not in kind:  # nothing shows it: SI, if that is at all possible
             values = arrays[one.file, one.name]
             usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
-            wheel = one.role.rpartition(".")[2] in ("left", "right")  # small ones turn fast
             largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
             first = next(iter(UNITS[kind_of(one.role)]))
             one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest)

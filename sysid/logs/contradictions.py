@@ -245,12 +245,12 @@ def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
     found = [shares for trial in trials if (shares := _empty_shares(trial)) is not None]
     if not found:
         return []
-    shares = [float(np.median(known)) if (known := [one[k] for one in found if np.isfinite(one[k])]) else 0.0
-              for k in (0, 1)]
-    empty = [name for name, share in zip(("v", "omega"), shares, strict=True) if share > EMPTY]
+    usual = [float(np.median(known)) if (known := [one[k] for one in found if np.isfinite(one[k])]) else 0.0
+             for k in (0, 1)]
+    empty = [name for name, share in zip(("v", "omega"), usual, strict=True) if share > EMPTY]
     if not empty:
         return []
-    how = "all zero" if max(shares) > 0.95 else f"zero in {max(shares):.0%} of that time"
+    how = "all zero" if max(usual) > 0.95 else f"zero in {max(usual):.0%} of that time"
     return [f"odometry: its pose moves with the commands, but its speeds {' and '.join(empty)} are {how}: the driver "
             "does not fill the twist. Compute v and omega from the pose, or record a topic that has them."]
 

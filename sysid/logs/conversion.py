@@ -16,7 +16,7 @@ from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.rosbag import PACKED, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.text_files import integrate_speeds, read_drives, text_files
 from whill_mjx.io.command_line import Range
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -56,8 +56,8 @@ class ConvertConfig:
     truth_turned: Annotated[float, Range(-360, 360)] = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     input: Literal["auto", "commands", "wheels"] = "auto"
-    """What drives the model: commands, or measured wheel speeds (of joint states or odometry) in their place; auto takes
-    the latter where no recording has commands."""
+    """What drives the model: commands, or measured wheel speeds (of joint states or odometry); auto takes the latter
+    where no recording has commands."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
@@ -103,8 +103,8 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
     """
     if not config.source.exists():
-        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of one of them, "
-                                "or a measured set.")
+        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of them, or a "
+                                "measured set.")
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
@@ -133,7 +133,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
 
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
-        drives = [trial_drive(trial) for trial in log.trials]
+        drives = [_moved(trial_drive(trial), config.truth_ahead, config.truth_turned) for trial in log.trials]
         if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
             notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
     if not drives:
@@ -176,8 +176,8 @@ def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive],
     found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
-        raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert those "
-                         "without commands into a dataset of their own.")
+        raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
+                         "those without into a dataset of their own.")
     decided = list(dict.fromkeys(str(column) for one in found for column in one.columns))
     for one in found:
         source = Source(config.source, {column.role.partition(".")[0]: column.file for column in one.columns})
@@ -244,8 +244,9 @@ def _recording_name(path: Path) -> str:
     """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
     if not path.is_file():
         return path.name
-    alone = path.stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
-    return path.absolute().parent.name if alone else path.stem
+    stem = Path(path.stem).stem if path.suffix in PACKED else path.stem
+    alone = stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
+    return path.absolute().parent.name if alone else stem
 
 
 def cut(
@@ -337,6 +338,18 @@ def trial_drive(trial: Trial) -> Drive:
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
 
 
+def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
+    """The drive with its outside pose at the drive-axle centre and along the vehicle, as of `cut`."""
+    if drive.ground_truth is None or ahead == turned == 0.0:
+        return drive
+    truth = drive.ground_truth.copy()
+    truth[:, 3] -= np.deg2rad(turned)
+    truth[:, 1] -= ahead * np.cos(truth[:, 3])
+    truth[:, 2] -= ahead * np.sin(truth[:, 3])
+    truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
+    return replace(drive, ground_truth=truth)
+
+
 def write_dataset(
     folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
     more: Mapping[str, Any] | None = None,
@@ -367,8 +380,8 @@ def write_dataset(
     if known and any((folder / "trials").glob("*")):
         log = load_log(folder)  # trials are not added to what cannot be loaded
         if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
-            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, which that of the new trials "
-                             "is not. Choose another --out.")
+            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
+                             "trials is another. Choose another --out.")
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
         accepted, refused = _write_accepted(partial, drives)

@@ -159,9 +159,11 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
 def _gains(
     trials: Sequence[Trial], channel: str, index: int, shifts: Sequence[Mapping[str, Shift]]
 ) -> list[tuple[float, float]]:
-    """Two estimates of a measured speed (1) or yaw rate (2) over the command, each with its correlation, as medians over
-    trials: one at the delay and lag that fit best, and one at a usual delay. The first errs where commands are short
-    or periodic, the second where the vehicle follows late."""
+    """Two estimates of a measured speed (1) or yaw rate (2) over the command, each with its correlation (medians).
+
+    One is at the delay and lag that fit best, and errs where commands are short or periodic. The other is at a usual
+    delay, and errs where the vehicle follows late.
+    """
     best = [shift for one in shifts if (shift := one.get(("v", "omega")[index - 1]))]
     usual = [one for trial in trials if (one := _gain(trial, channel, index)) is not None]
     both = ([(one.gain, one.correlation) for one in best], usual)

@@ -178,7 +178,7 @@ def load_log(folder: str | Path) -> Log:
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
-        notes.append("the input is measured wheel speeds, no commands: delays, drive and limits of the vehicle do not show")
+        notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
     return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,8 @@ WHEELS = ("JointState", CHAIR_STATE, "Odometry")
 """Types of the input where wheel speeds stand for commands, the first found is taken."""
 OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic"}
 SUFFIXES = (".db3", ".mcap", ".bag")
+PACKED = (".zst", ".zstd")
+UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
 MAX_SET_BACK = 0.5  # s that a stamp may run back by before the clock counts as set
 
 
@@ -70,7 +73,8 @@ class Bag:
 
 def is_bag(path: Path) -> bool:
     """Whether a path is one recording: a folder with metadata.yaml, or a file of a known kind."""
-    return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in SUFFIXES)
+    packed = path.suffix in PACKED and Path(path.stem).suffix in SUFFIXES
+    return (path / "metadata.yaml").is_file() or (path.is_file() and (path.suffix in SUFFIXES or packed))
 
 
 def find_bags(source: Path) -> list[Path]:
@@ -95,6 +99,13 @@ def read_bag(
     Raises:
         ValueError: naming the file, the topic, the rule and the remedy.
     """
+    if path.suffix in PACKED:
+        with TemporaryDirectory() as folder:
+            unpacked = _unpacked(path, Path(folder))
+            try:
+                return replace(read_bag(unpacked, topics, geometry, wheels), path=path)
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(unpacked), str(path))) from None
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -138,17 +149,18 @@ def read_bag(
             notes.append(f"{topic}: {unset.sum()} messages with an orientation that is all zero are left out")
         if not (finite | unset).all():
             notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
-        received, stamped = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
-        if len(received) < 2:
-            raise ValueError(f"{path}: topic {topic} has {len(received)} usable messages; at least 2 are needed. Name "
+        times, stamps = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
+        if len(times) < 2:
+            raise ValueError(f"{path}: topic {topic} has {len(times)} usable messages; at least 2 are needed. Name "
                              f"another topic with {OPTIONS[stream]}, or '' to go without.")
         values = table[finite]
         if values.shape[1] != len(COLUMNS[stream]):
-            received, stamped, values = _of_wheels(stream, short_type(known[topic]), received, stamped, values, geometry)
-            if np.median(np.diff(received)) > COARSE:
-                notes.append(f"{topic}: a state each {np.median(np.diff(received)):.2g} s is coarse: delays and lags below "
-                             "that do not show. Ask the driver for 20 ms (publish_interval_ms)")
-        streams[stream] = BagStream(topic, known[topic], received, stamped, values)
+            kind = short_type(known[topic])
+            times, stamps, values = _of_wheels(stream, kind, times, stamps, values, geometry)
+            if (step := float(np.median(np.diff(times)))) > COARSE:
+                notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. "
+                             "Ask the driver for 20 ms (publish_interval_ms)")
+        streams[stream] = BagStream(topic, known[topic], times, stamps, values)
     return Bag(path, streams, notes)
 
 
@@ -162,6 +174,22 @@ def _of_wheels(
         values = chair_odometry(received, rows, *geometry)
         return received, stamped, values if stream == "odometry" else values[:, 3:]
     return received, stamped, joint_twist(received, rows, *geometry)
+
+
+def _unpacked(path: Path, folder: Path) -> Path:
+    """A packed bag, as a recorder leaves it that was killed before it wrote metadata.yaml, unpacked into a folder."""
+    from rosbags.rosbag2.reader import zstd  # the standard library's, or what stands for it in older Pythons
+
+    target = folder / path.stem
+    try:
+        with zstd.open(path, "rb") as source, target.open("wb") as out:
+            while part := source.read(1 << 20):
+                if out.tell() > UNPACKED_BYTES:
+                    raise ValueError(f"{path}: is larger than {UNPACKED_BYTES / 1e9:g} GB unpacked. Split it.")
+                out.write(part)
+    except (zstd.ZstdError, EOFError) as error:
+        raise ValueError(f"{path}: cannot be unpacked ({error}). Copy it again, or unpack it with zstd -d.") from None
+    return target
 
 
 def choose_topics(
@@ -216,12 +244,13 @@ def choose_topics(
 def _wheel_topic(path: Path, known: dict[str, str], listing: str) -> dict[str, str]:
     """The topic whose wheel speeds are the input."""
     for kind in WHEELS:
-        fitting = [name for name, one in known.items() if short_type(one) == kind and name not in TOPICS["ground_truth"]]
+        fitting = [name for name, one in known.items()
+                   if short_type(one) == kind and name not in TOPICS["ground_truth"]]
         usual = [name for name in TOPICS["odometry"] if name in fitting]
         if len(fitting) == 1 or usual:
             return {"command": (usual or fitting)[0]}
-    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState or an "
-                     "Odometry with --command-topic.")
+    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState "
+                     "or an Odometry with --command-topic.")
 
 
 def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:

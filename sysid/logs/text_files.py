@@ -94,8 +94,7 @@ def read_table(path: Path) -> Table:
         rows = rows[:-1]  # a recorder that was stopped
     for (number, _), row in zip(data, rows, strict=False):
         if len(row) != width:
-            raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save the table again, "
-                             "with decimal points.")
+            raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save it again.")
     if len(rows) < LEAST:
         raise ValueError(f"{path}: {len(rows)} rows; at least {LEAST} are needed. Give the whole recording.")
     numbers = {}
@@ -171,15 +170,17 @@ def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple
         names = [f"{table.stem}/{name}" for table in tables for name in table.columns]
         listed = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
         guessed = " ".join(f"'{one}'" for one in columns) or "nothing"
-        raise ValueError(f"{source}: {problem} Its columns are {listed}; guessed: {guessed}. Give --columns with what is "
-                         "right of this and what is missing, each as ROLE=COLUMN:UNIT; see docs/sysid_tools.md.")
+        raise ValueError(f"{source}: {problem} Its columns are {listed}; guessed: {guessed}. Give --columns with what "
+                         "differs and what is missing, each as ROLE=COLUMN:UNIT; see docs/sysid_tools.md.")
     return columns, list(said)
 
 
 def _is_here(text: str, tables: Sequence[Table]) -> bool:
+    """Whether a decision is of one of these files; one without a known column is, so that it is refused."""
     rest = text.partition("=")[2].strip()
-    return any(rest.startswith((f"{table.stem}/{name}", name)) for table in tables for name in table.columns) or not any(
-        "/" in rest and rest.split("/")[0] != table.stem for table in tables)
+    if any(rest.startswith((f"{table.stem}/{name}", name)) for table in tables for name in table.columns):
+        return True
+    return all("/" not in rest or rest.split("/")[0] == table.stem for table in tables)
 
 
 def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
@@ -245,8 +246,8 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
         else:
             notes.append("the outside pose has no heading and is left out")
     if not {"odometry", "ground_truth"} & set(made):
-        raise ValueError(f"{source}: {name} has {'wheel speeds' if measured_input else 'commands'} and nothing to compare "
-                         "their motion with. Add an outside pose, or commands beside the wheel speeds.")
+        raise ValueError(f"{source}: {name} has {'wheel speeds' if measured_input else 'commands'} and nothing to "
+                         "compare their motion with. Add an outside pose, or commands beside the wheel speeds.")
     begin, end = max(one[0, 0] for one in made.values()), min(one[-1, 0] for one in made.values())
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())

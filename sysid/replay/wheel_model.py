@@ -17,8 +17,8 @@ from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams
 
 DT = 0.01  # s
-NOTE = ("the log has no commands: measured wheel speeds are the input. Radius and track are effective ones, slip and scrub "
-        "included; drive, delays of commands and their scale are left out")
+NOTE = ("the log has no commands: measured wheel speeds are the input. Radius and track are effective ones, slip and "
+        "scrub included; drive, delays of commands and their scale are left out")
 
 
 def wheel_model(spec: VehicleSpec) -> Model:
@@ -45,7 +45,8 @@ def wheel_model(spec: VehicleSpec) -> Model:
                           yaw + DT * omega, command[0], command[1]])
 
     model = function_model(step, {
-        "radius": (nominal_radius, 0.5 * nominal_radius, 2 * nominal_radius, "m"), "radius_difference": (0.0, -0.2, 0.2),
+        "radius": (nominal_radius, 0.5 * nominal_radius, 2 * nominal_radius, "m"),
+        "radius_difference": (0.0, -0.2, 0.2),
         "track": (nominal_track, 0.5 * nominal_track, 5 * nominal_track, "m"), "ahead": (0.0, -reach, reach, "m"),
         "left": (0.0, -reach, reach, "m")}, dt=DT, name=f"{spec.name} on measured wheels")
     late = with_effects(VehicleParams(Body(), ()), ("pose_delay",)).effects

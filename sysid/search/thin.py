@@ -18,7 +18,8 @@ HIDDEN = {
     "no outside pose": ("slip_traction.", "axle_pivot.", "lateral_damping."),
     "no turn": ("body.yaw_inertia", "body.com_y", "yaw_scrub.", "lateral_damping.", "axle_pivot.",
                 "slip_traction.side_slip_speed", "slip_traction.mu_free", "track_width."),
-    "no straight motion": ("rolling_resistance.", "slip_traction.slip_speed", "suspension.", "body.com_x", "body.com_z"),
+    "no straight motion": ("rolling_resistance.", "slip_traction.slip_speed", "suspension.", "body.com_x",
+                           "body.com_z"),
 }
 """Cause -> parameters, or beginnings of their names, that it hides."""
 REMEDIES = {"no outside pose": "log motion capture, lidar or RTK", "no turn": "turn on the spot and drive circles",
@@ -45,10 +46,11 @@ def check_moves(log: Log) -> None:
         command = trial.command
         moving = (abs(command.v) > DRIVES) | (abs(command.omega) > TURNS)
         ends = [*command.t[1:], max(trial.duration, float(command.t[-1]))]
-        seconds += float(sum(max(end - begin, 0.0) for begin, end, one in zip(command.t, ends, moving, strict=True) if one))
+        seconds += float(sum(max(end - begin, 0.0) for begin, end, one in zip(
+            command.t, ends, moving, strict=True) if one))
     if log.training and seconds < LEAST_SECONDS:
-        raise ValueError(f"log {log.name!r}: its training trials are commanded to move for {seconds:.1f} s in all, which "
-                         f"determines nothing. Record drives of {LEAST_SECONDS:g} s and more; sysid.inspect says which.")
+        raise ValueError(f"log {log.name!r}: its training trials are commanded to move for {seconds:.1f} s in all, "
+                         "which determines nothing. Record longer drives; sysid.inspect says which.")
 
 
 def without_hidden(space: Space, log: Log, asked: Sequence[str] = ()) -> Space:

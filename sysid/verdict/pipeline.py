@@ -102,6 +102,10 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
 
 def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
     """Raise ValueError for logs in which nothing can be found."""
+    for one in (log, *references):
+        if one.fields.get("input") == "wheels":
+            raise ValueError(f"log {one.name!r}: its input is measured wheel speeds; what a vehicle lacks shows after "
+                             "commands only. Record them, or fit the wheels with python -m sysid.fit.")
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):

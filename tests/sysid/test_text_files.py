@@ -84,12 +84,13 @@ def test_columns_are_found_by_their_names_and_units_by_names_or_numbers(tmp_path
 
 def test_files_of_one_drive_are_joined_by_time_and_the_decision_is_written_and_can_be_repeated(tmp_path):
     c, folder = columns(), tmp_path / "monday"
+    turn, seen = quaternion(c["yaw"]), quaternion(c["gyaw"])
     write(folder / "cmd_vel.csv", {"%time": 1e9 * (T0 + c["t"]), "field.linear.x": c["cv"], "field.angular.z": c["cw"]})
     write(folder / "odom.csv", {"header.stamp.secs": np.floor(T0 + c["t"]), "header.stamp.nsecs": 1e9 * (c["t"] % 1),
                                 "pose.pose.position.x": c["x"], "pose.pose.position.y": c["y"],
-                                **{f"pose.pose.orientation.{name[1]}": one for name, one in quaternion(c["yaw"]).items()},
+                                **{f"pose.pose.orientation.{name[1]}": one for name, one in turn.items()},
                                 "twist.twist.linear.x": c["v"], "twist.twist.angular.z": c["w"]})
-    write(folder / "mocap.tum", {"t": T0 + c["t"], "x": c["gx"], "y": c["gy"], "z": 0 * c["gx"], **quaternion(c["gyaw"])},
+    write(folder / "mocap.tum", {"t": T0 + c["t"], "x": c["gx"], "y": c["gy"], "z": 0 * c["gx"], **seen},
           separator=" ", header=False)
     log, notes = convert(ConvertConfig(folder, tmp_path / "log"))
     check(log.trials[0])
@@ -132,8 +133,8 @@ def of_unknown_origin(c):
     (unnamed, "no column is surely a command, .*Its columns are drive/a, drive/b.*Give --columns"),
     (of_unknown_origin, "not clear what drive/x, drive/y, drive/yaw are.*guessed: .*'odometry.x=drive/x:m'.*--columns"),
     (lambda c: {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"]}, "neither odometry .* nor an outside pose"),
-    (lambda c: {"cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]}, "no column of drive is surely its "
-                                                                                         "time"),
+    (lambda c: {"cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]},
+     "no column of drive is surely its time"),
 ])
 def test_without_a_sure_guess_one_line_names_columns_guess_and_flags_and_nothing_is_written(tmp_path, names, said):
     path = write(tmp_path / "drive.csv", names(columns()))
@@ -182,8 +183,8 @@ def test_states_of_the_chair_become_the_odometry_that_the_bridge_makes_of_them(p
 
 
 def test_wheels_among_joints_are_found_by_their_names():
-    state = SimpleNamespace(name=["arm_left_joint", "front_left_wheel", "rear_left_wheel", "right_wheel", "caster_wheel"],
-                            position=[9.0, 1.0, 1.2, 2.0, 7.0], velocity=[])
+    names = ["arm_left_joint", "front_left_wheel", "rear_left_wheel", "right_wheel", "caster_wheel"]
+    state = SimpleNamespace(name=names, position=[9.0, 1.0, 1.2, 2.0, 7.0], velocity=[])
     row = joint_row(state)
     assert row[:2] == pytest.approx((1.1, 2.0)) and np.isnan(row[2:]).all()
     assert np.isinf(joint_row(SimpleNamespace(name=["a", "b"], position=[0.0, 0.0], velocity=[]))).all()

@@ -256,7 +256,7 @@ def functional_env(
         if not targets:
             return transition
         known = jax.vmap(lambda one: privileged.truth(batch.env, one))(state.env)
-        seen = step.obs if batch.env.sensors else {"camera": step.obs}
+        seen: Any = step.obs if batch.env.sensors else {"camera": step.obs}
         return dataclasses.replace(transition, obs={**seen, TRUTH: known})
 
     def reset(key: jax.Array) -> tuple[Any, Transition]:
