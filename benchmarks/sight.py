@@ -21,6 +21,7 @@ import tyro
 from benchmarks.harness import device_name, figure, record, time_calls
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import RICH, Env, State, make_env, reset_state
+from whill_mjx.evaluation.novelty import SETTLED
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.world.render import pinhole, render
 from whill_mjx.world.render.pallas import render_pallas
@@ -44,6 +45,8 @@ class Options:
     """Files that `benchmarks.foreign` wrote."""
     runs: tuple[str, ...] = ()
     """Folders of trainings."""
+    stops: tuple[str, ...] = ()
+    """NAME=NAT: surprise at which a policy stops for good; the same drives are counted once more with that stop."""
     device: str = ""
     """Device on which those drives or trainings ran; none says this one."""
 
@@ -111,13 +114,18 @@ def steps(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
 def foreign(options: Options) -> dict[str, dict[str, Any]]:
     """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians."""
     drives = [one for path in options.drives for one in json.loads(path.read_text())["drives"]]
+    stops = {name: float(nat) for name, nat in (text.split("=", 1) for text in options.stops)}
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in drives:
         groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
+        if one["driver"] == "policy" and one["policy"] in stops:
+            surprised = max(one["novelty"][SETTLED:], default=0.0) >= stops[one["policy"]]
+            end = "stopped" if surprised else one["end"]
+            groups.setdefault((one["policy"], "with_stop", one["variant"]), []).append(end)
     found: dict[str, dict[str, Any]] = {}
     medians: dict[tuple[str, str], list[float]] = {}
     for (policy, driver, variant), ends in sorted(groups.items()):
-        for end in ("arrived", "collided"):
+        for end in ("arrived", "collided", *(["stopped"] if driver == "with_stop" else [])):
             share = ends.count(end) / len(ends)
             name = "_".join(["foreign", policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
             device = options.device or device_name()
