@@ -27,6 +27,7 @@ from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
+from whill_mjx.tasks.options import named_task
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
@@ -44,7 +45,7 @@ class Look:
     """Options of the command."""
 
     scene: str = "obstacle_course"
-    """Name of a task, gallery, or all."""
+    """Name of a task, package.module:TASK, path/to/file.py:TASK, gallery, or all."""
     out: Path = Path("look.png")
     """Picture to write, or video with the ending .mp4 or .gif."""
     layout: str = "randomised"
@@ -199,7 +200,9 @@ def _env(options: Look) -> tuple[Env, VehicleParams]:
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
-    if options.scene not in (*known, "all"):
+    if ":" in options.scene:
+        named_task(options.scene, "--scene")
+    elif options.scene not in (*known, "all"):
         raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")
     check_known("--layout", options.layout, LAYOUTS)
     if options.out.suffix not in (".png", *VIDEOS):

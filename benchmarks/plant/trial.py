@@ -68,8 +68,11 @@ class Drive:
 class Plant:
     """A chair ready to drive: its model is compiled and settled once."""
 
+    build = staticmethod(build)
+    """The model of a chair."""
+
     def __init__(self, chair: Chair, contact: Contact = SLOW) -> None:
-        self.chair, self.model = chair, build(chair, contact)
+        self.chair, self.model = chair, self.build(chair, contact)
         self.substeps = round(TICK / contact.timestep)
         self.data = mujoco.MjData(self.model)
         joint = {name: self.model.joint(name) for name in ("wheel_left", "wheel_right")}

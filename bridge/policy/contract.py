@@ -73,6 +73,18 @@ class Contract:
 
 
 @dataclass(frozen=True)
+class Commands:
+    """What the actions of an agent that drives a vehicle mean."""
+
+    low: tuple[float, float]
+    """Command at action -1: v [m/s], omega [rad/s]."""
+    high: tuple[float, float]
+    """Command at action +1."""
+    rate_hz: float
+    action_repeat: int
+
+
+@dataclass(frozen=True)
 class AgentContract:
     """What `policy.json` says about observations, action and state of an agent."""
 
@@ -86,6 +98,8 @@ class AgentContract:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     task: str
+    commands: Commands | None = None
+    """Of an agent that drives a vehicle by other sensors than its camera alone."""
 
     SINGLE = "observation"
 
@@ -131,12 +145,7 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     image, action = fields.child("image"), fields.child("action")
     image.rule("channels", lambda value: is_integer(value) and value == 3, "must be 3")
     image.rule("encoding", lambda value: value == "rgb8", "must be 'rgb8'")
-    action.rule("names", lambda value: value == ["v", "omega"], "must be ['v', 'omega']")
-    action.rule("units", lambda value: value == ["m/s", "rad/s"], "must be ['m/s', 'rad/s']")
-    limits = f"must be two finite numbers from -{MAX_SPEED:g} to {MAX_SPEED:g}"
-    low = action.rule("low", _is_pair, limits)
-    high = action.rule("high", lambda value: _is_pair(value) and all(a < b for a, b in zip(low, value, strict=True)),
-                       f"{limits}, above low = {low}")
+    commands = _parse_commands(fields, action)
     height, width = (image.rule(key, _is_side, "must be an integer from 1 to 4096") for key in ("height", "width"))
     if height * width > MAX_PIXELS:
         raise PolicyFileError(f"{name} image: height x width = {height} x {width}, but it must have at most "
@@ -144,17 +153,30 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     carry = _parse_carry(fields)
     inputs, outputs = _parse_tensors(fields, 1 + len(carry), 1 + len(carry))
     return Contract(
-        height=height, width=width, low=(float(low[0]), float(low[1])), high=(float(high[0]), float(high[1])),
-        rate_hz=float(fields.rule("rate_hz", lambda value: is_number(value) and 0.01 <= value <= 1000,
-                                  "must be from 0.01 to 1000 [1/s]")),
-        action_repeat=fields.rule("action_repeat", lambda value: is_integer(value) and 1 <= value <= 100,
-                                  "must be an integer from 1 to 100"),
-        carry=carry, inputs=inputs, outputs=outputs,
+        height=height, width=width, low=commands.low, high=commands.high, rate_hz=commands.rate_hz,
+        action_repeat=commands.action_repeat, carry=carry, inputs=inputs, outputs=outputs,
         camera=_parse_camera(fields.child("camera")),
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text"),
         vehicle_sha256=fields.rule("vehicle_sha256", lambda value: value == "" or _is_digest(value),
                                    "must be empty or a SHA-256 (64 hexadecimal digits)"),
         novelty=_parse_novelty(fields, carry),
+    )
+
+
+def _parse_commands(fields: "Fields", action: "Fields") -> Commands:
+    """Return what actions mean, from the rates of a policy and its table of the action."""
+    action.rule("names", lambda value: value == ["v", "omega"], "must be ['v', 'omega']")
+    action.rule("units", lambda value: value == ["m/s", "rad/s"], "must be ['m/s', 'rad/s']")
+    limits = f"must be two finite numbers from -{MAX_SPEED:g} to {MAX_SPEED:g}"
+    low = action.rule("low", _is_pair, limits)
+    high = action.rule("high", lambda value: _is_pair(value) and all(a < b for a, b in zip(low, value, strict=True)),
+                       f"{limits}, above low = {low}")
+    return Commands(
+        (float(low[0]), float(low[1])), (float(high[0]), float(high[1])),
+        float(fields.rule("rate_hz", lambda value: is_number(value) and 0.01 <= value <= 1000,
+                          "must be from 0.01 to 1000 [1/s]")),
+        fields.rule("action_repeat", lambda value: is_integer(value) and 1 <= value <= 100,
+                    "must be an integer from 1 to 100"),
     )
 
 
@@ -174,6 +196,7 @@ def parse_agent(name: str, table: Mapping[str, Any]) -> AgentContract:
     return AgentContract(
         observation=observation, discrete=kind == "discrete", size=size, carry=carry, inputs=inputs, outputs=outputs,
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text") if "task" in table else "",
+        commands=_parse_commands(fields, action) if "low" in action.table and size == 2 and kind == "box" else None,
     )
 
 

@@ -19,6 +19,14 @@ SPREAD = 0.05
 """Day-to-day standard deviation of a parameter, as a share of its value: an assumption, printed with the fit."""
 LEAST = 0.003  # of the range: what no parameter is known better than
 UNKNOWN = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known (uniform)
+EXPECTED = {
+    "wheel_radius_difference.common": 0.03, "wheel_radius_difference.difference": 0.02, "track_width.error": 0.05,
+    "wheels.difference": 0.02, "odometry_scale.linear": 0.03, "odometry_scale.angular": 0.05,
+    "pose_mount.x": 0.2, "pose_mount.y": 0.2, "pose_mount.yaw": 0.2,
+}
+"""How far data sheets, rulers and hand-drawn markers are usually off: standard deviations around where a parameter does
+nothing, of those whose bounds say much less."""
+RELATIVE = {"wheels.radius": 0.03, "wheels.track": 0.05}  # the same as shares of what a robot file says
 QUANTILE = 1.645  # of the normal distribution, of the 90 % intervals in vehicle files
 
 
@@ -47,8 +55,18 @@ class Prior:
 
 
 def bounds_alone(space: Space) -> Prior:
-    """Nothing but the bounds is known: as wide as a uniform distribution within them."""
-    return Prior(np.full(space.size, 0.5), np.full(space.size, UNKNOWN))
+    """Nothing but the bounds is known: as wide as a uniform distribution within them; or as `EXPECTED` has it."""
+    sd = expected_sd(space)
+    return Prior(np.where(sd < UNKNOWN, space.to_unit(space.initial), 0.5), sd)
+
+
+def expected_sd(space: Space) -> np.ndarray:
+    """(P,) standard deviations in unit coordinates of what is known of parameters before any drive."""
+    width = space.high - space.low
+    sizes = np.array([EXPECTED.get(name, np.inf) for name in space.names])
+    for i, name in enumerate(space.names):
+        sizes[i] = RELATIVE[name] * abs(space.initial[i]) if name in RELATIVE else sizes[i]
+    return np.minimum(sizes / width, UNKNOWN)
 
 
 def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], spread: float = SPREAD) -> Prior:
@@ -59,7 +77,7 @@ def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], sprea
     """
     mean = space.to_unit(space.initial)
     slope = np.maximum(space.slope(mean), 1e-12)
-    sd = np.full(space.size, UNKNOWN)
+    sd = expected_sd(space)
     for i, name in enumerate(space.names):
         if name in intervals:
             low, high = intervals[name]

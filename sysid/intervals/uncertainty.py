@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.errors.pose_objective import Told, without_prior
-from sysid.errors.prior import UNKNOWN
+from sysid.errors.prior import UNKNOWN, expected_sd
 from sysid.errors.robust import HUBER, huber_weight, robust_cost
 from sysid.errors.space import BENT, NUISANCE, TERMS, Space
 from sysid.intervals.independence import CONFIDENCE, Evidence, errors_of, shared_error
@@ -166,12 +166,13 @@ def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDE
     reach = errors.quantile * errors.deviation * np.array([[-1], [1]]) * stretched(evidence.ahead)  # (2, P)
     ends = space.to_values(u + reach)
     straight = space.to_values(u) + reach * space.slope(u)
-    estimates = []
+    estimates, expected = [], expected_sd(space)
     for index, (name, low, high) in enumerate(zip(space.names, *ends, strict=True)):
         if name in TERMS:
             low, high = np.clip(straight[:, index], space.low[index], space.high[index])
-        narrow = errors.deviation[index] < UNIDENTIFIABLE * PRIOR_SD and name not in NUISANCE
-        remark = "" if narrow else f"not identifiable: {NUISANCE.get(name, 'the log hardly narrows its bounds')}"
+        narrow = errors.deviation[index] < UNIDENTIFIABLE * expected[index] and name not in NUISANCE
+        usual = "its bounds" if expected[index] == PRIOR_SD else "what is usual"
+        remark = "" if narrow else f"not identifiable: {NUISANCE.get(name, f'the log hardly narrows {usual}')}"
         if narrow and min(u[index], 1 - u[index]) < WALL:
             remark = f"on its {'lower' if u[index] < 0.5 else 'upper'} bound"
         if name in NUISANCE:

@@ -22,8 +22,9 @@ from sysid.logs.log import Trial
 from sysid.replay import pieces
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import cores, on_all_cores, on_processor
+from sysid.replay.on_host import HostReplay, replay_of
 from sysid.replay.records import Measured, Plant, Simulated
-from sysid.replay.rollout import Replay, make_batch
+from sysid.replay.rollout import make_batch
 
 VECTOR, FEW, MANY = 8, 32, 128
 """Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
@@ -61,7 +62,7 @@ class CourseReplay:
                         odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
-        self._replay, self._compiled = Replay(plant, whole, set_values), set[int]()
+        self._replay, self._compiled = replay_of(plant, whole, set_values), set[int]()
         self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
         self._trials = [trials[i] for i in first]
 
@@ -72,7 +73,7 @@ class CourseReplay:
         batch = self._replay.batch
         records, step = batch.command.shape[1], self._record
         count = pieces.count(records * step)
-        if count < 2 or batch.warm_up or not self._anywhere:
+        if count < 2 or batch.warm_up or not self._anywhere or isinstance(self._replay, HostReplay):
             return self
         times = pieces.begins(records, count) * step - pieces.OVERLAP
         speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])
@@ -83,6 +84,8 @@ class CourseReplay:
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
+        if isinstance(self._replay, HostReplay):
+            return self._spread(self._replay.simulate(values), motion=True)
         if not on_processor():
             size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
             return self._spread(self._replay.simulate(values, size), motion=True)

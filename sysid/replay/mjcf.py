@@ -27,12 +27,19 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import Entry, Robot, default_paths, load_robot, resolve, write_mjcf
+from sysid.replay.mjcf_file import SIZES, Entry, Robot, Size, default_paths, load_robot, resolve, sizes_of, write_mjcf
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+from sysid.replay.robot_drive import RobotDrive
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
+AROUND_ROBOT = ("command_delay", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
+"""Effects of the catalogue that every robot may have around it."""
+NEAR = 0.15  # share by which a true radius or track may differ from the file's
+SLOW = 100.0  # times as slow as assumed a servo may be that the file does not have
+
+
 @struct.dataclass
 class Motion:
     """What MJX carries from step to step."""
@@ -48,6 +55,7 @@ def mjcf_model(
     path: str | Path, parameters: Mapping[str, tuple[float, float]] | Sequence[str] | None = None, *,
     wheels: Sequence[str] = (), wheel_radius: float | None = None, track: float | None = None,
     timestep: float | None = None, effects: Sequence[str] = (), room_fixed: bool | None = None,
+    calibrate: bool = False,
 ) -> Model:
     """A differential drive from an MJCF or URDF file.
 
@@ -59,10 +67,12 @@ def mjcf_model(
         parameters: dotted path -> (lowest, highest), or paths alone (a fifth to five times the file's value); by
             default gain, damping and friction of the driven wheels.
         wheels: joints or actuators of the driven wheels, left and right; by default the two that have "left" and
-            "right" in their names.
+            "right" in their names, or the two or three of each side of a skid-steered robot.
         wheel_radius, track: nominal, of controller and odometry [m]; by default those of the file.
         timestep: physics step [s]; by default the file's.
         effects: of the catalogue, around the model; for example command_delay.
+        calibrate: also fit what a first calibration finds: true radii and track (`wheels.radius`, `wheels.difference`,
+            `wheels.track`), and delays, scales and the tracked point around the model, where a log shows them.
         room_fixed: it matters where in the room it starts; by default where the world has more than planes in it.
 
     Raises:
@@ -71,7 +81,11 @@ def mjcf_model(
     robot = load_robot(Path(path), wheels, wheel_radius, track, timestep)
     host, names = robot.host, default_paths(robot) if parameters is None else tuple(parameters)
     bounds: dict[str, Bounds] = {}
-    entries: dict[str, Entry] = {}
+    entries: dict[str, Entry | Size] = {}
+    sizes = sizes_of(robot)
+    if calibrate:  # where wheels slip in every turn, the track has no part of its own
+        names = (*names, *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
+                 *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
     if robot.motors:
         gain, high = robot.drive_gain
         bounds["drive.kp"] = (gain, gain / 100, high, "N m s/rad")
@@ -81,30 +95,43 @@ def mjcf_model(
             low, high = given or bounds[name][1:3]
             bounds[name] = ((low * high) ** 0.5, low, high, "N m s/rad")
             continue
+        if name in sizes:
+            entries[name] = size = sizes[name]
+            value = size.nominal
+            usual = ((1 - NEAR) * value, (1 + NEAR) * value) if value else (-NEAR, NEAR)
+            low, high = given or usual
+            bounds[name] = (float(np.clip(value, low, high)), low, high, size.unit)
+            continue
+        if name in SIZES:
+            raise ValueError(f"{path}: {name} cannot be fitted: a driven wheel rolls on something that is no sphere, "
+                             "cylinder or capsule. Give it one, or leave this parameter out.")
         entries[name] = entry = resolve(robot, name)
         value = entry.read(host)
         if given is None and value == 0:
             raise ValueError(f"{path}: {name} is 0 in the file, so that its bounds cannot be guessed. Give them: "
                              f"parameters={{{name!r}: (lowest, highest)}}.")
         low, high = sorted((value / FACTOR, value * FACTOR)) if given is None else given
+        if calibrate and given is None and entry.array == "actuator_gainprm" and set(entry.ids) <= set(robot.added):
+            low, high = value / SLOW, value * FACTOR
         bounds[name] = (float(np.clip(value, low, high)), low, high, entry.unit)
     # A mass scales its inertia: before an inertia is set by itself.
-    entries = dict(sorted(entries.items(), key=lambda one: one[1].array != "body_mass"))
+    entries = dict(sorted(entries.items(), key=lambda one: getattr(one[1], "array", "") != "body_mass"))
     if room_fixed is None:
         world = host.geom_bodyid == 0
         room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
     params = make_parameters(bounds, room_fixed=room_fixed)
     plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
-                              wheel_radius=robot.wheel_radius, track=robot.track)
+                              wheel_radius=robot.wheel_radius, track=robot.track, drive=RobotDrive(robot, entries))
 
     def write(folder: Path, params: Parameters) -> Path:
         return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
                                   if name in entries}, Path(folder) / "model.xml")
 
-    return Model(robot.path.name, plant, params, write, robot.notes).with_effects(effects)
+    around = AROUND_ROBOT if calibrate else ()
+    return Model(robot.path.name, plant, params, write, robot.notes, around).with_effects(effects)
 
 
-def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, Any, Any]:
+def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:
     """place, substep, observe and move of `with_surroundings`."""
     from mujoco import mjx
 
@@ -127,7 +154,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
 
     def wheel_speeds(v: jax.Array, omega: jax.Array) -> jax.Array:
         half = omega * robot.track / 2
-        return jnp.stack([v - half, v + half]) / robot.wheel_radius
+        return jnp.stack([v - half, v + half])[robot.sides] / robot.wheel_radius
 
     def pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Reference point (3,) and heading ()."""
@@ -172,7 +199,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry]) -> tuple[Any, Any, An
 
     def observe(state: Motion) -> jax.Array:
         where, heading = pose(state.qpos)
-        left, right = sign * state.qvel[wheels] * robot.wheel_radius
+        left, right = (sign * state.qvel[wheels] * robot.wheel_radius).reshape(2, -1).mean(1)
         return jnp.stack([where[0], where[1], heading, (left + right) / 2, (right - left) / robot.track])
 
     def move(state: Motion, start: jax.Array) -> Motion:

@@ -14,12 +14,18 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot_files import read_robot
+from sysid.replay.wheels import wheel_joints
 from whill_mjx.io.fields import Field, check
 from whill_mjx.logs.dataset import write_text
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
+ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
+STEP = 0.005  # s, physics step of a URDF: it settles and drives as with MuJoCo's 2 ms
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
+SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
+DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
+LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
 SERVO_STEPS = 2  # the least number of timesteps in that time
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
@@ -83,6 +89,54 @@ class Entry:
         return found
 
 
+@dataclass(frozen=True, eq=False)
+class Size:
+    """A true size of the driven wheels, which the file only believes: of their round geoms and places."""
+
+    path: str
+    """`wheels.radius` or `wheels.track` [m], `wheels.difference` [-], left radius less right one over their mean."""
+    unit: str
+    nominal: float
+    """What the file says."""
+    geoms: tuple[tuple[int, ...], ...]
+    """Of each wheel, those on the left first."""
+    bodies: tuple[int, ...]
+    along: tuple[np.ndarray, ...]
+    """(3,) in the frames of the wheels' parents: a wheel that grows rises, a track that grows moves it outwards."""
+
+    def changes(self, model: Any, value: Any) -> dict[str, Any]:
+        """Arrays of a model, of NumPy or JAX, with the value put in; what rolls on the floor stays on it."""
+        half = (value - self.nominal) / 2
+        signs = np.repeat([1, -1], len(self.bodies) // 2)
+        move = {"wheels.track": half, "wheels.radius": 2 * half}.get(self.path, half * self._radius(model))
+        place = model.body_pos
+        for body, sign, along in zip(self.bodies, signs, self.along, strict=True):
+            place = _added(place, body, move * along * (sign if self.path == "wheels.difference" else 1))
+        if self.path == "wheels.track":
+            return {"body_pos": place}
+        size = model.geom_size
+        for sign, geoms in zip(signs, self.geoms, strict=True):
+            factor = value / self.nominal if self.path == "wheels.radius" else 1 + sign * half
+            for geom in geoms:
+                size = _added(size, (geom, 0), (factor - 1) * size[geom, 0])
+        return {"body_pos": place, "geom_size": size}
+
+    def _radius(self, model: Any) -> Any:
+        return model.geom_size[self.geoms[0][0], 0]
+
+    def read(self, model: Any) -> float:
+        """What the file says."""
+        return self.nominal
+
+
+def _added(array: Any, index: Any, change: Any) -> Any:
+    if isinstance(array, jax.Array):
+        return array.at[index].add(change)
+    array = np.array(array)
+    array[index] += change
+    return array
+
+
 @dataclass(frozen=True)
 class Robot:
     """A compiled differential drive and where its parts are."""
@@ -95,10 +149,10 @@ class Robot:
     """Address of the free joint in qpos."""
     speed: int
     """Address of the free joint in qvel."""
-    wheels: tuple[int, int]
-    """Addresses of the driven wheels in qvel, left and right."""
-    actuators: tuple[int, int]
-    sign: tuple[float, float]
+    wheels: tuple[int, ...]
+    """Addresses of the driven wheels in qvel: one to three on the left, then as many on the right."""
+    actuators: tuple[int, ...]
+    sign: tuple[float, ...]
     """1 where a positive speed of the joint drives forwards."""
     motors: bool
     """The actuators take a torque, and not a speed."""
@@ -109,8 +163,19 @@ class Robot:
     wheel_radius: float
     track: float
     rest: np.ndarray  # qpos after SETTLE
+    added: tuple[int, ...] = ()
+    """Actuators that the file does not have."""
+    sliding: tuple[int, ...] = ()
+    """Geoms that stand on the floor and neither turn nor swivel."""
+    distance: float = 0.0
+    """Between the driven wheels, as the file says [m]."""
     notes: tuple[str, ...] = ()
     """What was left out of the file."""
+
+    @property
+    def sides(self) -> np.ndarray:
+        """(W,) 0 for each driven wheel on the left, then 1 for each on the right."""
+        return np.repeat([0, 1], len(self.wheels) // 2)
 
 
 def load_robot(
@@ -119,8 +184,11 @@ def load_robot(
 ) -> Robot:
     """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
     try:
-        spec, replaced = read_robot(path, wheels, wheel_radius)
-        joints = _wheel_joints(path, spec, wheels)
+        spec, replaced, stated = read_robot(path, wheels, wheel_radius)
+        joints = wheel_joints(path, spec, wheels)
+        if stated is not None:
+            spec.option.timestep = STEP if timestep is None else timestep  # the file has none
+            replaced += _as_in_gazebo(path, spec, joints)
         _complete(path, spec, joints)
         if timestep is not None:
             spec.option.timestep = timestep
@@ -131,17 +199,24 @@ def load_robot(
         ids = [host.joint(name).id for name in joints]
         bodies = [int(host.jnt_bodyid[one]) for one in ids]
         radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
-        inertias = [_wheel_inertias(host, one, radius) for one in ids]
-        if _add_servos(spec, joints, inertias):
+        inertias = [_wheel_inertias(host, one, radius, len(ids)) for one in ids]
+        bare = _add_servos(spec, joints, inertias)
+        if bare:
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
         if not (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
             bottom = float(data.xpos[bodies[0], 2]) - _wheel_radius(path, host, bodies[0], radius)
-            spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom])
+            spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],
+                                    friction=[0, 0, 0])  # MuJoCo takes the larger one of two geoms
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
+        if stated is not None and (low := _below_wheels(path, host, data, bodies, radius)):
+            for name in low:
+                spec.geom(name).conaffinity = 0
+            replaced += list(low.values())
+            host = spec.compile()
         notes = _leave_out_contacts(path, spec, host)
         if notes:
             host = spec.compile()
@@ -151,24 +226,65 @@ def load_robot(
         text = str(error).strip()
         raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}. Correct the "
                          "model.") from None
-    left = data.xanchor[ids[0]] - data.xanchor[ids[1]]
+    half = len(ids) // 2
+    left = data.xanchor[ids[:half]].mean(0) - data.xanchor[ids[half:]].mean(0)
     distance = float(np.linalg.norm(left))
     left = left / distance
     forward = np.cross(left, [0.0, 0.0, 1.0])
     free = int(host.body_jntadr[host.body_rootid[bodies[0]]])
     rotation = data.xmat[host.body_rootid[bodies[0]]].reshape(3, 3).copy()  # the data moves on
-    middle = (data.xanchor[ids[0]] + data.xanchor[ids[1]]) / 2 - data.xpos[host.body_rootid[bodies[0]]]
+    middle = data.xanchor[ids].mean(0) - data.xpos[host.body_rootid[bodies[0]]]
     sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
     actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
-    root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), _pair(host.jnt_dofadr[ids])
+    root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), _numbers(host.jnt_dofadr[ids])
     _settle(path, host, data, speed, turning, float(radius))
-    return Robot(path, spec, host, root, speed, turning, _pair(actuators), (sign[0], sign[1]),
+    sliding = _sliding(host, data, int(host.body_rootid[bodies[0]]))
+    if stated is not None:
+        raised = _raise_supports(path, host, data, spec, sliding, bodies)
+        if raised:
+            replaced += raised
+            mujoco.mj_resetData(host, data)
+            _settle(path, host, data, speed, turning, float(radius))
+            sliding = _sliding(host, data, int(host.body_rootid[bodies[0]]))
+    if stated is not None:
+        for geom in sliding:
+            friction = min(stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
+            host.geom_friction[geom, 0] = friction
+            spec.geom(host.geom(geom).name).friction[0] = friction
+    return Robot(path, spec, host, root, speed, turning, actuators, sign,
                  _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
                  rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(),
-                 (*replaced, *notes))
+                 tuple(actuators[one] for one in bare), sliding, distance, (*replaced, *notes))
 
 
-def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, int], radius: float) -> None:
+def _sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int) -> tuple[int, ...]:
+    """Geoms fixed to the vehicle's main body that touch the world at rest."""
+    pairs = [(int(one.geom1), int(one.geom2)) for one in data.contact[: data.ncon]]
+    touching = {geom for pair in pairs for geom in pair if any(host.geom_bodyid[other] == 0 for other in pair)}
+    return tuple(sorted(geom for geom in touching if host.body_weldid[host.geom_bodyid[geom]] == root))
+
+
+def _raise_supports(
+    path: Path, host: mujoco.MjModel, data: mujoco.MjData, spec: Any, sliding: Sequence[int], bodies: Sequence[int],
+) -> list[str]:  # fmt: skip
+    """Raise what slides before and behind the axle: at one height with the driven wheels it would share their load as
+    the stiffness of the contacts has it, where a real vehicle has springs or a gap. A note where it was done."""
+    axle = data.xpos[list(bodies)].mean(0)
+    place = (data.geom_xpos[list(sliding)] - axle).reshape(-1, 3)
+    ahead = place @ data.xmat[host.body_rootid[bodies[0]]].reshape(3, 3)[:, 0]
+    if not (ahead > 0).any() or not (ahead < 0).any():
+        return []
+    for geom, distance in zip(sliding, np.abs(ahead), strict=True):
+        up = data.xmat[host.geom_bodyid[geom]].reshape(3, 3).T @ np.array([0.0, 0.0, LEVEL * distance])
+        host.geom_pos[geom] += up
+        host.geom_sameframe[geom] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        spec.geom(host.geom(geom).name).pos = host.geom_pos[geom]
+    return [f"{path.name}: {', '.join(host.geom(one).name for one in sliding)} are raised by up to "
+            f"{1000 * LEVEL * np.abs(ahead).max():.2g} mm: they stand before and behind the axle, at the height of the "
+            "driven wheels"]
+
+
+def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tuple[int, ...], radius: float) -> None:
     """Let the model come to rest on its floor, without a command; ValueError where it does not."""
     remedy = "Check its contacts, the gains and inertias of its wheels, and its timestep."
     faults = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -188,6 +304,31 @@ def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tup
                          f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
 
 
+SIZES = ("wheels.radius", "wheels.difference", "wheels.track")
+
+
+def sizes_of(robot: Robot) -> dict[str, Size]:
+    """The true sizes that may be fitted; none where a wheel rolls on something that is not round."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    mujoco.mj_kinematics(host, data)
+    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    bodies = [int(host.jnt_bodyid[joint]) for joint in joints]
+    touching = [[int(one) for one in _parts(host, body) if _touches_ground(host, int(one))] for body in bodies]
+    kinds = [int(one) for one in ROUND]
+    if not all(geoms and all(int(host.geom_type[one]) in kinds for one in geoms) for geoms in touching):
+        return {}
+    geoms, half = tuple(tuple(one) for one in touching), len(joints) // 2
+    out = data.xanchor[joints[:half]].mean(0) - data.xanchor[joints[half:]].mean(0)
+    out, up = out / np.linalg.norm(out), np.array([0.0, 0.0, 1.0])
+    frames = [data.xmat[host.body_parentid[body]].reshape(3, 3).T for body in bodies]
+    raised = tuple(frame @ up for frame in frames)
+    apart = tuple(frame @ out * (1 - 2 * side) for frame, side in zip(frames, robot.sides, strict=True))
+    radius = max(float(host.geom_size[one, 0]) for one in geoms[0])
+    known = (("wheels.radius", "m", radius, raised), ("wheels.difference", "-", 0.0, raised),
+             ("wheels.track", "m", robot.distance, apart))
+    return {path: Size(path, unit, value, geoms, _numbers(bodies), along) for path, unit, value, along in known}
+
+
 def resolve(robot: Robot, path: str) -> Entry:
     """Where a dotted path leads; ValueError names what is known."""
     kind, _, rest = path.partition(".")
@@ -199,7 +340,8 @@ def resolve(robot: Robot, path: str) -> Entry:
     numbered = parts[-1].isdigit() and len(parts) > 2
     pattern, field = ".".join(parts[: -2 if numbered else -1]), parts[-2 if numbered else -1]
     known = names_of(host, kind)
-    ids = [number for name, number in known.items() if name == pattern or fnmatchcase(name, pattern)]
+    ids = [number for name, number in known.items()
+           if any(name == one or fnmatchcase(name, one) for one in (pattern, *pattern.split("|")))]
     if not ids:
         raise ValueError(f"{robot.path}: no {kind} {pattern!r} (known: {', '.join(known)}). Correct {path!r}.")
     array, column, unit = FIELDS.get((kind, field), (f"{kind}_{field}", None, "-"))
@@ -230,22 +372,25 @@ def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
     return {name: i for name, i in found.items() if name and name != "world"}
 
 
-def write_mjcf(robot: Robot, values: Mapping[Entry, float], path: Path) -> Path:
+def write_mjcf(robot: Robot, values: Mapping[Entry | Size, float], path: Path) -> Path:
     """Write the completed model with values put in, whole or not at all."""
     host, spec = robot.host, robot.spec.copy()
     arrays: dict[str, np.ndarray] = {}
     for entry, value in values.items():
-        view: Any = _Overlaid(host, arrays)
+        view: Any = Overlaid(host, arrays)
         arrays.update(entry.changes(view, value))
     for entry in values:
+        if isinstance(entry, Size):
+            _put_size(spec, entry, Overlaid(host, arrays))
+            continue
         for number in entry.ids:
-            _put(spec, entry, number, _Overlaid(host, arrays))
+            _put(spec, entry, number, Overlaid(host, arrays))
     spec.compile()
     write_text(path, spec.to_xml())
     return path
 
 
-class _Overlaid:
+class Overlaid:
     """A model with some of its arrays replaced."""
 
     def __init__(self, host: mujoco.MjModel, arrays: dict[str, np.ndarray]):
@@ -253,6 +398,13 @@ class _Overlaid:
 
     def __getattr__(self, name: str) -> Any:
         return self._arrays.get(name, getattr(self._host, name))
+
+
+def _put_size(spec: Any, entry: Size, model: Any) -> None:
+    for body in entry.bodies:
+        spec.body(mujoco.mj_id2name(model._host, KINDS["body"], body)).pos = model.body_pos[body]
+    for geom in (one for geoms in entry.geoms for one in geoms):
+        spec.geom(mujoco.mj_id2name(model._host, KINDS["geom"], geom)).size[0] = model.geom_size[geom, 0]
 
 
 def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
@@ -278,25 +430,6 @@ def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
             setattr(element, field, float(values))
 
 
-def _wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, str]:
-    """Names of the joints of the driven wheels, left and right."""
-    hinges = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name]
-    driven = {actuator.name: actuator.target for actuator in spec.actuators}
-    if wheels:
-        found = [driven.get(name, name) for name in wheels]
-        if len(found) != 2 or not set(found) <= set(hinges):
-            raise ValueError(f"{path}: wheels are {' and '.join(wheels)}; they must be two hinge joints or "
-                             f"their actuators, left and right (joints: {', '.join(hinges)}; "
-                             f"actuators: {', '.join(driven)}).")
-        return found[0], found[1]
-    for among in ([name for name in hinges if name in driven.values()], hinges):
-        sides = [[name for name in among if side in name.lower()] for side in ("left", "right")]
-        if all(len(side) == 1 for side in sides):
-            return sides[0][0], sides[1][0]
-    raise ValueError(f"{path}: the driven wheels cannot be told by their names (joints: {', '.join(hinges)}). Name "
-                     "them: wheels=(left, right), on the command line --wheels LEFT RIGHT.")
-
-
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
     """Give the model a free joint and names to its bodies and geoms, where it has none."""
     spec.compiler.fusestatic = False
@@ -318,6 +451,53 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
             plain = body.name if k == 0 else f"{body.name}_{k}"
             if not geom.name and plain and plain not in taken:
                 geom.name = plain
+
+
+def _below_wheels(
+    path: Path, host: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], radius: float,
+) -> dict[str, str]:  # fmt: skip
+    """Geoms that reach so far below the driven wheels that these would hang in the air, with a note for each: mostly
+    boxes that stand in for meshes."""
+    floor = min(float(data.xpos[body, 2]) for body in bodies) - radius
+    wheels = {int(host.body_weldid[body]) for body in bodies}
+    found = {}
+    for geom in range(host.ngeom):
+        if host.geom_bodyid[geom] == 0 or int(host.body_weldid[host.geom_bodyid[geom]]) in wheels or not (
+                host.geom_contype[geom] | host.geom_conaffinity[geom]):
+            continue
+        turn, reach = data.geom_xmat[geom].reshape(3, 3), host.geom_aabb[geom, 3:]
+        round_one = int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
+        down = float(reach[0] if round_one else np.abs(turn[2]) @ reach)
+        low = floor - (float(data.geom_xpos[geom, 2] + turn[2] @ host.geom_aabb[geom, :3]) - down)
+        if low > DEEP * radius:
+            name = host.geom(geom).name
+            found[name] = (f"{path.name}: {name} reaches {low:.3g} m below the driven wheels: its contacts are left "
+                           "out")
+    return found
+
+
+def _as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
+    """What a URDF leaves to its simulator, a note for each change.
+
+    Parts of one robot do not touch each other. Joints with an end, of arms, heads and suspensions, are held: their
+    motors and springs are not in the file. A driven wheel is held at its speed, whatever its bearing.
+    """
+    notes = []
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = 0, 1
+    for joint in list(spec.joints):
+        if joint.name in joints:
+            if np.any(joint.frictionloss) or np.any(joint.damping):
+                notes.append(f"{path.name}: friction and damping of joint {joint.name} are left out: an added servo "
+                             "would make up for them")
+            joint.frictionloss = 0.0
+            joint.damping = np.zeros_like(joint.damping)
+        elif joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
+                joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.ptp(joint.range)):
+            notes.append(f"{path.name}: joint {joint.name} is held at 0: the file has no motor or spring for it")
+            spec.delete(joint)
+    return notes
 
 
 def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
@@ -344,8 +524,8 @@ def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[st
     return tuple(left_out.values())
 
 
-def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
-    """Give velocity servos to wheels without actuators; whether there were any.
+def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> list[int]:
+    """Give velocity servos to wheels without actuators; numbers of these wheels.
 
     Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
     vehicles follow within the same time. A wheel that slips is far lighter, so the integration is implicit in speed.
@@ -361,17 +541,17 @@ def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float
         joint.armature += max(ROTOR_SHARE * total - wheel, 0.0)
     if bare:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    return bool(bare)
+    return bare
 
 
-def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float) -> tuple[float, float]:
-    """Inertia about a wheel's axle [kg m^2]: of the wheel alone, and with half of the vehicle that rolls on two."""
+def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) -> tuple[float, float]:
+    """Inertia about a wheel's axle [kg m^2]: of the wheel alone, and with its share of a vehicle on `count` wheels."""
     body = int(host.jnt_bodyid[joint])
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, host.body_iquat[body])
     axis = turn.reshape(3, 3).T @ host.jnt_axis[joint]
     wheel = float(axis**2 @ host.body_inertia[body] + host.dof_armature[host.jnt_dofadr[joint]])
-    return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / 2
+    return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / count
 
 
 def _drive_gain(
@@ -390,8 +570,7 @@ def _drive_gain(
 
 def _wheel_radius(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
     """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
-    kinds = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
-    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, kinds)]
+    round_ones = [int(one) for one in _parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
     touching = [one for one in round_ones if _touches_ground(host, one)]
     sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
     if not sizes and known is None:
@@ -440,7 +619,8 @@ def default_paths(robot: Robot) -> tuple[str, ...]:
                              ("geom", geoms, "friction")):
         names = [mujoco.mj_id2name(host, KINDS[kind], one) for one in ids]
         pattern = _pattern(names, names_of(host, kind))
-        for name in names if pattern is None else [pattern]:
+        together = ["|".join(names)] if len(names) > 2 else names  # all wheels of a skid drive share one value
+        for name in together if pattern is None else [pattern]:
             path = f"{kind}.{name}.{field}"
             if resolve(robot, path).read(host) != 0:
                 found.append(path)
@@ -448,13 +628,13 @@ def default_paths(robot: Robot) -> tuple[str, ...]:
 
 
 def _pattern(names: Sequence[str], known: Mapping[str, int]) -> str | None:
-    """One pattern that matches these two names and no other."""
-    side = names[0].lower().find("left")
+    """One pattern that matches these names and no other."""
+    side = names[0].lower().find("left") if len(names) == 2 else -1
     start = names[0][:side] if side >= 0 else os.path.commonprefix(list(names))
     end = names[0][side + 4 :] if side >= 0 else os.path.commonprefix([name[len(start):][::-1] for name in names])[::-1]
     pattern = f"{start}*{end}"
     return pattern if {name for name in known if fnmatchcase(name, pattern)} == set(names) else None
 
 
-def _pair(values: Sequence[int] | np.ndarray) -> tuple[int, int]:
-    return int(values[0]), int(values[1])
+def _numbers(values: Sequence[int] | np.ndarray) -> tuple[int, ...]:
+    return tuple(int(value) for value in values)

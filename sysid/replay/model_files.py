@@ -47,13 +47,18 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
         from sysid.replay.mjcf import mjcf_model
 
         inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
-        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track)
+        return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track,
+                          calibrate=not inside)
     if path.suffix != ".py":
         raise ValueError(f"{path}: a model is {', '.join(SUFFIXES)} or .py. Rename the file or write an adapter.")
     loader = importlib.util.spec_from_file_location(path.stem, path)
     assert loader is not None and loader.loader is not None
     module = importlib.util.module_from_spec(loader)
-    loader.loader.exec_module(module)
+    try:
+        loader.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{path}: ends in {type(error).__name__} when it is run ({error}). Correct it; run it alone "
+                         "to see where.") from error
     if not hasattr(module, attribute):
         raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
     found = getattr(module, attribute)

@@ -20,7 +20,7 @@ from flax import struct
 
 from sysid.errors.space import LOG_SPAN, Space
 from sysid.logs.log import Trial
-from sysid.replay.records import Plant
+from sysid.replay.records import Host, Plant
 from whill_mjx.effects import EFFECTS, make_effects
 from whill_mjx.effects.base import apply_chain
 from whill_mjx.logs.dataset import write_text
@@ -28,7 +28,7 @@ from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
 
-AROUND = ("command", "sensing")
+AROUND = ("command", "sensing", "outside")
 """Places of effects that need to know nothing of what is inside a model."""
 Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 """Initial value, lowest, highest, and, where it has one, the unit."""
@@ -61,6 +61,8 @@ class Model:
     """Writes the fitted model into a folder in its own format; returns the file."""
     notes: tuple[str, ...] = ()
     """What of its file was left out or replaced."""
+    around: tuple[str, ...] = ()
+    """Effects that it may have around it: a fit adds those that a log shows."""
 
     def with_effects(self, names: Sequence[str]) -> Model:
         """The same model with effects of the catalogue around it; ValueError for those that act inside one."""
@@ -99,6 +101,37 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
     if not both:
         return rolling
     return (*rolling, "sensor_delay", "pose_delay") if receipt else (*rolling, "sensor_delay")
+
+
+def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
+    """What a usual first calibration finds, where it is known to show: sizes of the wheels, and of what measures them.
+
+    A command fixes how fast wheels turn, an outside pose how far the vehicle comes by that: both together show radii
+    and track. The odometry beside them shows the sizes that it takes for them, and the pose itself which point of the
+    vehicle it follows. Without an outside pose nothing tells them apart. On a skid drive wheels slip in every turn, and
+    the track has no part of its own in that.
+    """
+    if not any(effect.name == "slip_traction" for effect in params.effects):
+        return ()
+    if not any(trial.ground_truth is not None for trial in trials):
+        return ()
+    both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
+    sizes = ("wheel_radius_difference",) if spec.drive == "skid" else ("wheel_radius_difference", "track_width")
+    return (*sizes, *(("odometry_scale",) if both else ()), "pose_mount")
+
+
+ODOMETRY_ALONE, POSE_ALONE, BOTH = ("odometry_lag",), ("pose_mount",), ("sensor_delay", "odometry_scale")
+"""Effects around a model that show in one stream, or against the other."""
+
+
+def effects_around(model: Model, trials: tuple[Trial, ...]) -> tuple[str, ...]:
+    """Those of the effects that a model may have around it that a log shows."""
+    reports = any(trial.odometry is not None for trial in trials)
+    seen = any(trial.ground_truth is not None for trial in trials)
+    both = any(trial.odometry is not None and trial.ground_truth is not None for trial in trials)
+    hidden = ((ODOMETRY_ALONE, reports), (POSE_ALONE, seen), (BOTH, both))
+    left_out = {name for names, shown in hidden if not shown for name in names}
+    return tuple(name for name in model.around if name not in left_out)
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:
@@ -225,7 +258,7 @@ class Surrounded:
 def with_surroundings(
     place: Callable[[Parameters, jax.Array], Any], substep: Callable[[Parameters, Any, jax.Array], Any],
     observe: Callable[[Any], jax.Array], move: Callable[[Any, jax.Array], Any], dt: float, wheel_radius: float = 0.1,
-    track: float = 0.5,
+    track: float = 0.5, drive: Callable[..., np.ndarray] | None = None,
 ) -> Plant:
     """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
 
@@ -235,6 +268,7 @@ def with_surroundings(
         observe: state -> (5,) x, y, yaw of the body, v and omega of the odometry.
         move: (state, start (5,)) -> the same motion at the start's pose.
         wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
+        drive: as in `Host`, where the host steps it more quickly.
     """
     surroundings: Any = SimpleNamespace(dt=dt, wheel_radius=wheel_radius, track=track)
 
@@ -248,15 +282,17 @@ def with_surroundings(
     def advance(params: Parameters, state: Surrounded, command: jax.Array) -> Surrounded:
         memory, command = apply_chain(params.effects, state.memory, "command", command, surroundings)
         inner = substep(params, state.inner, command)
-        seen = observe(inner)
+        return read(params, replace(state, memory=memory), inner, observe(inner))
+
+    def read(params: Parameters, state: Surrounded, inner: Any, seen: jax.Array) -> Surrounded:
         healthy = jnp.isfinite(seen).all()
         inner = jax.tree.map(lambda new, old: jnp.where(healthy, new, old), inner, state.inner)
         v, omega = (jnp.where(healthy, seen[i], 0.0) for i in (3, 4))
         encoder = _integrate(state.encoder, v, omega, dt)
-        memory, reading = apply_chain(params.effects, memory, "sensing", encoder, surroundings)
+        memory, reading = apply_chain(params.effects, state.memory, "sensing", encoder, surroundings)
         return Surrounded(inner, memory, encoder, reading, state.diverged | ~healthy)
 
-    def look(state: Surrounded) -> jax.Array:
+    def look(state: Surrounded, observe: Callable[[Any], jax.Array] = observe) -> jax.Array:
         reading = state.reading
         reported = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
         pose = observe(state.inner)[:3]
@@ -267,7 +303,24 @@ def with_surroundings(
         encoder, reading = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.reading))  # type: ignore[attr-defined]
         return replace(state, inner=move(state.inner, start), encoder=encoder, reading=reading)
 
-    return Plant(start_at, advance, look, dt, shift)
+    def commands(params: Parameters, command: jax.Array) -> jax.Array:
+        def after(memory: Any, one: jax.Array) -> tuple[Any, jax.Array]:
+            return apply_chain(params.effects, memory, "command", one, surroundings)
+
+        if not any(hasattr(effect, "command") for effect in params.effects):
+            return command
+        return jax.lax.scan(after, tuple(effect.init() for effect in params.effects), command)[1]
+
+    def begin(params: Parameters, start: jax.Array) -> Surrounded:
+        return replace(start_at(params, start), inner=start)
+
+    def take(params: Parameters, state: Surrounded, seen: jax.Array) -> Surrounded:
+        after = read(params, state, seen[:5], seen[:5])
+        return replace(after, diverged=after.diverged | (seen[5] > 0.5))
+
+    recorded = Plant(begin, take, lambda state: look(state, lambda inner: inner), dt, shift)
+    host = None if drive is None else Host(place, commands, drive, recorded)
+    return Plant(start_at, advance, look, dt, shift, host=host)
 
 
 def save_model(

@@ -17,6 +17,21 @@ YAW_COLUMNS = (2, 5)
 
 
 @dataclass(frozen=True)
+class Host:
+    """A model that the host steps by itself, and what is traced around it."""
+
+    place: Callable[[Any, jax.Array], Any]
+    """(params, start (5,)) -> state of the bare model."""
+    commands: Callable[[Any, jax.Array], jax.Array]
+    """(params, commands (S, 2)) -> the same behind the effects on commands."""
+    drive: Callable[[dict[str, np.ndarray], Any, np.ndarray, int, np.ndarray], np.ndarray]
+    """(values (N,) by name, states (N, B), commands (N, B, W + S, 2), warm-up steps W, starts (N, B, 3)) ->
+    (N, B, S, 6) x, y, yaw, v, omega, and 1 from where it diverged, after each step."""
+    recorded: Plant
+    """A plant whose commands are what was observed."""
+
+
+@dataclass(frozen=True)
 class Plant:
     """A vehicle as pure functions of one instance."""
 
@@ -38,6 +53,8 @@ class Plant:
     frame: float | None = None
     """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
     once a frame."""
+    host: Host | None = None
+    """Where the host steps it more quickly."""
     arithmetic: bool = False
     """Whether its steps are arithmetic on single numbers, without products of matrices or solvers."""
 

@@ -22,8 +22,11 @@ BOX = 0.1  # m, of a mesh whose body says nothing of its size
 XACRO = "pip install xacro"
 
 
-def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> tuple[Any, list[str]]:
-    """The editable model of an MJCF, URDF or xacro file, and a note for each mesh that was replaced.
+def read_robot(
+    path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None,
+) -> tuple[Any, list[str], dict[str, float] | None]:  # fmt: skip
+    """The editable model of an MJCF, URDF or xacro file, a note for each mesh that was replaced, and the friction that
+    a URDF states for Gazebo by link; None for MJCF, which has its own.
 
     Raises:
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
@@ -33,12 +36,24 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
     try:
         top = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return mujoco.MjSpec.from_file(str(path)), []  # MuJoCo says where the mistake is
+        return mujoco.MjSpec.from_file(str(path)), [], None  # MuJoCo says where the mistake is
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if path.suffix == ".xacro" else mujoco.MjSpec.from_file(str(path))
-        return spec, _place_meshes(path, spec)
+        return spec, _place_meshes(path, spec), None
     notes = _place_urdf_meshes(path, top, wheels, wheel_radius)
-    return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes
+    return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes, _frictions(top)
+
+
+def _frictions(top: ElementTree.Element) -> dict[str, float]:
+    """Coefficients along the first direction that a URDF states for Gazebo, by link."""
+    found = {}
+    for element in top.findall("gazebo"):
+        stated = [one.get("value") or one.text or "" for one in element.iter() if one.tag in ("mu1", "mu")]
+        try:
+            found[element.get("reference", "")] = float(stated[0])
+        except (IndexError, ValueError):
+            continue
+    return found
 
 
 def expand_xacro(path: Path) -> str:

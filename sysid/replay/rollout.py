@@ -112,7 +112,7 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
 
 def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
     """Replay all trials of a batch with one parameter set. Differentiable in forward mode."""
-    return jax.vmap(lambda one: _simulate_one(plant, params, one))(batch)
+    return jax.vmap(lambda one: simulate_one(plant, params, one))(batch)
 
 
 class Replay:
@@ -132,7 +132,7 @@ class Replay:
             def tiled(leaf: jax.Array) -> jax.Array:
                 return jnp.tile(leaf, (sets, *(1,) * (leaf.ndim - 1)))
 
-            one = jax.vmap(lambda value, trial: _simulate_one(plant, set_values(value), trial, few))
+            one = jax.vmap(lambda value, trial: simulate_one(plant, set_values(value), trial, few))
             found = one(jnp.repeat(values, trials, axis=0), jax.tree.map(tiled, batch))
             return jax.tree.map(lambda leaf: leaf.reshape(sets, trials, *leaf.shape[1:]), found)
 
@@ -208,6 +208,9 @@ def path_of(
     """
     params, latency = without(params, SensorDelay.name)
     params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "reference"):  # the start is that of a tracked point
+            start = effect.reference(start)
     if not warm_up:  # which finds its commands on the way
         params, command = delayed(params, command, plant.dt)
 
@@ -285,7 +288,8 @@ class PathReplay:
         return np.concatenate(parts)[:count]
 
 
-def _simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
+def simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
+    """Replay one trial of a batch with one parameter set."""
     path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:

@@ -8,7 +8,7 @@ place:
     force(memory, motion)                   -> memory, Wrench      friction, slip, drag; those that react come last
     world(memory, World)                    -> memory, World       slope, ground, true geometry
     sensing(memory, Odometry, motion)       -> memory, Odometry    odometry scale, low-pass, latency
-    outside(memory, path (R, 3), dt)        -> memory, path        latency of a pose measured from outside; replays only
+    outside(memory, path (R, 3), dt)        -> memory, path        latency and mount of an outside pose; replays only
 
 Effects of one place act in the order of the tuple; forces add up. At its neutral values an effect vanishes exactly.
 `init()` gives the memory it starts with.

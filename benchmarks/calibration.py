@@ -1,0 +1,111 @@
+"""The usual first calibration: a small robot whose wheels, track and markers are not where its owner believes.
+
+    python -m benchmarks.calibration                     # drives and fits it
+    python -m benchmarks.calibration --parts files --folder ROBOTS   # loads and drives each robot file of a folder
+
+`small`: a robot of a kilogram is driven on the contact plant, which shares no code with the model, and fitted as by
+`sysid.fit LOG --model robot.urdf`. `files`: every robot file of a folder is loaded, settled and driven straight on.
+
+Writes benchmarks/results/logs.json.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from benchmarks.plant.commands import nine
+from benchmarks.plant.first_day import FASTER, SLOWER, Wrong, make_uncalibrated, write_urdf
+from sysid.logs.log import load_log
+from sysid.pages.report import error_rows, summaries
+from sysid.replay.mjcf_file import load_robot
+from sysid.replay.model_files import SUFFIXES
+from sysid.replay.robot_check import check_robot
+from sysid.search.fitting import fit_log, predict
+from sysid.search.settings import FitConfig
+
+CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
+MANOEUVRES = ("turn", "s_curve", "reverse", "figure_eight", "stop_and_go")
+LENGTH = 14.0  # s of each manoeuvre
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What to measure."""
+
+    parts: tuple[str, ...] = ("small",)
+    """Of small and files."""
+    folder: Path = Path("robots")
+    """With robot files, for `files`."""
+    seed: int = 0
+    quick: bool = False
+    """Fewer trials and iterations."""
+
+
+def small(config: Benchmark) -> dict[str, dict]:
+    """Figures of the small robot."""
+    wrong = Wrong(x=0.05, y=-0.02)
+    tables = {}
+    for name, table in nine(config.seed).items():
+        if name in MANOEUVRES:
+            kept = table[table[:, 0] < LENGTH] * [1.0, SLOWER, FASTER]
+            kept[-5:, 1:] = 0.0
+            tables[name] = kept
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        make_uncalibrated(folder / "log", "small", wrong, config.seed, 3, tables)
+        log = load_log(folder / "log")
+        fit = fit_log(log, FitConfig(model=str(write_urdf(folder / "robot.urdf")), quick=config.quick))
+        rows = error_rows(log.trials, *predict(fit, log.trials))
+    one = summaries(rows, log.trials)["summary"]["held_out"]["ground_truth"]["trajectory"]
+    found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))
+    spec = log.spec
+    away = math.hypot(found["pose_mount.x"] - wrong.x, found["pose_mount.y"] - wrong.y)
+    values = {
+        "small_robot_replicate_ratio": (one["fitted"] / one["noise_floor"], "ratio"),
+        "small_robot_radius_error": (abs(found["wheels.radius"] / spec.wheel_radius / (1 + wrong.radius) - 1), "share"),
+        "small_robot_track_error": (abs(found["wheels.track"] / spec.track / (1 + wrong.track) - 1), "share"),
+        "mount_offset_mm": (1000 * away, "mm"),
+        "mount_offset_deg": (abs(math.degrees(found["pose_mount.yaw"] - wrong.yaw)), "deg"),
+        "small_robot_fit_s": (fit.seconds, "s"),
+    }
+    return {name: figure([float(value)], unit) for name, (value, unit) in values.items()}
+
+
+def files(config: Benchmark) -> dict[str, dict]:
+    """How many of a folder's robot files load, settle and drive straight on."""
+    paths = sorted(path for path in config.folder.rglob("*") if path.suffix in SUFFIXES)
+    good = 0
+    for path in paths:
+        try:
+            check = check_robot(load_robot(path))
+        except (ValueError, FileNotFoundError) as error:
+            print(f"{path.name}: {error}")
+            continue
+        good += check.drives_straight
+        v, omega = check.command
+        print(f"{path.name}: straight {check.speed / v:.1%}, on the spot {check.rate / omega:.1%}"
+              f"{'' if check.drives_straight else ' NOT STRAIGHT'}")
+    return {"robot_files_loaded": figure([float(good)], "count"),
+            "robot_files_tried": figure([float(len(paths))], "count")}
+
+
+def main(config: Benchmark) -> None:
+    """Measure and record."""
+    figures = {}
+    for part in config.parts:
+        figures |= {"small": small, "files": files}[part](config)
+    for name, one in figures.items():
+        print(f"{name}: {np.round(one['value'], 4)} {one['unit']}")
+    print(record("logs", CLAIM, figures))
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Benchmark))

@@ -1,0 +1,104 @@
+"""Replay of a model that the host steps by itself: what is around it is traced, its own steps are not.
+
+C MuJoCo steps a small robot on a core some hundred times as fast as MJX does, and nothing has to be compiled first.
+Commands go through their effects for a whole drive, the host drives it, and what it observed goes through the effects
+of the odometry and the outside pose, as if a plant had just made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sysid.replay.cores import on_processor
+from sysid.replay.delays import delayed
+from sysid.replay.records import Batch, Plant, Simulated
+from sysid.replay.rollout import Replay, simulate_one
+
+FEW = 4  # parameter sets whose readings are computed together at least
+
+
+class HostReplay:
+    """`Replay` of one batch by `Plant.host`."""
+
+    def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
+        """`set_values` turns values (P,) into the model's parameters."""
+        host = plant.host
+        assert host is not None
+        recorded = replace(host.recorded, frame=plant.frame)
+
+        def before(values: jax.Array, one: Batch) -> tuple[Any, Any, jax.Array, jax.Array]:
+            """Values of the model, its state at the start, commands (S, 2) of every physics step, and where it starts.
+
+            It drives from the origin where that does not matter: sets that differ in readings alone share a drive.
+            """
+            params, start = set_values(values), one.start
+            for effect in params.effects:
+                start = effect.reference(start) if hasattr(effect, "reference") else start
+            begin = start if params.room_fixed else start.at[:3].set(0.0)
+            command = one.command.reshape(-1, 2)
+            if one.warm_up:  # it came with these
+                command = jnp.concatenate([jnp.broadcast_to(start[3:], (one.warm_up, 2)), command])
+            params, command = delayed(params, command[:, None], plant.dt)
+            return params.values, host.place(params, begin), host.commands(params, command[:, 0]), begin
+
+        def after(values: jax.Array, one: Batch, motion: jax.Array) -> Simulated:
+            params, start = set_values(values), one.start
+            for effect in params.effects:
+                start = effect.reference(start) if hasattr(effect, "reference") else start
+            motion = motion if params.room_fixed else _moved(motion, start)
+            kept = tuple(effect for effect in params.effects if not hasattr(effect, "command"))
+            motion = motion.reshape(*one.command.shape[:2], -1)
+            return simulate_one(recorded, replace(params, effects=kept), replace(one, command=motion, warm_up=0))
+
+        def of_all(function: Callable[..., Any]) -> Any:
+            """Of each set (N,) on each trial (B,)."""
+            each = jax.vmap(function, in_axes=(None, 0, *((0,) if function is after else ())))
+            return jax.jit(jax.vmap(each, in_axes=(0, None, *((0,) if function is after else ()))))
+
+        self.batch, self._host = batch, host
+        self._before, self._after = of_all(before), of_all(after)
+
+    def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
+        """Replay with each of values (N, P); leaves gain the axis N in front. `size` is not needed."""
+        count = len(values)
+        padded = np.concatenate([values, np.repeat(values[-1:], -count % FEW, axis=0)])  # few sizes are compiled
+        sets = jnp.asarray(padded, jnp.result_type(float))
+        given = jax.tree.map(np.asarray, self._before(sets, self.batch))
+        keys = [tuple(leaf[i].tobytes() for leaf in jax.tree.leaves(given)) for i in range(len(padded))]
+        first = {key: i for i, key in reversed(list(enumerate(keys)))}
+        place = {key: k for k, key in enumerate(first)}
+        inner, states, commands, begin = jax.tree.map(lambda leaf: leaf[list(first.values())], given)
+        motion = self._host.drive({name: leaf[:, 0] for name, leaf in inner.items()}, states, commands,
+                                  self.batch.warm_up, begin[..., :3])
+        motion = motion[[place[key] for key in keys]]
+        found = self._after(sets, self.batch, jnp.asarray(motion, jnp.result_type(float)))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """There is none: differences of `simulate` are taken."""
+        raise NotImplementedError("a model that the host steps has no tangents; take differences")
+
+    def traced(self, values: jax.Array) -> Simulated:
+        """There is none: an accelerator steps the model by itself."""
+        raise NotImplementedError("a model that the host steps cannot be traced")
+
+
+def _moved(motion: jax.Array, start: jax.Array) -> jax.Array:
+    """Motion (S, 6) from the origin, from a start (5,)."""
+    cos, sin = jnp.cos(start[2]), jnp.sin(start[2])
+    x, y = motion[:, 0], motion[:, 1]
+    pose = [start[0] + cos * x - sin * y, start[1] + sin * x + cos * y, start[2] + motion[:, 2]]
+    return jnp.concatenate([jnp.stack(pose, axis=-1), motion[:, 3:]], axis=-1)
+
+
+def replay_of(plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]) -> Replay | HostReplay:
+    """The quickest replay of a plant here."""
+    if plant.host is not None and on_processor():
+        return HostReplay(plant, batch, set_values)
+    return Replay(plant, batch, set_values)

@@ -1,0 +1,135 @@
+"""What a robot file is understood as, and whether it drives as commanded: for people to look at before a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+
+from sysid.replay.mjcf_file import KINDS, Robot
+from sysid.replay.robot_drive import RobotDrive
+
+SPIN = 5.0  # rad/s of a wheel in the drives that are tried
+SECONDS = 3.0  # of each; the first second is left out
+STRAIGHT = 0.1  # share by which the speed may differ from the command
+LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
+
+
+@dataclass(frozen=True)
+class Check:
+    """A robot at rest and in two drives of `SECONDS`."""
+
+    loads: dict[str, float]
+    """Share of the weight that each geom on the floor carries."""
+    command: tuple[float, float]
+    """Speed [m/s] and yaw rate [rad/s] that were asked for, one drive each."""
+    speed: float
+    """Along the vehicle where it should drive straight [m/s]."""
+    drift: float
+    """Yaw rate there [rad/s]."""
+    rate: float
+    """Yaw rate where it should turn on the spot [rad/s]."""
+
+    @property
+    def drives_straight(self) -> bool:
+        """Whether it drives within a tenth of the commanded speed, and hardly turns meanwhile."""
+        v = self.command[0]
+        return abs(self.speed - v) <= STRAIGHT * v and abs(self.drift) * (SECONDS - 1) < 0.2
+
+
+def check_robot(robot: Robot) -> Check:
+    """Drive a robot straight on and on the spot, each from rest."""
+    v = SPIN * robot.wheel_radius
+    omega = 2 * v / robot.track / (1 if len(robot.wheels) == 2 else 2)
+    steps, second = round(SECONDS / robot.host.opt.timestep), round(1 / robot.host.opt.timestep)
+    commands = np.zeros((1, 2, steps, 2))
+    commands[0, 0, :, 0], commands[0, 1, :, 1] = v, omega
+    rest = np.tile(robot.rest, (1, 2, 1))
+    states = SimpleNamespace(qpos=rest, qvel=np.zeros((1, 2, robot.host.nv)))
+    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
+    straight, spot = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 2, 3)))[0]
+    yaw = np.unwrap(straight[:, 2])
+    step = np.diff(straight[second:, :2], axis=0)
+    forward = (step[:, 0] * np.cos(yaw[second:-1]) + step[:, 1] * np.sin(yaw[second:-1])).sum()
+    turned = np.unwrap(spot[:, 2])
+    took = SECONDS - 1
+    return Check(_loads(robot), (v, omega), float(forward / took), float((yaw[-1] - yaw[second]) / took),
+                 float((turned[-1] - turned[second]) / took))
+
+
+def _loads(robot: Robot) -> dict[str, float]:
+    """Share of the weight on each geom that touches the floor at rest, the largest first."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_forward(host, data)
+    found: dict[str, float] = {}
+    force = np.zeros(6)
+    for number in range(data.ncon):
+        contact = data.contact[number]
+        ours = [int(geom) for geom in (contact.geom1, contact.geom2) if host.geom_bodyid[geom] != 0]
+        if len(ours) != 1:
+            continue
+        mujoco.mj_contactForce(host, data, number, force)
+        name = mujoco.mj_id2name(host, KINDS["geom"], ours[0]) or f"geom {ours[0]}"
+        found[name] = found.get(name, 0.0) + float(force[0] * abs(contact.frame[2]))
+    total = sum(found.values()) or 1.0
+    return dict(sorted(((name, value / total) for name, value in found.items()), key=lambda one: -one[1]))
+
+
+def describe_robot(robot: Robot, check: Check) -> list[str]:
+    """What was understood, as lines of text."""
+    host = robot.host
+    data = mujoco.MjData(host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(host, data)
+    count, half = len(robot.wheels), len(robot.wheels) // 2
+    kind = "differential drive, two driven wheels" if count == 2 else f"skid-steered, {count} driven wheels"
+    root = int(host.body_rootid[host.jnt_bodyid[_joints(robot)[0]]])
+    lines = [f"{robot.path.name}: {kind}, {float(host.body_subtreemass[root]):.4g} kg",
+             f"  wheel radius {robot.wheel_radius:.4g} m, track {robot.distance:.4g} m"]
+    if count > 2:
+        ahead = (data.xanchor[_joints(robot)] - data.xpos[root]) @ _forward(robot, data, root)
+        lines[-1] += f", wheelbase {np.ptp(ahead):.4g} m"
+    names = [mujoco.mj_id2name(host, KINDS["joint"], joint) for joint in _joints(robot)]
+    lines += [f"  left: {', '.join(names[:half])}; right: {', '.join(names[half:])}",
+              f"  driven by {_drive(robot)}"]
+    lines += ["", "On the floor, at rest"]
+    lines += [f"  {name}: {share:.0%} of the weight" for name, share in check.loads.items() if share >= LIGHT]
+    lines += ["", "Trial drives in C MuJoCo",
+              f"  straight on at {check.command[0]:.3g} m/s: {check.speed / check.command[0]:.1%} of the commanded "
+              f"speed, turning {np.degrees(check.drift):+.2f} degrees/s",
+              f"  on the spot at {check.command[1]:.3g} rad/s: {check.rate / check.command[1]:.1%} of the commanded "
+              "rate"]
+    missing = [*robot.notes, *_missing(robot, check)]
+    return [*lines, "", "Missing, replaced or odd", *(f"  {one}" for one in missing or ["nothing"])]
+
+
+def _drive(robot: Robot) -> str:
+    if robot.added:
+        return "velocity servos that were added"
+    return "motors with an added speed controller" if robot.motors else "the file's velocity servos"
+
+
+def _missing(robot: Robot, check: Check) -> list[str]:
+    found = []
+    host, wheels = robot.host, set(np.array(robot.host.jnt_bodyid)[_joints(robot)].tolist())
+    carried = sum(share for name, share in check.loads.items()
+                  if int(host.body_weldid[host.geom_bodyid[host.geom(name).id]]) in
+                  {int(host.body_weldid[body]) for body in wheels})
+    if carried < 0.3:
+        found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
+                     "casters and wheels, and the centre of mass")
+    if not check.drives_straight:
+        found.append("it does not drive straight on within a tenth of the commanded speed: check axes of the wheels, "
+                     "what drags on the floor, and friction")
+    return found
+
+
+def _joints(robot: Robot) -> list[int]:
+    return [int(np.flatnonzero(robot.host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+
+
+def _forward(robot: Robot, data: mujoco.MjData, root: int) -> np.ndarray:
+    return np.asarray(data.xmat[root].reshape(3, 3) @ robot.forward)

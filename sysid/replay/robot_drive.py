@@ -1,0 +1,113 @@
+"""Drives of a robot file in C MuJoCo, many at once on the host's cores."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from sysid.replay.cores import cores
+from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
+
+LOST = 1e6  # m, rad or their rates: where a drive no longer means anything
+
+
+class RobotDrive:
+    """`sysid.replay.records.Host.drive` of a robot."""
+
+    def __init__(self, robot: Robot, entries: Mapping[str, Entry | Size]):
+        self._robot, self._entries = robot, entries
+        self._models: list[mujoco.MjModel] = []
+
+    def __call__(
+        self, values: dict[str, np.ndarray], states: Any, commands: np.ndarray, warm_up: int, starts: np.ndarray
+    ) -> np.ndarray:
+        """Motion (N, B, S, 6) of N parameter sets on B trials."""
+        robot = self._robot
+        sets, trials, steps = commands.shape[:3]
+        models = [self._model(i, {name: one[i] for name, one in values.items()}) for i in range(sets)]
+        host = models[0]
+        width = mujoco.mj_stateSize(host, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        first = np.zeros((sets, trials, width))
+        place, speed = slice(1, 1 + host.nq), slice(1 + host.nq, 1 + host.nq + host.nv)
+        first[..., place], first[..., speed] = states.qpos, states.qvel
+        half = commands[..., 1] * robot.track / 2
+        control = np.zeros((sets, trials, steps, host.nu))
+        wanted = (commands[..., 0] - half, commands[..., 0] + half)
+        for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
+            gear = host.actuator_gear[one, 0] if robot.motors else 1.0
+            control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
+        rows = sets * trials
+        data = [mujoco.MjData(host) for _ in range(min(cores(), rows))]
+        path, _ = rollout.rollout([models[i // trials] for i in range(rows)], data, first.reshape(rows, -1),
+                                  control.reshape(rows, steps, -1), nstep=steps)
+        path = path.reshape(sets, trials, steps, -1)
+        seen = self._observe(path[..., place], path[..., speed])
+        if warm_up:
+            seen = _from(seen, warm_up, starts)
+        lost = ~(np.abs(seen) < LOST).all(-1)
+        seen[lost] = 0.0
+        return np.concatenate([seen, np.maximum.accumulate(lost, axis=2)[..., None]], axis=-1)
+
+    def _model(self, number: int, values: Mapping[str, float]) -> mujoco.MjModel:
+        """The robot's model with values put in, one of a pool."""
+        robot, nominal = self._robot, self._robot.host
+        while len(self._models) <= number:
+            self._models.append(copy.copy(nominal))
+        model, arrays = self._models[number], dict[str, np.ndarray]()
+        for name, entry in self._entries.items():
+            arrays.update(entry.changes(Overlaid(nominal, arrays), float(values[name])))
+        for name, array in arrays.items():
+            getattr(model, name)[:] = array
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if robot.motors:
+            _close_loop(model, nominal, robot, float(values["drive.kp"]))
+        return model
+
+    def _observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """(..., 5) x, y, yaw of the reference point, v and omega of the wheels."""
+        robot = self._robot
+        quaternion = qpos[..., robot.root + 3 : robot.root + 7]
+        where = qpos[..., robot.root : robot.root + 3] + _rotated(quaternion, robot.point)
+        forward = _rotated(quaternion, robot.forward)
+        rims = np.array(robot.sign) * qvel[..., list(robot.wheels)] * robot.wheel_radius
+        left, right = (rims[..., robot.sides == side].mean(-1) for side in (0, 1))
+        yaw = np.arctan2(forward[..., 1], forward[..., 0])
+        return np.stack([where[..., 0], where[..., 1], yaw, (left + right) / 2, (right - left) / robot.track], axis=-1)
+
+
+def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp: float) -> None:
+    """Put the speed controller before motors into their law: torque = gain kp (target - speed)."""
+    for one in robot.actuators:
+        gain, gear = model.actuator_gainprm[one, 0], model.actuator_gear[one, 0]
+        model.actuator_biastype[one] = int(mujoco.mjtBias.mjBIAS_AFFINE)
+        model.actuator_gainprm[one, 0] = gain * kp / gear
+        model.actuator_biasprm[one, :3] = 0.0, 0.0, -gain * kp / gear
+        if nominal.actuator_ctrllimited[one]:
+            limits = np.sort(nominal.actuator_ctrlrange[one] * gain)
+            if nominal.actuator_forcelimited[one]:
+                limits = np.clip(limits, *nominal.actuator_forcerange[one])
+            model.actuator_ctrllimited[one], model.actuator_forcelimited[one] = 0, 1
+            model.actuator_forcerange[one] = limits
+
+
+def _from(seen: np.ndarray, first: int, starts: np.ndarray) -> np.ndarray:
+    """Motion (N, B, S, 5) from its step `first` on, moved so that it begins at the starts (N, B, 3)."""
+    turn = starts[..., 2, None] - seen[:, :, first - 1, None, 2]
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y = (seen[:, :, first:, i] - seen[:, :, first - 1, None, i] for i in range(2))
+    later = seen[:, :, first:].copy()
+    later[..., 0] = starts[..., 0, None] + cos * x - sin * y
+    later[..., 1] = starts[..., 1, None] + sin * x + cos * y
+    later[..., 2] += turn
+    return later
+
+
+def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """A vector (3,) turned by quaternions (..., 4) of w, x, y, z."""
+    cross = 2 * np.cross(quaternion[..., 1:], vector)
+    return vector + quaternion[..., :1] * cross + np.cross(quaternion[..., 1:], cross)

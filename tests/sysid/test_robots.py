@@ -1,0 +1,202 @@
+"""Robot files of strangers: wheels are found, what a URDF leaves out is made up for, and robots drive straight on."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sysid import inspect as inspect_module
+from sysid.replay.mjcf import mjcf_model
+from sysid.replay.mjcf_file import default_paths, load_robot
+from sysid.replay.robot_check import check_robot, describe_robot
+
+pytestmark = pytest.mark.quick
+CYLINDER = '<cylinder radius="0.1" length="0.05"/>'
+BALL = '<sphere radius="0.05"/>'
+
+
+def link(name, shape="", mass=1.0, inertia=0.003, origin="0 0 0", turn="0 0 0"):
+    body = f'<collision><origin xyz="{origin}" rpy="{turn}"/><geometry>{shape}</geometry></collision>' if shape else ""
+    numbers = f'ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"'
+    return f'<link name="{name}"><inertial><mass value="{mass}"/><inertia {numbers}/></inertial>{body}</link>'
+
+
+def joint(name, child, place, kind="fixed", axis="0 1 0", parent="base", more=""):
+    return (f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{place}"/><axis xyz="{axis}"/>{more}</joint>')
+
+
+def wheel(name, x, y, shape=CYLINDER, axis="0 1 0", parent="base", more=""):
+    return (link(f"{name}_link", shape, turn="1.5707963 0 0")
+            + joint(name, f"{name}_link", f"{x} {y} 0", "continuous", axis, parent, more))
+
+
+def robot_file(folder, *parts, base=""):
+    path = folder / "robot.urdf"
+    box = base or link("base", '<box size="0.6 0.3 0.1"/>', 20.0, 0.5, origin="0 0 0.1")
+    path.write_text(f'<robot name="r">{box}{"".join(parts)}</robot>')
+    return path
+
+
+def drives(robot):
+    check = check_robot(robot)
+    return check.drives_straight, check
+
+
+NAMES = {
+    "front and rear": ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"],
+    "letters": ["fl_wheel_joint", "fr_wheel_joint", "rl_wheel_joint", "rr_wheel_joint"],
+    "back": ["wheel_back_left", "wheel_back_right", "wheel_front_left", "wheel_front_right"],
+    "numbers": ["wheel_1", "wheel_2", "wheel_3", "wheel_4"],
+}
+
+
+@pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
+def test_four_wheels_are_found_by_usual_names_and_make_a_skid_steered_robot(tmp_path, names):
+    ahead = ("front_", "wheel_front", "fl_", "fr_", "wheel_1", "wheel_2")
+    left_ones = ("front_left", "rear_left", "wheel_front_left", "wheel_back_left", "fl_", "rl_", "wheel_1", "wheel_3")
+    places = [(0.25 if name.startswith(ahead) else -0.25, 0.25 if name.startswith(left_ones) else -0.25)
+              for name in names]
+    robot = load_robot(robot_file(tmp_path, *(wheel(name, *place) for name, place in zip(names, places, strict=True))))
+    assert len(robot.wheels) == 4 and robot.track == pytest.approx(0.5)
+    left = {names[i] for i in range(4) if places[i][1] > 0}
+    found = [robot.host.actuator(one).name for one in robot.actuators]
+    assert set(found[:2]) == left and places[names.index(found[0])][0] > 0  # from front to rear
+    straight, check = drives(robot)
+    assert straight and check.rate > 0
+    assert "skid-steered, 4 driven wheels" in describe_robot(robot, check)[0]
+
+
+def test_six_wheels_share_their_parameters_and_the_track_is_not_fitted(tmp_path):
+    parts = [wheel(f"{a}_{b}_wheel", x, y) for a, x in (("front", 0.3), ("middle", 0.0), ("rear", -0.3))
+             for b, y in (("left", 0.25), ("right", -0.25))]
+    path = robot_file(tmp_path, *parts)
+    robot = load_robot(path)
+    assert len(robot.wheels) == 6 and len(default_paths(robot)) == 2 and drives(robot)[0]
+    names = set(mjcf_model(path, calibrate=True).params.values)
+    assert "wheels.radius" in names and "wheels.track" not in names
+    assert load_robot(path, ("front_left_wheel", "rear_right_wheel", "front_right_wheel", "rear_left_wheel")).sign
+    with pytest.raises(ValueError, match="do not stand in pairs"):
+        load_robot(path, ("front_left_wheel", "rear_left_wheel", "middle_left_wheel", "rear_right_wheel"))
+
+
+def test_axles_that_point_opposite_ways_drive_forwards_together(tmp_path):
+    parts = [wheel("front_left_wheel", 0.25, 0.25, axis="0 -1 0"), wheel("front_right_wheel", 0.25, -0.25),
+             wheel("rear_left_wheel", -0.25, 0.25), wheel("rear_right_wheel", -0.25, -0.25, axis="0 -1 0")]
+    robot = load_robot(robot_file(tmp_path, *parts))
+    assert robot.sign == (-1.0, 1.0, 1.0, -1.0) and drives(robot)[0]
+
+
+TWO = (wheel("left_wheel_joint", 0.0, 0.25), wheel("right_wheel_joint", 0.0, -0.25))
+
+
+def test_swivelling_casters_are_not_driven(tmp_path):
+    parts = [*TWO]
+    for name, y in (("left_caster", 0.15), ("right_caster", -0.15)):
+        parts += [link(f"{name}_fork", mass=0.3),
+                  joint(f"{name}_swivel", f"{name}_fork", f"-0.25 {y} 0", "continuous", "0 0 1"),
+                  link(f"{name}_wheel_link", BALL, 0.3),
+                  joint(f"{name}_wheel", f"{name}_wheel_link", "-0.03 0 -0.05", "continuous", parent=f"{name}_fork")]
+    robot = load_robot(robot_file(tmp_path, *parts))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["left_wheel_joint", "right_wheel_joint"]
+    assert drives(robot)[0] and not robot.sliding
+
+
+def test_balls_before_and_behind_the_axle_leave_the_weight_to_the_wheels(tmp_path):
+    balls = [link(name, BALL, 0.1) + joint(f"{name}_joint", name, f"{x} 0 -0.05")
+             for name, x in (("a", 0.2), ("b", -0.2))]
+    robot = load_robot(robot_file(tmp_path, *TWO, *balls))
+    straight, check = drives(robot)
+    assert straight and sum(share for name, share in check.loads.items() if "wheel" in name) > 0.5
+    assert any("a, b are raised by up to 2 mm" in note for note in robot.notes)
+
+
+def test_a_ball_slides_with_the_friction_that_is_stated_for_gazebo(tmp_path):
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    for stated, friction in (("", 0.05), ("<mu1>0.2</mu1>", 0.2), ('<mu1 value="0.3"/>', 0.3)):
+        more = f'<gazebo reference="ball">{stated}</gazebo>' if stated else ""
+        path = robot_file(tmp_path, *TWO, ball, more)
+        robot = load_robot(path)
+        assert robot.host.geom("ball").friction[0] == pytest.approx(friction)
+        assert "geom.ball.friction" in mjcf_model(path, calibrate=True).params.values
+
+
+def test_wheels_on_springs_that_the_file_lacks_are_held_with_a_note(tmp_path):
+    parts = []
+    for name, y in (("left", 0.25), ("right", -0.25)):
+        drop = '<limit lower="0" upper="0.03" effort="0" velocity="0"/>'
+        parts += [link(f"{name}_drop"),
+                  joint(f"{name}_drop_joint", f"{name}_drop", f"0 {y} 0", "prismatic", "0 0 1", more=drop),
+                  wheel(f"{name}_wheel", 0, 0, parent=f"{name}_drop")]
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    robot = load_robot(robot_file(tmp_path, *parts, ball))
+    assert drives(robot)[0]
+    assert sum("is held at 0: the file has no motor or spring" in note for note in robot.notes) == 2
+
+
+def test_a_bearing_that_no_added_servo_could_turn_is_left_out_with_a_note(tmp_path):
+    stiff = '<dynamics damping="0" friction="100"/>'
+    parts = [wheel("left_wheel", 0, 0.25, more=stiff), wheel("right_wheel", 0, -0.25, more=stiff)]
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    robot = load_robot(robot_file(tmp_path, *parts, ball))
+    assert drives(robot)[0]
+    assert sum("friction and damping of joint" in note for note in robot.notes) == 2
+
+
+def test_a_box_that_reaches_below_the_wheels_does_not_carry_the_robot(tmp_path):
+    base = link("base", '<mesh filename="package://gone/body.stl"/>', 20.0, 0.8)  # a cube of 0.7 m stands in
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    robot = load_robot(robot_file(tmp_path, *TWO, ball, base=base))
+    assert drives(robot)[0]
+    assert any("below the driven wheels: its contacts are left out" in note for note in robot.notes)
+
+
+def test_parts_of_a_urdf_do_not_touch_each_other(tmp_path):
+    arm = link("arm", '<box size="0.6 0.6 0.1"/>', 0.5) + joint("arm_joint", "arm", "0 0 0.15", "continuous", "0 0 1")
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    robot = load_robot(robot_file(tmp_path, *TWO, ball, arm))
+    straight, check = drives(robot)
+    assert straight and set(check.loads) <= {"left_wheel_joint_link", "right_wheel_joint_link", "ball"}
+
+
+def test_wheels_that_are_capsules_roll(tmp_path):
+    path = tmp_path / "robot.xml"
+    sides = "".join(
+        f'<body name="{side}" pos="0 {y} 0.1"><joint name="{side}_wheel" axis="0 1 0"/><geom type="capsule" '
+        f'size="0.1 0.01" zaxis="0 1 0" mass="1"/></body>' for side, y in (("left", 0.25), ("right", -0.25)))
+    path.write_text('<mujoco><worldbody><body name="base"><freejoint/><geom type="box" size="0.3 0.15 0.03" '
+                    'pos="0 0 0.15" mass="10"/><geom name="ball" type="sphere" size="0.05" pos="-0.2 0 0.05" '
+                    f'friction="0.05" mass="0.1"/>{sides}</body></worldbody></mujoco>')
+    robot = load_robot(path)
+    assert drives(robot)[0] and robot.wheel_radius == pytest.approx(0.1)
+    assert "wheels.radius" in mjcf_model(path, calibrate=True).params.values
+
+
+def test_inspect_says_what_was_understood_and_draws_it(tmp_path, capsys):
+    ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
+    path = robot_file(tmp_path, *TWO, ball)
+    config = inspect_module.InspectConfig(dataset=path, out=tmp_path / "seen")
+    found = inspect_module.main(config)
+    text = capsys.readouterr().out
+    for words in ("differential drive, two driven wheels, 22.1 kg", "wheel radius 0.1 m, track 0.5 m",
+                  "left: left_wheel_joint; right: right_wheel_joint", "left_wheel_joint_link: 5",
+                  "of the commanded speed"):
+        assert words in text
+    assert (tmp_path / "seen" / "robot.png").stat().st_size > 5000 and found["drives_straight"]
+    inspect_module.main(inspect_module.InspectConfig(dataset=path, out=tmp_path / "seen", json=True))
+    assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
+
+
+def test_motors_of_a_file_are_driven_by_the_host_with_their_own_limits(tmp_path):
+    """C MuJoCo steps the speed controller as part of the motor's law."""
+    from test_models import ROBOT
+
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace("<velocity", '<motor ctrlrange="-3 3"').replace(' kv="1"', ""))
+    straight, check = drives(load_robot(path))
+    assert straight and abs(check.drift) < 0.05
+    path.write_text(ROBOT.replace("<velocity", '<motor ctrlrange="-0.01 0.01"').replace(' kv="1"', ""))
+    assert not drives(load_robot(path))[0]
+    assert np.isfinite(check.rate)
