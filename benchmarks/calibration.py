@@ -31,8 +31,8 @@ from sysid.search.fitting import expected_steps, fit_log, predict
 from sysid.search.settings import FitConfig
 
 CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
-MANOEUVRES = ("turn", "s_curve", "reverse", "figure_eight", "stop_and_go")
-LENGTH = 14.0  # s of each manoeuvre
+MANOEUVRES = ("turn", "s_curve", "stop_and_go", "figure_eight")
+LENGTH = 12.0  # s of each manoeuvre
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ class Benchmark:
     seed: int = 0
     quick: bool = False
     """Fewer trials and iterations."""
+    elsewhere: bool = True
+    """Whether the fit looks for other minima."""
 
 
 def small(config: Benchmark) -> dict[str, dict]:
@@ -61,7 +63,8 @@ def small(config: Benchmark) -> dict[str, dict]:
         folder = Path(temporary)
         make_uncalibrated(folder / "log", "small", wrong, config.seed, 3, tables)
         log = load_log(folder / "log")
-        settings = FitConfig(model=str(write_urdf(folder / "robot.urdf")), quick=config.quick)
+        settings = FitConfig(model=str(write_urdf(folder / "robot.urdf")), quick=config.quick,
+                             elsewhere=config.elsewhere)
         progress, close = progress_bar(expected_steps(settings))
         try:
             fit = fit_log(log, settings, progress)

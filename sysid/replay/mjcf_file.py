@@ -21,7 +21,7 @@ from whill_mjx.logs.dataset import write_text
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
 STEP = 0.005  # s, physics step of a URDF on two wheels: it settles and drives as with MuJoCo's 2 ms
-STIFF = 10.0  # of its friction over its contacts (impratio): with 1 a wheel that rolls creeps by 0.4 %, with 10 by 0.05
+STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
@@ -29,8 +29,8 @@ THIN = 0.02  # of its radius: half the width of a wheel that rolls on its middle
 DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 SKID_SHARE = 1.0
-"""The same where wheels skid in every turn. MuJoCo finds contact forces for a wheel that turns freely: one that its servo
-holds pulls too little along beside what it resists sideways, the less so the heavier it is by itself."""
+"""The same where wheels skid in every turn. MuJoCo finds contact forces for a wheel that turns freely: one that its
+servo holds pulls too little along beside what it resists sideways, the less so the heavier it is by itself."""
 ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
 SERVO_STEPS = 2  # the least number of timesteps in that time
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
