@@ -108,7 +108,7 @@ def files(config: Benchmark) -> dict[str, dict]:
 
 def main(config: Benchmark) -> None:
     """Measure and record."""
-    figures = {}
+    figures: dict[str, dict] = {}
     for part in config.parts:
         figures |= {"small": small, "files": files}[part](config)
     for name, one in figures.items():
