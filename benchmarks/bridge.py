@@ -11,7 +11,6 @@ the time from the injection to the first zero that this node hears.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib.metadata
 import json
@@ -30,7 +29,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bridge_robot import Robot, Switch, message_type
+from bridge.options import Parser, in_range, whole
 from bridge.simulate import Frame
+from whill_mjx.io.command_line import guarded
 
 CLAIM = "Frame to command, delivery, pacing and every stop of the bridge, measured between processes"
 HIDDEN = 2048
@@ -376,10 +377,10 @@ def installed_mb(*names: str) -> float:
 
 def main() -> None:
     parts = ("steady", "episodes", "faults", "fuzz", "policy")
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge", description="Measure the bridge.")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of each steady run")
-    parser.add_argument("--resets", type=int, default=20)
-    parser.add_argument("--repeats", type=int, default=5, help="of each fault")
+    parser = Parser(prog="python -m benchmarks.bridge", description="Measure the bridge.")
+    parser.add_argument("--seconds", type=in_range(0), default=60.0, help="length of each steady run")
+    parser.add_argument("--resets", type=whole(0), default=20)
+    parser.add_argument("--repeats", type=whole(), default=5, help="of each fault")
     parser.add_argument("--policy", type=Path, help="policy file to measure; default: a stand-in of 10 M parameters")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     options = parser.parse_args()
@@ -416,4 +417,5 @@ def cpu_model() -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

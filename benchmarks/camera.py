@@ -13,13 +13,14 @@ import time
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, run
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import Quality, camera_rotation, pinhole, render
 from whill_mjx.world.render.pallas import Tiling, render_pallas
@@ -52,19 +53,19 @@ class Options:
 
     parts: tuple[str, ...] = ("crowd", "best", "map", "peer")
     """Parts to measure: crowd, best, map, peer, tilings."""
-    worlds: int = 0
+    worlds: Annotated[int, NOT_NEGATIVE] = 0
     """Worlds per call; 0 takes 16,384 on an accelerator and 512 on a CPU."""
-    calls: int = 20
+    calls: Annotated[int, COUNT] = 20
     """Calls per repeat on an accelerator, so that the launch of a call does not count; a CPU makes 2."""
-    repeats: int = 7
+    repeats: Annotated[int, COUNT] = 7
     """Timed repeats."""
-    rows: int = 8
+    rows: Annotated[int, COUNT] = 8
     """Rows of the kernel's tiles."""
-    columns: int = 16
+    columns: Annotated[int, COUNT] = 16
     """Columns of the kernel's tiles."""
-    warps: int = 1
+    warps: Annotated[int, COUNT] = 1
     """Warps per tile."""
-    keep: int = 64
+    keep: Annotated[int, COUNT] = 64
     """Walls that the jnp renderer keeps in each strip of the map's image."""
 
 
@@ -213,6 +214,4 @@ def _draw_kernel(position, rotation, scene, quality=None, tiling=None):
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Options, prog="python -m benchmarks.camera", description=__doc__))
+    run(Options, main, __doc__, positional=False)

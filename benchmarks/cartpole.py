@@ -27,11 +27,13 @@ import numpy as np
 
 from benchmarks import cartpole_env, grid_env
 from benchmarks.harness import figure, record
+from bridge.options import Parser, in_range, whole
 from dreamer import spaces
 from dreamer.config import DreamerConfig, preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from dreamer.types import FunctionalEnv
+from whill_mjx.io.command_line import guarded
 
 CLAIM = "DreamerV3 on tasks that are not ours; the curve of every seed, [environment steps, return of each seed]"
 TINY = dict(
@@ -214,22 +216,22 @@ def summary(
 
 def parse() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.cartpole", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", choices=("balance", "swingup", "grid"), default="balance")
     parser.add_argument("--sight", choices=("image", "joints", "both"), default="image")
     parser.add_argument("--preset", default="size12m", help="tiny, cpu, size1m, size12m, ...")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=100_000, help="environment steps of each seed")
-    parser.add_argument("--ratio", type=float, help="replayed steps per decision; the preset's unless given")
-    parser.add_argument("--unroll", type=int, help="steps of the recurrences in one loop body")
-    parser.add_argument("--instances", type=int, default=16)
-    parser.add_argument("--episodes", type=int, default=10, help="of every evaluation")
-    parser.add_argument("--eval-every", type=int, default=10_000, help="environment steps")
-    parser.add_argument("--minutes", type=float, help="stop and save after so long")
-    parser.add_argument("--checkpoint-s", type=float, default=600.0, help="seconds between checkpoints")
+    parser.add_argument("--seeds", type=whole(0), default=3)
+    parser.add_argument("--first-seed", type=whole(0), default=0)
+    parser.add_argument("--steps", type=whole(), default=100_000, help="environment steps of each seed")
+    parser.add_argument("--ratio", type=in_range(0), help="replayed steps per decision; the preset's unless given")
+    parser.add_argument("--unroll", type=whole(), help="steps of the recurrences in one loop body")
+    parser.add_argument("--instances", type=whole(), default=16)
+    parser.add_argument("--episodes", type=whole(), default=10, help="of every evaluation")
+    parser.add_argument("--eval-every", type=whole(), default=10_000, help="environment steps")
+    parser.add_argument("--minutes", type=in_range(0), help="stop and save after so long")
+    parser.add_argument("--checkpoint-s", type=in_range(0), default=600.0, help="seconds between checkpoints")
     parser.add_argument("--out", type=Path, default=Path("runs/control"))
     parser.add_argument("--separate", action="store_true", help="one seed after the other, each a program of its own")
     parser.add_argument("--collect", metavar="DEVICE", help="only record the runs in --out, which were made there")
@@ -238,4 +240,5 @@ def parse() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    run(parse())
+    with guarded():
+        run(parse())

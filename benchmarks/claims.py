@@ -892,6 +892,28 @@ CLAIMS = (
     ),
     Claim(
         MISSING,
+        "Sensors and floor noisier or quieter than on the reference days",
+        "undeclared",
+        "Disturbances and sensor noise of the log times a factor; the reference days keep the usual ones. 40 logs with "
+        "nothing missing for each factor.",
+        ("figure", "0.5", "2", "4"),
+        (
+            (
+                "false alarms",
+                *(f"{{false_alarms_sensor_noise_{level}}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "upper 95 % bound of their rate",
+                *(f"{{false_alarm_upper_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "noise factors inside their 95 % interval, of 200",
+                *(f"{{noise_factor_coverage_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+        ),
+    ),
+    Claim(
+        MISSING,
         "How long the loop takes",
         "undeclared",
         "27 drives of 22 s and six reference days, compilation included.",
@@ -956,6 +978,23 @@ CLAIMS = (
             ("functions with more than 6 arguments", "{functions_over_6_arguments}"),
             ("lines of `sysid`", "{lines_sysid}"),
             ("sentences over 35 words in README and docs", "{sentences_over_35_words}"),
+        ),
+    ),
+    Claim(
+        "The code itself",
+        "Nothing lost, nothing silent",
+        "reliability",
+        "Damaged files, mistaken commands, kills and Ctrl-C at random moments; each count should be 0.",
+        ("figure", "value", "of"),
+        (
+            ("damaged files: undocumented exceptions", "{fuzz_undocumented}", "{fuzz_undocumented|.readers} readers"),
+            ("damaged files: hangs", "{fuzz_hangs}", "{fuzz_hangs|.readers} readers"),
+            ("damaged files: more than 500 MB", "{fuzz_memory}", "{fuzz_memory|.readers} readers"),
+            ("mistaken commands: tracebacks", "{option_tracebacks}", "{option_tracebacks|.command_lines} lines"),
+            ("kills: work lost beyond a minute", "{kills_lost}", "{kills_lost|.kills} kills"),
+            ("kills: other bits in the end", "{kills_different}", "{kills_different|.kills} kills"),
+            ("kills: half-written files", "{kills_half_written}", "{kills_half_written|.kills} kills"),
+            ("Ctrl-C to exit, 95 % [s]", "{ctrl_c_p95_s}", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
         ),
     ),
     # Bridge

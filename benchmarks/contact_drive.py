@@ -18,9 +18,11 @@ import numpy as np
 from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
 from benchmarks.plant.make import make_log
+from bridge.options import Parser, whole
 from sysid.logs.log import Log, load_log
 from sysid.search.fitting import fit_log, predict
 from sysid.search.settings import FitConfig
+from whill_mjx.io.command_line import guarded
 
 FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
 
@@ -51,12 +53,12 @@ def largest_errors(seed: int, iterations: int) -> dict[str, tuple[float, float]]
 
 def main() -> None:
     """Fit every chair, print and record."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.contact_drive", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("--seeds", type=int, nargs="+", default=[2000, 2001, 2002], help="days of the plant")
-    parser.add_argument("--iterations", type=int, default=60, help="of the fit: until nothing moves")
+    parser.add_argument("--seeds", type=whole(0), nargs="+", default=[2000, 2001, 2002], help="days of the plant")
+    parser.add_argument("--iterations", type=whole(), default=60, help="of the fit: until nothing moves")
     options = parser.parse_args()
     found = {seed: largest_errors(seed, options.iterations) for seed in options.seeds}
     record("physics", CLAIM, figures_of(found))
@@ -74,4 +76,5 @@ def figures_of(found: dict[int, dict[str, tuple[float, float]]]) -> dict[str, di
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

@@ -24,11 +24,13 @@ import numpy as np
 
 from benchmarks.course_figures import BLIND, draw, groups, is_corridor, last_evaluation, load_run
 from benchmarks.harness import RESULTS, device_name, figure, record
+from bridge.options import Parser, in_range, whole
 from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
 from dreamer.train import train
 from whill_mjx import evaluate as evaluation_command
+from whill_mjx.io.command_line import guarded
 from whill_mjx.learning.checks import mean_figures
 from whill_mjx.learning.setup import (
     TRUTH,
@@ -254,45 +256,47 @@ def planner(options: argparse.Namespace) -> None:
 
 def parse() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.course", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("run")
     one.add_argument("--out", type=Path, required=True)
-    one.add_argument("--seed", type=int, default=0)
+    one.add_argument("--seed", type=whole(0), default=0)
     one.add_argument("--preset", default="auto")
     one.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
     one.add_argument("--layout", default="randomised")
     one.add_argument("--vehicle", type=Path)
     one.add_argument("--learner", default="dreamer", choices=("dreamer", "ppo"))
-    one.add_argument("--instances", type=int, help="chairs side by side; the preset's unless given")
-    one.add_argument("--steps", type=int)
-    one.add_argument("--eval-every", type=int, help="environment steps; the preset's unless given")
-    one.add_argument("--lr", type=float, help="learning rate; the preset's unless given")
+    one.add_argument("--instances", type=whole(), help="chairs side by side; the preset's unless given")
+    one.add_argument("--steps", type=whole())
+    one.add_argument("--eval-every", type=whole(), help="environment steps; the preset's unless given")
+    one.add_argument("--lr", type=in_range(0), help="learning rate; the preset's unless given")
     one.add_argument("--targets", action="store_true", help="the world model also predicts what the simulator knows")
     one.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="other settings of the learner")
-    one.add_argument("--ratio", type=float, help="replayed steps per environment step; the preset's unless given")
-    one.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
-    one.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
-    one.add_argument("--second-tries", type=float, help="share of failed worlds begun again; the preset's unless given")
-    one.add_argument("--episodes", type=int, default=1000, help="of the final evaluation and the proofs of sight")
+    one.add_argument("--ratio", type=in_range(0), help="replayed steps per environment step; the preset's unless given")
+    one.add_argument("--repeat", type=whole(), help="control periods that a decision holds; the preset's unless given")
+    one.add_argument("--starts", type=in_range(0, 1), help="share of exploring starts; the preset's unless given")
+    one.add_argument("--second-tries", type=in_range(0, 1),
+                     help="share of failed worlds begun again; the preset's unless given")
+    one.add_argument("--episodes", type=whole(), default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
     one.add_argument("--training-only", action="store_true", help="no final evaluation, policy file or proofs of sight")
-    one.add_argument("--checkpoint-s", type=float, default=60.0, help="seconds between checkpoints")
-    one.add_argument("--beside", type=int, default=0, help="other trainings on the same device: its time says nothing")
+    one.add_argument("--checkpoint-s", type=in_range(0), default=60.0, help="seconds between checkpoints")
+    one.add_argument("--beside", type=whole(0), default=0,
+                     help="other trainings on the same device: its time says nothing")
     one.set_defaults(call=run)
     side = commands.add_parser("together")
     side.add_argument("--out", type=Path, required=True)
-    side.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    side.add_argument("--seeds", type=whole(0), nargs="+", default=[0, 1, 2, 3, 4])
     side.add_argument("--preset", default="paper")
     side.add_argument("--task", default="obstacle_course", choices=("obstacle_course", "corridor"))
-    side.add_argument("--repeat", type=int, help="control periods that a decision holds; the preset's unless given")
-    side.add_argument("--starts", type=float, help="share of exploring starts; the preset's unless given")
+    side.add_argument("--repeat", type=whole(), help="control periods that a decision holds; the preset's unless given")
+    side.add_argument("--starts", type=in_range(0, 1), help="share of exploring starts; the preset's unless given")
     side.add_argument("--layout", default="randomised")
     side.add_argument("--vehicle", type=Path)
-    side.add_argument("--steps", type=int)
-    side.add_argument("--minutes", type=float, help="stop by then; the same command goes on")
+    side.add_argument("--steps", type=whole())
+    side.add_argument("--minutes", type=in_range(0), help="stop by then; the same command goes on")
     side.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the learner")
     side.set_defaults(call=together)
     several = commands.add_parser("collect")
@@ -306,11 +310,12 @@ def parse() -> argparse.Namespace:
     tried.add_argument("--device", required=True, help="on which they were made")
     tried.set_defaults(call=ablation)
     ceiling = commands.add_parser("planner")
-    ceiling.add_argument("--episodes", type=int, default=200)
+    ceiling.add_argument("--episodes", type=whole(), default=200)
     ceiling.set_defaults(call=planner)
     return parser.parse_args()
 
 
 if __name__ == "__main__":
-    arguments = parse()
-    arguments.call(arguments)
+    with guarded():
+        arguments = parse()
+        arguments.call(arguments)

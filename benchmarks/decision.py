@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from sysid.pages.report import write_report
 from sysid.weighing.posterior import Posterior, Weighed, posterior
 from sysid.weighing.saved_evidence import load
 from sysid.weighing.verdict import Rules, Verdict, calibration_scores, decide
+from whill_mjx.io.command_line import COUNT, run
 
 SCORES = Path("sysid/data/null_scores.json")
 MISSING = RESULTS.parents[1] / "sysid" / "missing"
@@ -49,7 +50,7 @@ class Benchmark:
     """Write the figures."""
     verbose: bool = False
     """Print every log."""
-    processes: int = 1
+    processes: Annotated[int, COUNT] = 1
     work: Path = Path("runs/evidence")
 
 
@@ -256,6 +257,4 @@ def _same(mine: Mapping[str, float], theirs: Mapping[str, float]) -> bool:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark, description=__doc__))
+    run(Benchmark, main, __doc__, positional=False)

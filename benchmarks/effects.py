@@ -16,10 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bridge.options import Parser
 from whill_mjx import share_results
 from whill_mjx.effects import EFFECTS, equation, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Alike, Axis, Scale
+from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import body_twist
@@ -259,12 +261,14 @@ def draw(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    share_results()
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.effects", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("what", choices=("page", "figure"))
-    if parser.parse_args().what == "page":
-        write_text(DOCS / "effects.md", page())
-    else:
-        draw(DOCS / "images" / "effects.png")
+    with guarded():
+        share_results()
+        parser = Parser(
+            prog="python -m benchmarks.effects", description=__doc__,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        parser.add_argument("what", choices=("page", "figure"))
+        if parser.parse_args().what == "page":
+            write_text(DOCS / "effects.md", page())
+        else:
+            draw(DOCS / "images" / "effects.png")

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import jax
 
 from benchmarks.harness import figure, record, time_calls
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, run
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of the benchmark."""
 
-    instances: int = 0
+    instances: Annotated[int, NOT_NEGATIVE] = 0
     """Instances; 0 takes 16,384 on an accelerator and 256 on a CPU."""
-    steps: int = 20
+    steps: Annotated[int, COUNT] = 20
     """Control steps per timed call."""
-    repeats: int = 5
+    repeats: Annotated[int, COUNT] = 5
     """Timed calls."""
 
 
@@ -45,6 +47,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Options, prog="python -m benchmarks.environment", description=__doc__))
+    run(Options, main, __doc__, positional=False)

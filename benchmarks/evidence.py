@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -23,11 +22,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
 
+from benchmarks import kept
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
 from benchmarks.undeclared_plant import capped, power_sizes
@@ -40,6 +40,7 @@ from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.verdict.result import LoopConfig, Prepared
 from sysid.weighing.make_evidence import Maker
 from sysid.weighing.saved_evidence import save
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, run
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 
@@ -71,14 +72,14 @@ class Benchmark:
 
     stages: tuple[Stage, ...] = ("tuning", "test")
     kinds: tuple[str, ...] = ("null", "scaled", "noisy", "pair")
-    nulls: int = 40
+    nulls: Annotated[int, COUNT] = 40
     """Logs with nothing in them, for each noise level."""
     only: tuple[str, ...] = ()
     """Labels that begin with one of these."""
-    seconds: float = 1e9
+    seconds: Annotated[float, NOT_NEGATIVE] = 1e9
     """After which no further log is begun."""
     work: Path = Path("runs/evidence")
-    reference: int = 0
+    reference: Annotated[int, NOT_NEGATIVE] = 0
     """Set of reference days."""
     all_cores: bool = False
     """One process for each core; this one only waits for them."""
@@ -137,9 +138,9 @@ def ready_vehicle(work: Path, reference: int) -> Prepared:
         ready = prepared(work, reference, USUAL, LoopConfig())
         temporary = path.with_name(f"{path.name}.{os.getpid()}")
         params = jax.tree.map(np.asarray, ready.reference.params)  # arrays that any version reads
-        temporary.write_bytes(pickle.dumps((replace(ready.reference, params=params), ready.wander)))
+        temporary.write_bytes(kept.dumps((replace(ready.reference, params=params), ready.wander)))
         os.replace(temporary, path)
-    fitted, wander = pickle.loads(path.read_bytes())
+    fitted, wander = kept.loads(path.read_bytes())
     spec = reference_days(work, USUAL, reference)[0].spec
     found = hypotheses(spec, fitted.params)
     full = with_catalogue(fitted.params, found)
@@ -242,6 +243,4 @@ def truth_of(work: Path, stage: Stage, labels: Sequence[str]) -> list[dict[str, 
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark, description=__doc__))
+    run(Benchmark, main, __doc__, positional=False)

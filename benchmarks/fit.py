@@ -43,6 +43,7 @@ from sysid.logs.log import Log, load_log
 from sysid.search.comparison import Judge
 from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, make_problem
 from sysid.search.settings import FitConfig
+from whill_mjx.io.command_line import run
 
 
 def plant(settings: Benchmark) -> None:
@@ -308,6 +309,4 @@ def main(settings: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark, prog="python -m benchmarks.fit", description=__doc__))
+    run(Benchmark, main, __doc__, positional=False)

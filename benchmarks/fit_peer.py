@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -40,6 +40,7 @@ from sysid.search.comparison import Judge, Recorder
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
 from sysid.search.valleys import gradient_search
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, run
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 
@@ -54,17 +55,17 @@ SIDES = ("left", "right")
 class Peer:
     """What is compared."""
 
-    trials: int = 18
+    trials: Annotated[int, COUNT] = 18
     """Fitted trials: the first of three replicates of six manoeuvres of 22 s."""
-    seed: int = 3
+    seed: Annotated[int, SEED] = 3
     """Day of the contact plant."""
     preset: bool = False
     """Ours has the preset's values of what is not fitted, not those of another day; the peer those of the plant."""
-    other_day: int = 4
+    other_day: Annotated[int, COUNT] = 4
     """The day that it knows them from."""
-    iterations: int = 40
+    iterations: Annotated[int, COUNT] = 40
     """Of both searches, at most."""
-    eps: float = 1e-4
+    eps: Annotated[float, NOT_NEGATIVE] = 1e-4
     """Step of its finite differences; its own default, 1.5e-8, is lost in the rounding of contacts."""
 
 
@@ -307,6 +308,4 @@ def main(settings: Peer) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Peer, prog="python -m benchmarks.fit_peer", description=__doc__))
+    run(Peer, main, __doc__, positional=False)

@@ -26,6 +26,8 @@ from statistics import median
 from benchmarks.harness import figure, record
 from benchmarks.import_graph import circles, floors, import_graph
 from benchmarks.prose import sentences
+from bridge.options import Parser, whole
+from whill_mjx.io.command_line import guarded
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
@@ -167,14 +169,14 @@ def compare_times(other: Path, programs: list[str], rounds: int) -> dict[str, di
 
 def main() -> None:
     """Count, compare and record."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.house", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--against", type=Path, help="another checkout of the project")
     parser.add_argument("--lowered", action="store_true", help="compare lowered programs with it")
     parser.add_argument("--times", nargs="*", choices=TIMED, default=[],
                         help="programs whose seconds are compared with it")
-    parser.add_argument("--rounds", type=int, default=1, help="of timing both trees, five calls a program each")
+    parser.add_argument("--rounds", type=whole(), default=1, help="of timing both trees, five calls a program each")
     options = parser.parse_args()
     if (options.lowered or options.times) and options.against is None:
         parser.error("--lowered and --times need --against CHECKOUT")
@@ -189,4 +191,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

@@ -5,7 +5,6 @@ Run by `benchmarks.house` once for each of two trees, as a script: it imports th
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import re
@@ -17,6 +16,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from bridge.options import Parser
+from whill_mjx.io.command_line import guarded
 
 COUNT = 64  # instances
 REPEATS = 5
@@ -147,7 +149,7 @@ def loop() -> float:
 
 def main() -> None:
     """Write digests or seconds as JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.house_programs", description=__doc__)
+    parser = Parser(prog="python -m benchmarks.house_programs", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file to write")
     parser.add_argument("--lowered", action="store_true", help="digests of programs")
     parser.add_argument("--times", nargs="*", default=[], help="programs whose seconds are wanted")
@@ -162,5 +164,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    found("share_results", "whill_mjx.processor")()
-    main()
+    with guarded():
+        found("share_results", "whill_mjx.processor")()
+        main()

@@ -22,10 +22,12 @@ import jax.numpy as jnp
 
 from benchmarks import harness, learner_study
 from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE, ROWS, STREAMS, random_replay, time_updates
+from bridge.options import Parser, in_range, whole
 from dreamer import agent as agents
 from dreamer import behavior, distributions, image, optim, replay, rssm, world_model
 from dreamer.config import DreamerConfig, preset
 from dreamer.rssm import Latent
+from whill_mjx.io.command_line import guarded
 
 Figures = dict[str, dict[str, Any]]
 CLAIM = "One DreamerV3 update, all of it on the device, as the training loop runs it."
@@ -127,18 +129,18 @@ def _bind(function: Callable[..., Any], arguments: tuple) -> Callable[[], Any]:
 
 def arguments() -> argparse.ArgumentParser:
     """The options."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.learner", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--preset", help="size; size12m on an accelerator and cpu on a CPU unless given")
-    parser.add_argument("--batch-size", type=int)
-    parser.add_argument("--unroll", type=int)
+    parser.add_argument("--batch-size", type=whole())
+    parser.add_argument("--unroll", type=whole())
     parser.add_argument("--dtype", choices=("bfloat16", "float32"), help="type of the products")
-    parser.add_argument("--blocks", type=int, default=5)
-    parser.add_argument("--per-block", type=int, default=10)
+    parser.add_argument("--blocks", type=whole(), default=5)
+    parser.add_argument("--per-block", type=whole(), default=10)
     parser.add_argument("--parts", action="store_true", help="also time the parts of an update")
     parser.add_argument("--peer", action="store_true", help="also time the learner of SheepRL at this size")
-    parser.add_argument("--peer-limit-s", type=float, default=600.0, help="for each of the peer's two ways")
+    parser.add_argument("--peer-limit-s", type=in_range(0), default=600.0, help="for each of the peer's two ways")
     learner_study.add_arguments(parser)
     parser.add_argument("--dry", action="store_true", help="print only")
     return parser
@@ -202,4 +204,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

@@ -14,6 +14,9 @@ import json
 import time
 from typing import Any
 
+from bridge.options import Parser, whole
+from whill_mjx.io.command_line import guarded
+
 LENGTH = 64
 ACTION_DIM = 2
 SHAPE = (3, 64, 64)
@@ -95,17 +98,18 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.learner_peer", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--size", default="12M", help="1M, 12M, 25M, 50M, 100M, 200M or 400M")
-    parser.add_argument("--batch-size", type=int, default=16)
+    parser.add_argument("--batch-size", type=whole(), default=16)
     parser.add_argument("--compile", action="store_true", help="torch.compile with CUDA graphs")
-    parser.add_argument("--blocks", type=int, default=5)
-    parser.add_argument("--per-block", type=int, default=10)
+    parser.add_argument("--blocks", type=whole(), default=5)
+    parser.add_argument("--per-block", type=whole(), default=10)
     print(json.dumps(measure(parser.parse_args())))
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

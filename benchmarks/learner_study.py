@@ -37,6 +37,7 @@ import jax.numpy as jnp
 
 from benchmarks import harness, learner_fused, learner_profile
 from benchmarks.learner_updates import Updates
+from bridge.options import in_range, whole
 from dreamer import distributions, recurrence, rssm
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent
@@ -73,13 +74,15 @@ class Variant:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the study."""
-    parser.add_argument("--batches", type=int, nargs="+", default=[], help="time these batch sizes")
-    parser.add_argument("--seeds-under-vmap", type=int, nargs="+", default=[], help="time so many seeds side by side")
+    parser.add_argument("--batches", type=whole(), nargs="+", default=[], help="time these batch sizes")
+    parser.add_argument("--seeds-under-vmap", type=whole(), nargs="+", default=[],
+                        help="time so many seeds side by side")
     parser.add_argument("--host-replay", action="store_true", help="time it with the observations on the host")
     parser.add_argument("--profile", action="store_true", help="count the kernels of an update and share out its time")
     parser.add_argument("--tries", nargs="*", choices=TRIES, help="time other programs; all of them unless named")
-    parser.add_argument("--compile-threads", type=int, default=1, help="programs compiled at once")
-    parser.add_argument("--limit-s", type=float, default=float("inf"), help="begin no further variant after so long")
+    parser.add_argument("--compile-threads", type=whole(), default=1, help="programs compiled at once")
+    parser.add_argument("--limit-s", type=in_range(0), default=float("inf"),
+                        help="begin no further variant after so long")
     parser.add_argument("--skip-base", action="store_true", help="do not time the update as it is")
     parser.add_argument("--one-profile", action="store_true", help=argparse.SUPPRESS)  # in a process of its own
     parser.add_argument("--one-fused", action="store_true", help=argparse.SUPPRESS)  # likewise: it could hang

@@ -17,7 +17,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +37,8 @@ from sysid.verdict.late_pose import NAME
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, refit_poses
+from whill_mjx.io import command_line
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -63,13 +65,13 @@ class Benchmark:
     parts: tuple[Literal["ladder", "change", "mrclam"], ...] = ("ladder", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
-    windows: int = 96
+    windows: Annotated[int, COUNT] = 96
     """Training steps of drive_norlab, spread evenly over each terrain; all held-out ones are scored."""
-    robot_windows: int = 16
+    robot_windows: Annotated[int, COUNT] = 16
     """Windows of 15 s of each robot of mrclam."""
-    rounds: int = 3
+    rounds: Annotated[int, COUNT] = 3
     """Loops at most, one after the other."""
-    physics_dt: float = 0.01
+    physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
 
 
@@ -287,6 +289,4 @@ def main(settings: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark, prog="python -m benchmarks.measured_loop", description=__doc__))
+    command_line.run(Benchmark, main, __doc__, positional=False)

@@ -5,13 +5,14 @@ A figure replaces one of the same name only if it was made on the same day or la
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.harness import RESULTS
+from bridge.options import Parser
+from whill_mjx.io.command_line import guarded
 
 
 def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> Path:
@@ -39,9 +40,10 @@ def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> 
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.merge", description=__doc__)
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    parser.add_argument("--only", nargs="+", default=(), metavar="NAME")
-    given = parser.parse_args()
-    for file in given.files:
-        print(merge(file, only=given.only))
+    with guarded():
+        parser = Parser(prog="python -m benchmarks.merge", description=__doc__)
+        parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
+        parser.add_argument("--only", nargs="+", default=(), metavar="NAME")
+        given = parser.parse_args()
+        for file in given.files:
+            print(merge(file, only=given.only))

@@ -27,7 +27,9 @@ import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
 from benchmarks.physics_rolls import BASE, compiled_roll
+from bridge.options import Parser, whole
 from whill_mjx.effects import EFFECTS
+from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.manoeuvres import command_table
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import drive, place
@@ -228,18 +230,18 @@ def record_speed(options: argparse.Namespace, on_cpu: bool) -> None:
 
 def main() -> None:
     """Print and record the parts asked for."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m benchmarks.physics", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     on_cpu = jax.devices()[0].platform == "cpu"
     counts = [512, 1024, 2048] if on_cpu else [1024, 32768, 131072]
-    parser.add_argument("--instances", type=int, nargs="+", default=counts)
+    parser.add_argument("--instances", type=whole(), nargs="+", default=counts)
     parser.add_argument("--vehicles", nargs="+", default=["loaded", BASE, "whill_cr_paper"])
-    parser.add_argument("--periods", type=int, default=5 if on_cpu else 20)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--periods", type=whole(), default=5 if on_cpu else 20)
+    parser.add_argument("--repeats", type=whole(), default=5)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=["speed"])
     parser.add_argument("--effects", nargs="+", choices=sorted(EFFECTS), help="of the part effects; default: all")
-    parser.add_argument("--worlds", type=int, default=0, help="of the peers; default 8192, on a CPU 64")
+    parser.add_argument("--worlds", type=whole(0), default=0, help="of the peers; default 8192, on a CPU 64")
     parser.add_argument("--dynamics", choices=("fused", "mjx"), default="fused")
     options = parser.parse_args()
     if "timestep" in options.parts:
@@ -259,4 +261,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

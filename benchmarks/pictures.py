@@ -23,6 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from bridge.options import Parser
+from whill_mjx.io.command_line import guarded
+
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 CAMERA = 288
 """Edge of the large camera picture [pixels]; the policy itself sees 64."""
@@ -193,7 +196,7 @@ def ros(out: Path) -> None:
 
 def main() -> None:
     """Draw what the command line names."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.pictures", description=__doc__,
+    parser = Parser(prog="python -m benchmarks.pictures", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     kinds = parser.add_subparsers(dest="kind", required=True)
     kinds.add_parser("drive", help="the moving picture")
@@ -211,5 +214,6 @@ def main() -> None:
 if __name__ == "__main__":
     from whill_mjx import share_results
 
-    share_results()
-    main()
+    with guarded():
+        share_results()
+        main()

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from dreamer.iteration import Metrics, TrainState, compile_iteration, init_state
 from dreamer.replay import Replay
 from dreamer.types import FunctionalEnv, Transition
 from whill_mjx.devices import choose_devices
+from whill_mjx.io.command_line import COUNT, run
 from whill_mjx.learning.setup import functional_env, make_training_env
 from whill_mjx.tasks.tasks import make_task
 
@@ -53,25 +54,25 @@ BYTES = {"pred": 1, "s8": 1, "u8": 1, "bf16": 2, "f16": 2, "s64": 8, "u64": 8, "
 class Options:
     """Options of the benchmark; everything counts per device."""
 
-    devices: tuple[int, ...] = ()
+    devices: Annotated[tuple[int, ...], COUNT] = ()
     """Device counts; none takes those of 1, 2 and 4 that exist. 1 is always measured, as the base."""
-    instances: int = 2048
+    instances: Annotated[int, COUNT] = 2048
     """Chairs."""
-    steps: int = 100
+    steps: Annotated[int, COUNT] = 100
     """Environment steps of a block, in one dispatch."""
-    batch: int = 16
+    batch: Annotated[int, COUNT] = 16
     """Sequences of a batch."""
-    length: int = 64
+    length: Annotated[int, COUNT] = 64
     """Steps of a sequence."""
-    updates: int = 10
+    updates: Annotated[int, COUNT] = 10
     """Updates of a block, in one dispatch."""
-    streams: int = 256
+    streams: Annotated[int, COUNT] = 256
     """Streams of the replay."""
-    rows: int = 256
+    rows: Annotated[int, COUNT] = 256
     """Steps of each stream that the replay holds."""
     preset: str = "size12m"
     """Size of the learner."""
-    blocks: int = 7
+    blocks: Annotated[int, COUNT] = 7
     """Timed blocks of each device count."""
     parts: tuple[str, ...] = ("env", "learner")
     """What to measure."""
@@ -271,6 +272,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Options, prog="python -m benchmarks.scaling", description=__doc__))
+    run(Options, main, __doc__, positional=False)

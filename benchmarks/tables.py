@@ -16,6 +16,8 @@ from typing import Any
 
 from benchmarks.claims import CLAIMS, HEADLINES, Claim
 from benchmarks.harness import RESULTS
+from bridge.options import Parser
+from whill_mjx.io.command_line import guarded
 
 HEAD = """# Benchmarks
 
@@ -199,7 +201,7 @@ def pages(results: Path = RESULTS) -> dict[Path, str]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Write or check both pages."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.tables", description=__doc__,
+    parser = Parser(prog="python -m benchmarks.tables", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; fail where a page is out of date")
     given = parser.parse_args(arguments)
@@ -211,4 +213,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

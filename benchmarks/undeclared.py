@@ -5,6 +5,7 @@
 
     for i in $(seq 44); do python -m benchmarks.undeclared --nulls 200 --reference-sets 44 --part $i/44 & done; wait
     for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
+    for i in $(seq 16); do python -m benchmarks.undeclared --sensor-noise 0.5 2 4 --share & done; wait
     python -m benchmarks.undeclared --collect
 
 The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes
@@ -19,7 +20,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import prepare
 from sysid.verdict.result import LoopConfig, Prepared
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, run
 from whill_mjx.vehicle.config import VehicleConfig
 
 REFERENCES = ("plain", "plain_2", "plain_3", "plain_4", "plain_5", "plain_6")
@@ -49,35 +51,39 @@ class Benchmark:
     """Which of them."""
     data: Path = Path("../shared/data")
     """Folder with `plant` and `undeclared`."""
-    nulls: int = 0
+    nulls: Annotated[int, NOT_NEGATIVE] = 0
     """Logs of the contact plant with nothing in them."""
-    reference_sets: int = 1
+    reference_sets: Annotated[int, COUNT] = 1
     """Sets of reference days that these are judged against in turn; all else is judged against the first. With as many
     sets as there are processes (`part`), each makes one."""
-    own_sets: int = 0
+    own_sets: Annotated[int, NOT_NEGATIVE] = 0
     """Further logs with nothing in them, each judged against a set of its own: their p-values are independent."""
     base: bool = False
     """Logs of the contact plant with one effect each, from its base size to the one that is noticed with 80 % power."""
     scales: tuple[float, ...] = ()
     """The same at multiples of that size."""
-    seeds: int = 1
+    seeds: Annotated[int, COUNT] = 1
     """Logs of each effect and multiple."""
-    noise: float = 1.0
+    noise: Annotated[float, NOT_NEGATIVE] = 1.0
     """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
+    sensor_noise: tuple[float, ...] = ()
+    """Factors on the disturbances and the sensor noise of further logs alone, whose reference days keep the usual ones:
+    `noisy_nulls` with nothing in them, and `seeds` of each effect at four times that size."""
+    noisy_nulls: int = 40
     vehicle: Literal["chair", "scooter", "robot"] = "chair"
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
-    pairs: int = 0
+    pairs: Annotated[int, NOT_NEGATIVE] = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
     """The logs of 4 times that size against a catalogue that lacks the effect; after those logs are driven."""
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
-    full: int = 4
+    full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
     """How long the whole command takes, from start to report, on a log of 27 trials with six reference days."""
-    refit_nulls: int = 0
+    refit_nulls: Annotated[int, NOT_NEGATIVE] = 0
     """Simulated days that are refitted meanwhile."""
     classes: bool = False
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
@@ -103,7 +109,8 @@ def main(settings: Benchmark) -> None:
     """Run what was asked for."""
     if settings.shared:
         shared(settings)
-    if settings.nulls or settings.own_sets or settings.base or settings.scales or settings.pairs or settings.left_out:
+    if (settings.nulls or settings.own_sets or settings.base or settings.scales or settings.pairs or settings.left_out
+            or settings.sensor_noise):
         plant(settings)
     if settings.speed:
         contact.speed(settings.work / "plant", settings.refit_nulls)
@@ -166,6 +173,9 @@ def plant(settings: Benchmark) -> None:
         judge(listed)
     if settings.scales:
         judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
+    if settings.sensor_noise:
+        judge(contact.noisy_jobs(work, settings.sensor_noise, settings.noisy_nulls, settings.seeds, part, driven,
+                                 settings.only))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:
@@ -209,6 +219,4 @@ def write_json(path: Path, content: Any) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Benchmark, prog="python -m benchmarks.undeclared", description=__doc__))
+    run(Benchmark, main, __doc__, positional=False)

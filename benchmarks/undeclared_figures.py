@@ -38,7 +38,9 @@ SAME = {  # effects that the plant and the catalogue write alike: parameter, its
 def figures(work: Path, driven: Driven = USUAL) -> None:
     """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
     cases = list(read_cases(work))
-    found = {**of_nulls([one for truth, one in cases if not truth])}
+    noisy = [(truth, one) for truth, one in cases if one["stage"] == "noisy"]
+    cases = [(truth, one) for truth, one in cases if one["stage"] != "noisy"]
+    found = {**of_nulls([one for truth, one in cases if not truth]), **of_noisy(noisy)}
     singles = [(next(iter(truth)), one) for truth, one in cases if one["stage"] == "scaled"]
     for scale in sorted({one["scale"] for _, one in singles}):
         found.update(of_singles([(name, one) for name, one in singles if one["scale"] == scale], f"_{scale:g}x"))
@@ -63,14 +65,15 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
              for name, size in power_sizes(work).items()} if driven == USUAL else recorded.get("sizes", {})
     path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
     content = {**json.loads(path.read_text()), "sizes": sizes}
-    judged = {_kind(truth, one["stage"]) for truth, one in cases}  # others may have been judged in another folder
+    cases += noisy  # others may have been judged in another folder
+    judged = {_kind(truth, one["stage"]) for truth, one in cases}
     kept = [row for row in recorded.get("confusion", [])
             if _kind(row["truth"], row["stage"]) not in judged or driven_of(row) != driven]
     content["confusion"] = kept + [
         {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": driven.noise,
          "vehicle": driven.vehicle, "verdict": one["verdict"],
          "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
-         "explained": one["share"]} for truth, one in cases]
+         "explained": one["share"], "sensor_noise": one.get("noise", 1.0)} for truth, one in cases]
     write_report(path, content)
 
 
@@ -110,6 +113,25 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
             p_values = [p_of(one["p_value"]) for one in apart]
             found[name] = figure([float(stats.kstest(p_values, "uniform").pvalue)],
                                  f"of {len(apart)} logs over {sets_of(apart)} sets of reference days")
+    return found
+
+
+def of_noisy(cases: Sequence[Case]) -> dict[str, Any]:
+    """False alarms, factors inside their intervals, and names, of logs noisier or quieter than the reference days."""
+    found = {}
+    for level in sorted({one["noise"] for _, one in cases}):
+        mine, tag = [(truth, one) for truth, one in cases if one["noise"] == level], f"_sensor_noise_{level:g}"
+        nulls = [one for truth, one in mine if not truth]
+        if nulls:
+            false = sum(one["verdict"] != "none" for one in nulls)
+            about = f"logs with nothing in them at {level:g} times the noise of the reference days"
+            found[f"false_alarms{tag}"] = figure([float(false)], f"of {len(nulls)} {about}")
+            found[f"false_alarm_upper{tag}"] = figure([upper_rate(false, len(nulls))], f"share of {about}")
+            inside = [each["interval"][0] <= level <= each["interval"][1]
+                      for one in nulls for each in one["noise_levels"].values()]
+            found[f"noise_factor_coverage{tag}"] = figure(
+                [float(np.mean(inside))], f"share of {len(inside)} 95 % intervals of {len(nulls)} logs")
+        found.update(of_singles([(next(iter(truth)), one) for truth, one in mine if truth], f"_4x{tag}"))
     return found
 
 

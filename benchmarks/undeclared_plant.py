@@ -64,13 +64,15 @@ class Job:
     scale: float = 0.0
     """Multiple of the 80 %-power size; 0 at base size and where there is nothing."""
     stage: str = "null"
-    """null, base, scaled, pair or left_out."""
+    """null, base, scaled, pair, left_out or noisy."""
     log: str = ""
     """Label of the log, where another job drives it."""
     without: tuple[str, ...] = ()
     """Effects that the catalogue does not have."""
     reference: int = 0
     """Set of reference days that it is judged against."""
+    noise: float = 1.0
+    """Factor on its noise beside that of the reference days."""
 
 
 def mine(number: int, part: str) -> bool:
@@ -106,6 +108,22 @@ def _dealt(null: int, sets: int, part: str) -> int:
 def own_set_jobs(count: int, part: str) -> list[Job]:
     """Logs with nothing in them, each against a set of reference days that no other log is judged against."""
     return [Job(f"null_own_{n:03d}", {}, OWN_SEED + n, reference=OWN_SET + n) for n in range(count) if mine(n, part)]
+
+
+def noisy_jobs(
+    work: Path, levels: Sequence[float], nulls: int, seeds: int, part: str, driven: Driven = USUAL,
+    only: Sequence[str] = ()
+) -> list[Job]:
+    """Logs noisier or quieter than the reference days: with nothing in them, and those of `scaled_jobs` at four times
+    the size. They are mixed, so that a part of them is a fair part."""
+    listed = [(n / nulls, Job(f"noise_{level:g}_{n:03d}", {}, 20000 + n + round(1000 * (level - 1)), stage="noisy",
+                              noise=level))
+              for n in range(nulls) for level in levels]
+    scaled = scaled_jobs(work, (4.0,), seeds, "1/1", driven, only)
+    listed += [(n / len(scaled), replace(job, label=f"{job.label}_noise_{level:g}", seed=job.seed + 4000,
+                                         stage="noisy", noise=level))
+               for level in levels for n, job in enumerate(scaled)]
+    return [job for n, (_, job) in enumerate(sorted(listed, key=lambda one: one[0])) if mine(n, part)]
 
 
 def probe_jobs(work: Path, part: str, only: Sequence[str] = ()) -> list[Job]:
@@ -254,11 +272,11 @@ def judge(
         return json.loads(verdict.read_text())
     folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
-        make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise, vehicle=driven.vehicle)
+        make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise * job.noise, vehicle=driven.vehicle)
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = find_missing(load_log(folder), (), config, reference=ready)
-    content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, **brief(result),
+    content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, "noise": job.noise, **brief(result),
                "seconds": time.perf_counter() - began}
     if full and result.search.verdict == "named":
         report = make_report(result)
@@ -300,6 +318,7 @@ def brief(result: Result) -> dict[str, Any]:
             "scan_p": found.scan.p_family, "worth": float(found.scan.worth.max()),
             "worth_limit": float(np.quantile(found.scan.null.max(1), 1 - alpha)),
             "excess_limit": wander.excess_limit(alpha), "warnings": warnings(result),
+            "noise_levels": {} if result.noise is None else result.noise.report(),
             "effects": [{key: one[key] for key in ("name", "class", "parameters", "p_value")}
                         for one in named_effects(result)] if found.verdict == "named" else [],
             "stood": [{"effect": one.effect, "manoeuvres": one.agreement.outcome, "scatter": one.agreement.scatter,

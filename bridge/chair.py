@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from bridge import ros
+from bridge.options import Parser, in_range
 from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
 
 SLOW = 0.15
@@ -52,10 +53,10 @@ class ChairNode:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="bridge.chair", description="Publish the odometry of a WHILL Model CR2.")
+    parser = Parser(prog="bridge.chair", description="Publish the odometry of a WHILL Model CR2.")
     parser.add_argument("--state-topic", default=ros.CHAIR_STATE_TOPIC)
-    parser.add_argument("--wheel-radius", type=float, default=WHEEL_RADIUS, help="[m], loaded")
-    parser.add_argument("--tread", type=float, default=TREAD, help="[m], between the drive wheels")
+    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=WHEEL_RADIUS, help="[m], loaded")
+    parser.add_argument("--tread", type=in_range(0.01, 5), default=TREAD, help="[m], between the drive wheels")
     return parser.parse_args(arguments)
 
 

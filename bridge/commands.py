@@ -122,7 +122,8 @@ class CommandListener:
         self._on_command = on_command
         self._own = ros.full_name(node)
         namespace = self._own.rpartition("/")[0]
-        tools = [f"{namespace}/{name}" for name in (ros.DRIVE_NAME, ros.GUARD_NAME, ros.RECORD_NAME)]
+        names = (ros.DRIVE_NAME, ros.GUARD_NAME, ros.RECORD_NAME, ros.MANOEUVRE_NAME)
+        tools = [f"{namespace}/{name}" for name in names]
         self._known = [self._own, *(name for name in tools if name != self._own)]
         self._guard = f"{namespace}/{ros.GUARD_NAME}"
         if kind != "auto":

@@ -22,13 +22,16 @@ BLIND_FRAMES = 5
 """Uniform frames in a row that count as a dark or saturated camera."""
 BLIND = "dark or saturated camera"
 OnBlind = Literal["warn", "slow", "stop"]
+NOVEL = "surroundings unlike the training"
+OnNovel = Literal["ignore", "slow", "stop"]
 
 
 class Controller:
     """One policy driving one vehicle."""
 
     def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic,
-                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, crop: Crop | None = None) -> None:
+                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, crop: Crop | None = None,
+                 on_novel: OnNovel = "stop") -> None:
         """Join a policy and its limits.
 
         Args:
@@ -39,7 +42,10 @@ class Controller:
             pace_by_stamp: run the policy at its rate in the time of the stamps instead of the wall clock's, for a
                 simulator whose time is slower or faster than the wall clock.
             crop: the part of the camera's image that the policy sees; None: all of it.
+            on_novel: what images cause that surprise the policy more than its training did, where its file says how
+                much that is.
         """
+        self._on_novel = on_novel
         self.policy = policy
         self.supervisor = Supervisor(safety)
         self.unusable = ""
@@ -114,6 +120,7 @@ class Controller:
             supervisor.counts["policy error"] += 1
             self.unusable = f"the policy failed: {error}"
             action = np.full(2, np.nan)
+        self._watch_novelty()
         return self._send(now, supervisor.action(now, action, self._clock() - start))
 
     def on_tick(self, now: float) -> Command | None:
@@ -155,6 +162,18 @@ class Controller:
             self.supervisor.block(BLIND, blind)
         elif self._on_blind == "slow":
             (self.supervisor.slow.add if blind else self.supervisor.slow.discard)(BLIND)
+
+    def _watch_novelty(self) -> None:
+        """Slow down, then stop for good, while the policy's surprise is larger than its own world made it."""
+        limits = getattr(self.policy.contract, "novelty", None)
+        if limits is None or self._on_novel == "ignore":
+            return
+        slow, stop = limits
+        novelty = self.policy.novelty
+        (self.supervisor.slow.add if novelty >= slow else self.supervisor.slow.discard)(NOVEL)
+        if novelty >= stop and self._on_novel == "stop":
+            self.supervisor.counts["novel surroundings"] += 1
+            self.supervisor.latch(NOVEL)
 
     @property
     def is_blind(self) -> bool:

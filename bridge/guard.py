@@ -16,6 +16,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
+from bridge.options import Parser, whole
 
 SILENCE = 0.15
 """[s]; a driving policy node gives a sign of life at least every 50 ms."""
@@ -205,11 +206,12 @@ class GuardLink:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
+    parser = Parser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
     parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
-    parser.add_argument("--realtime", type=int, default=0, metavar="PRIORITY", help="SCHED_FIFO priority, like 20")
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
+                        help="SCHED_FIFO priority, like 20")
     return parser.parse_args(arguments)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge import ros
+from bridge.options import in_range, whole
 from bridge.safety import Supervisor
 
 E_STOP, E_STOP_UNKNOWN = "emergency stop", "emergency stop unknown"
@@ -113,8 +114,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                              "once it was heard")
     parser.add_argument("--enable", choices=("require", "ignore"), default="ignore",
                         help="std_msgs/Bool on enable; require: stand unless it says true now")
-    parser.add_argument("--dead-man-button", type=int, default=-1, metavar="INDEX",
+    parser.add_argument("--dead-man-button", type=whole(-1, 1000), default=-1, metavar="INDEX",
                         help="sensor_msgs/Joy on joy: stand unless this button is held; -1: none")
-    parser.add_argument("--signal-age", type=float, default=0.5, help="a signal that is older is unknown [s]")
+    parser.add_argument("--signal-age", type=in_range(0, infinite=True), default=0.5,
+                        help="a signal that is older is unknown [s]")
     parser.add_argument("--collision", choices=("latch", "release", "ignore"), default="latch",
                         help="on collision_sensor true: stop until re-armed, stop while it lasts, or take no notice")

@@ -2,8 +2,11 @@
 
     python -m bridge.record logs/monday figure_eight_1
 
-Rows are written as they come into a hidden folder of the dataset, which moves to its place when the recording ends; a
-killed recorder leaves the hidden folder with all rows but the last second's.
+Every message counts: readers fit the publishers' quality of service and let many messages wait. `t` is the time of
+receipt on the steady clock; the column `stamp` keeps the message's own stamp.
+
+Rows are written as they come into a hidden folder of the dataset, which moves to its place when the recording ends. A
+killed recorder leaves the hidden folder with all rows but the last second's; `--recover` gives it its place.
 """
 
 import argparse
@@ -19,12 +22,21 @@ from typing import IO, Any
 
 from bridge import ros
 from bridge.commands import CommandListener
+from bridge.options import Parser, in_range
+from bridge.streams import Stream
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
-    "odometry": ("t", "x", "y", "yaw", "v", "omega"),
-    "ground_truth": ("t", "x", "y", "yaw"),
+    "odometry": ("t", "x", "y", "yaw", "v", "omega", "stamp"),
+    "ground_truth": ("t", "x", "y", "yaw", "stamp"),
+    "imu": ("t", "gyro", "stamp"),
 }
+TRIAL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
+PARTIAL = re.compile(r"\.(?P<trial>[A-Za-z0-9][\w.-]*)\.partial-(?P<process>\d+)")
+
+
+LOOK_PERIOD = 0.1
+"""Seconds between two looks for publishers."""
 
 
 class TrialWriter:
@@ -36,12 +48,7 @@ class TrialWriter:
         Raises:
             ValueError: the trial exists already, or its name is no plain file name.
         """
-        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", trial):
-            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
-                             "Choose another name, like circle_1.")
-        self.folder = Path(dataset) / "trials" / trial
-        if self.folder.exists():
-            raise ValueError(f"{self.folder}: exists already; a recording never replaces another. Choose another name.")
+        self.folder = self.check(dataset, trial)
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
         self._partial.mkdir()
@@ -53,6 +60,21 @@ class TrialWriter:
         self._yaw: float | None = None
         self.rows = dict.fromkeys(COLUMNS, 0)
 
+    @staticmethod
+    def check(dataset: str | Path, trial: str) -> Path:
+        """Return the folder of a trial that can be recorded.
+
+        Raises:
+            ValueError: as the constructor.
+        """
+        if not TRIAL_NAME.fullmatch(trial):
+            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
+                             "Choose another name, like circle_1.")
+        folder = Path(dataset) / "trials" / trial
+        if folder.exists():
+            raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
+        return folder
+
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
         if self._origin is None:
@@ -60,8 +82,11 @@ class TrialWriter:
         else:
             self._add("command", t, v, omega)
 
-    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float) -> None:
-        """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped."""
+    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float, stamp: float = 0.0) -> None:
+        """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped.
+
+        `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
+        """
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
         x0, y0, yaw0 = self._first_pose
@@ -69,11 +94,15 @@ class TrialWriter:
         dx, dy = x - x0, y - y0
         along = math.cos(yaw0) * dx + math.sin(yaw0) * dy
         left = -math.sin(yaw0) * dx + math.cos(yaw0) * dy
-        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega)
+        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega, stamp)
 
-    def ground_truth(self, t: float, x: float, y: float, yaw: float) -> None:
+    def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement of the drive-axle centre in the room."""
-        self._add("ground_truth", t, x, y, yaw)
+        self._add("ground_truth", t, x, y, yaw, stamp)
+
+    def imu(self, t: float, gyro: float, stamp: float = 0.0) -> None:
+        """Add the yaw rate [rad/s] of an inertial measurement unit."""
+        self._add("imu", t, gyro, stamp)
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""
@@ -101,6 +130,17 @@ class TrialWriter:
                                          f"{self._partial}. Make room and record again")
         os.replace(self._partial, self.folder)
         return self.folder
+
+    def put_aside(self) -> Path:
+        """End a recording that is no trial, such as a stopped drive; return its folder, below `aborted` in the dataset.
+
+        Raises:
+            OSError: as `close`.
+        """
+        aside = self.folder.parent.with_name("aborted")
+        aside.mkdir(exist_ok=True)
+        self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
+        return self.close()
 
     def _add(self, stream: str, t: float, *values: float) -> None:
         if not all(math.isfinite(value) for value in (t, *values)):
@@ -152,40 +192,106 @@ def toml_text(text: str) -> str:
 class RecordNode:
     """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
 
-    def __init__(self, node: Any, writer: TrialWriter, options: argparse.Namespace) -> None:
+    def __init__(self, node: Any, writer: TrialWriter | None, options: argparse.Namespace, seconds: float = 0.0
+                 ) -> None:
+        """Listen on the graph, for so long [s] or without end. What comes is dropped while `writer` is None."""
         from nav_msgs.msg import Odometry
+        from sensor_msgs.msg import Imu
 
         self.writer = writer
         self.failure: OSError | None = None
         """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
-        self._seconds = options.seconds
+        self._seconds = seconds
         self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
-        ros.steady_timer(node, 0.1, self._commands.look)
-        node.create_subscription(Odometry, options.odometry_topic, self._on_odometry, ros.best_effort())
-        node.create_subscription(Odometry, options.ground_truth_topic, self._on_ground_truth, ros.best_effort())
-        ros.steady_timer(node, 1.0, lambda: self._write(writer.flush))
+        self.streams = [Stream(node, Odometry, options.odometry_topic, self._on_odometry),
+                        Stream(node, Odometry, options.ground_truth_topic, self._on_ground_truth),
+                        Stream(node, Imu, options.imu_topic, self._on_imu)]
+        ros.steady_timer(node, LOOK_PERIOD, self._look)
+        ros.steady_timer(node, 1.0, self._flush)
 
     def finished(self) -> bool:
         """Return whether the recording time is over, or nothing can be written any more."""
         return self.failure is not None or bool(self._seconds) and time.monotonic() - self._started > self._seconds
 
+    def lost(self) -> dict[str, int]:
+        """Return how many messages of each topic the middleware lost, where it lost any."""
+        return {stream.name: stream.lost for stream in self.streams if stream.lost}
+
+    def _look(self) -> None:
+        self._commands.look()
+        for stream in self.streams:
+            stream.look()
+
+    def _flush(self) -> None:
+        self._write(lambda writer: writer.flush())
+
     def _on_command(self, v: float, omega: float) -> None:
-        self._write(self.writer.command, time.monotonic(), v, omega)
+        now = time.monotonic()
+        self._write(lambda writer: writer.command(now, v, omega))
 
     def _on_odometry(self, message: Any) -> None:
-        speed = message.twist.twist
-        self._write(self.writer.odometry, time.monotonic(), *planar_pose(message), speed.linear.x, speed.angular.z)
+        now, speed, stamp = time.monotonic(), message.twist.twist, ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.odometry(now, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
-        self._write(self.writer.ground_truth, time.monotonic(), *planar_pose(message))
+        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.ground_truth(now, *planar_pose(message), stamp))
 
-    def _write(self, write: Callable[..., None], *values: float) -> None:
+    def _on_imu(self, message: Any) -> None:
+        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
+        self._write(lambda writer: writer.imu(now, message.angular_velocity.z, stamp))
+
+    def _write(self, write: Callable[[TrialWriter], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
         try:
-            write(*values)
+            if self.writer is not None:
+                write(self.writer)
         except OSError as error:
             self.failure = self.failure or error
+
+
+def recover(dataset: Path) -> list[Path]:
+    """Give the recordings of killed recorders their place as trials; return their folders.
+
+    Raises:
+        ValueError: a trial of that name exists already.
+    """
+    found = []
+    for partial in sorted(dataset.glob(".*.partial-*")):
+        match = PARTIAL.fullmatch(partial.name)
+        if match is None or is_running(int(match["process"])):
+            continue
+        folder = dataset / "trials" / match["trial"]
+        if folder.exists():
+            raise ValueError(f"{partial}: cannot become {folder}, which exists already. Rename one of them.")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for path in partial.glob("*.csv"):
+            drop_torn_row(path)
+        os.replace(partial, folder)
+        found.append(folder)
+    return found
+
+
+def drop_torn_row(path: Path) -> None:
+    """Cut a row off that a killed recorder had only begun; every whole row ends with a line feed."""
+    content = path.read_bytes()
+    whole = content[: content.rfind(b"\n") + 1]
+    if len(whole) < len(content):
+        temporary = path.with_name(f".{path.name}.tmp")
+        temporary.write_bytes(whole)
+        os.replace(temporary, path)
+
+
+def is_running(process: int) -> bool:
+    """Return whether a process of this number exists on this computer."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def planar_pose(message: Any) -> tuple[float, float, float]:
@@ -197,21 +303,32 @@ def planar_pose(message: Any) -> tuple[float, float, float]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line. The geometry's defaults are those of the WHILL Model CR."""
-    parser = argparse.ArgumentParser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
+    parser = Parser(prog="bridge.record", description="Record one drive as a trial of a dataset.")
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
-    parser.add_argument("trial", help="name of the trial, like circle_1")
-    parser.add_argument("--seconds", type=float, default=0.0, help="end after so long; 0: at Ctrl-C or SIGTERM")
+    parser.add_argument("trial", nargs="?", help="name of the trial, like circle_1")
+    parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
+    parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
+                        help="end after so long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    add_dataset_options(parser)
+    options = parser.parse_args(arguments)
+    if (options.trial is None) != options.recover:
+        parser.error("give either the name of a trial or --recover")
+    return options
+
+
+def add_dataset_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the topics that are recorded, and what dataset.toml says of the vehicle."""
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
+    parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
     parser.add_argument("--vehicle", default="WHILL Model CR")
-    parser.add_argument("--wheel-radius", type=float, default=0.1325, help="[m]")
-    parser.add_argument("--track", type=float, default=0.496, help="[m]")
-    parser.add_argument("--wheelbase", type=float, default=0.45, help="[m]")
-    parser.add_argument("--mass", type=float, help="[kg], where known")
-    parser.add_argument("--v-limit", type=float, default=1.0, help="[m/s]")
-    parser.add_argument("--omega-limit", type=float, default=1.0, help="[rad/s]")
-    return parser.parse_args(arguments)
+    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
+    parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")
+    parser.add_argument("--wheelbase", type=in_range(0, 5), default=0.45, help="[m]")
+    parser.add_argument("--mass", type=in_range(0.01, 1e4), help="[kg], where known")
+    parser.add_argument("--v-limit", type=in_range(0.01, 100), default=1.0, help="[m/s]")
+    parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0, help="[rad/s]")
 
 
 def finish(writer: TrialWriter) -> Path | None:
@@ -225,6 +342,20 @@ def finish(writer: TrialWriter) -> Path | None:
     return folder
 
 
+def main_recover(dataset: Path) -> int:
+    """Recover what killed recorders left, and say what became of it."""
+    try:
+        found = recover(dataset)
+    except (ValueError, OSError) as error:
+        print(f"bridge.record: {error}", file=sys.stderr)
+        return 2
+    for folder in found:
+        print(f"bridge.record: {folder}: recovered", file=sys.stderr)
+    if not found:
+        print(f"bridge.record: {dataset}: no recording of a killed recorder is there", file=sys.stderr)
+    return 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Record until the time is over, SIGTERM or Ctrl-C.
 
@@ -232,6 +363,8 @@ def main(arguments: list[str] | None = None) -> int:
     """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
+    if options.recover:
+        return main_recover(options.dataset)
     try:
         writer = TrialWriter(options.dataset, options.trial)
         write_dataset_file(options.dataset, options)
@@ -241,9 +374,12 @@ def main(arguments: list[str] | None = None) -> int:
     failed = False
     try:
         with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
-            recorder = RecordNode(node, writer, options)
+            recorder = RecordNode(node, writer, options, options.seconds)
             ros.spin(node, recorder.finished)
             failed = recorder.failure is not None
+            for topic, count in recorder.lost().items():
+                print(f"bridge.record: {topic}: {count} messages were lost on the way. Record on the vehicle's own "
+                      "computer, or let the publisher be reliable.", file=sys.stderr)
     finally:
         folder = finish(writer)
     if failed or folder is None:

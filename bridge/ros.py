@@ -17,6 +17,10 @@ from typing import Any
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
+IMU_TOPIC = "imu"
+CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
+SCAN_TOPIC = "sensing/lidar/scan"
+PAUSE_TOPIC = "simulate/pause"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 CHAIR_STATE_TOPIC = "whill/states/model_cr2"
@@ -30,6 +34,7 @@ GUARD_TOPIC = "bridge/guard"
 DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
+MANOEUVRE_NAME = "bridge_manoeuvre"
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -97,16 +102,29 @@ def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], No
 def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
                      incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
     """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
+    subscribe_counting_losses(node, kind, topic, callback, best_effort(), lost, incompatible_qos=incompatible)
+
+
+def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
+                              lost: Callable[[Any], None], **callbacks: Any) -> Any:
+    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription."""
     try:
         from rclpy.event_handler import UnsupportedEventTypeError
     except ImportError:  # Humble
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
-        events = subscription_events(incompatible_qos=incompatible, message_lost=lost)
-        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+        events = subscription_events(message_lost=lost, **callbacks)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
     except UnsupportedEventTypeError:
-        events = subscription_events(incompatible_qos=incompatible)
-        node.create_subscription(kind, topic, callback, best_effort(), event_callbacks=events)
+        events = subscription_events(**callbacks)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+
+
+def is_reliable(policy: Any) -> bool:
+    """Return whether a publisher's reliability, as the graph gives it, is reliable."""
+    from rclpy.qos import ReliabilityPolicy
+
+    return bool(policy == ReliabilityPolicy.RELIABLE)
 
 
 def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
@@ -138,6 +156,40 @@ def diagnostics(node: Any) -> Callable[[bool, str, dict[str, Any]], None]:
         publisher.publish(message)
 
     return report
+
+
+def clock_publisher(node: Any) -> Callable[[int, int], None]:
+    """Return a function that publishes a time (seconds, nanoseconds) on /clock."""
+    from rosgraph_msgs.msg import Clock
+
+    publisher = node.create_publisher(Clock, "/clock", reliable())
+
+    def publish(seconds: int, nanoseconds: int) -> None:
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+        publisher.publish(message)
+
+    return publish
+
+
+def transform_publisher(node: Any) -> Callable[[Any], None]:
+    """Return a function that publishes an odometry's pose on /tf; it does nothing where tf2_msgs is not installed."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        return lambda odometry: None
+    from geometry_msgs.msg import TransformStamped
+
+    publisher = node.create_publisher(TFMessage, "/tf", reliable(10))
+
+    def publish(odometry: Any) -> None:
+        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+        position = odometry.pose.pose.position
+        message.transform.translation.x, message.transform.translation.y = position.x, position.y
+        message.transform.rotation = odometry.pose.pose.orientation
+        publisher.publish(TFMessage(transforms=[message]))
+
+    return publish
 
 
 def managed_node(name: str) -> Any:

@@ -70,6 +70,12 @@ def init_agent(config: DreamerConfig, obs_shape: ObsShape, action_dim: ActionSpe
     return AgentState(params, slow_value, optim.init(params), ReturnNorm(zero, jnp.copy(zero)), average)
 
 
+SURPRISE = "surprise"
+"""Name of the carry (N, 1) that holds a running mean of `rssm.surprise`, where it is asked for [nat]."""
+SURPRISE_RATE = 0.2
+"""Weight of the newest frame in it: half a second at 10 Hz."""
+
+
 def init_carry(config: DreamerConfig, batch: int, action_dim: ActionSpec) -> Carry:
     """Recurrent state of `batch` instances: all zeros mean the start of an episode."""
     latent = rssm.initial(config, batch)
@@ -121,7 +127,12 @@ def act(
         action = actions.sample(config, raw, noise)
         if greedy is not None:
             action = jnp.where(greedy[:, None], actions.mode(config, raw), action)
-    return {"deter": latent.deter, "stoch": latent.stoch, "action": action}, action
+    after = {"deter": latent.deter, "stoch": latent.stoch, "action": action}
+    if SURPRISE in carry:
+        fresh = rssm.surprise(config, params["dyn"], latent.deter, tokens)
+        mean = carry[SURPRISE] + SURPRISE_RATE * (fresh[:, None] - carry[SURPRISE])
+        after[SURPRISE] = jnp.where(is_first[:, None], fresh[:, None], mean)
+    return after, action
 
 
 def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -> tuple[Carry, jax.Array]:

@@ -57,6 +57,8 @@ class PolicyContract:
     """Control rate [1/s]."""
     action_repeat: int = 1
     """The policy is evaluated on every k-th tick; its command is held in between."""
+    novelty: tuple[float, float] | None = None
+    """Surprise [nat] from which the vehicle slows down, and at which it stops; needs a carry "surprise"."""
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Camera of the training, as plain JSON: pose and field of view, and the frame in which the pose is given."""
 
@@ -176,11 +178,72 @@ def export_agent(
         "action": {"kind": type(actions).__name__.lower(), "size": actions.width},
         "task": task,
     }
+    return _write_agent(path, model, params, table, network, checked)
+
+
+def export_sensing(
+    path: str | Path,
+    step: Callable[[Carry, dict[str, jax.Array]], tuple[Carry, jax.Array]],
+    carry: Mapping[str, jax.Array | np.ndarray],
+    obs_shape: Mapping[str, tuple[int, ...]],
+    weights: Any,
+    contract: PolicyContract,
+    *,
+    vehicle_file: str | Path | None = None,
+    check_steps: int = 200,
+) -> Path:
+    """Write the policy of a vehicle that observes other sensors than its camera alone, and return its folder.
+
+    It is an agent (`export_agent`) whose actions are commands: the contract's limits, rate and action repeat are in the
+    file too. The bridge, which feeds camera images alone, refuses it; evaluations read it.
+
+    Args:
+        path: folder to write; an existing policy file there is replaced as a whole.
+        step: pure function of one instance, (carry, observations by name) -> (carry, action (2,) in [-1, 1]).
+        carry: recurrent state by name; may be empty.
+        obs_shape: shapes by name, (H, W, C) of uint8 or (D,) of float32.
+        weights: pytree of the parameters.
+        contract: action, rate and task; its image and camera are not written.
+        vehicle_file: TOML vehicle file to put beside the policy.
+        check_steps: recurrent steps on random observations over which ONNX and JAX are compared.
+
+    Raises:
+        ValueError: the ONNX network needs operators outside the standard set or acts differently; nothing is written.
+    """
+    path = Path(path)
+    shapes = {name: jax.ShapeDtypeStruct(np.shape(value), value.dtype) for name, value in carry.items()}
+    inputs = jax.eval_shape(lambda: spaces.zeros({name: tuple(obs_shape[name]) for name in sorted(obs_shape)}))
+
+    def named_step(carry: Carry, obs: dict[str, jax.Array]) -> tuple[Carry, tuple[jax.Array, ...]]:
+        carry, action = step(carry, obs)
+        return carry, (action.astype(jnp.float32),)
+
+    network = Network(named_step, shapes, dict(inputs))
+    model = to_onnx(network)
+    checked = parity(model, network, check_steps)
+    vehicle = _describe(contract, "")
+    table = {
+        "schema": SCHEMA,
+        "kind": AGENT_KIND,
+        "observation": {name: list(shape) for name, shape in sorted(obs_shape.items())},
+        "action": {"kind": "box", "size": 2, **vehicle["action"]},
+        **{name: vehicle[name] for name in ("rate_hz", "action_repeat", "task")},
+    }
+    return _write_agent(path, model, weights, table, network, checked, vehicle_file)
+
+
+def _write_agent(
+    path: Path, model: bytes, weights: Any, table: dict[str, Any], network: Network, checked: dict[str, Any],
+    vehicle_file: str | Path | None = None,
+) -> Path:  # fmt: skip
+    """Write the folder of an agent, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
         (folder / "policy.onnx").write_bytes(model)
-        save_arrays(folder / "weights.npz", flatten_weights(params))
+        save_arrays(folder / "weights.npz", flatten_weights(weights))
+        if vehicle_file is not None:
+            _copy_vehicle(Path(vehicle_file), folder / "vehicle.toml", "")
         _finish(folder, path, table, network, checked)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -296,6 +359,7 @@ def _describe(contract: PolicyContract, vehicle_sha256: str) -> dict[str, Any]:
         "camera": dict(contract.camera),
         "task": contract.task,
         "vehicle_sha256": vehicle_sha256,
+        **({"novelty": list(contract.novelty)} if contract.novelty else {}),
     }
 
 

@@ -11,19 +11,32 @@ within their day-to-day spread, and the verdict is one of
 Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
 scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
 
-Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html and RUN/vehicle.toml with the effect in it.
+Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html and RUN/vehicle.toml with the effect in it. A loop
+that was stopped goes on where it was when the same command is given again.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
+
+if __name__ == "__main__":
+    listen()
 
 from sysid import command_line
+from sysid.logs.log import Log, check_same_vehicle
 from sysid.logs.sources import refuse_recording
-from sysid.verdict.pipeline import watched
+from sysid.missing.catalogue import hypotheses, outside_hypotheses
+from sysid.run_folder import file_label, run_folder, settings_of
+from sysid.verdict.pipeline import check_logs, watched
 from sysid.verdict.result import LoopConfig
+
+KIND = "sysid.close_loop"
+OUTPUTS = ("next_command.csv", "posterior.json", "evidence.npz.xz", "steps")
+STOPPED = "stopped; give the same command again to go on."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +53,11 @@ class Arguments:
     """Folder for the report and the vehicle file."""
     quick: bool = False
     """Fewer iterations, nulls and candidates."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Seed of the simulated nulls."""
-    refit_nulls: int = 0
+    refit_nulls: Annotated[int, Range(0, 1_000_000)] = 0
     """Simulated days with nothing missing that are refitted as the drives are (a few seconds each)."""
-    iterations: int = 15
+    iterations: Annotated[int, Range(1, 10_000)] = 15
     """Iterations of the base fit."""
     without: tuple[str, ...] = ()
     """Effects of the catalogue that are not looked for, because the vehicle cannot have them."""
@@ -54,32 +67,51 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Load, close the loop, open the held-out trials, write and print the verdict."""
-    from sysid.logs.measured import load_any
     from sysid.pages.loop_report import write_result
 
+    with refusing():
+        log, references, vehicle = load(arguments)
+        config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
+                            without=arguments.without, refit_nulls=arguments.refit_nulls)
+    chosen = {"data": log.sha256, "references": [one.sha256 for one in references], "decision": arguments.decision,
+              "vehicle": file_label(arguments.vehicle), **settings_of(config, ("thresholds",))}
+    with run_folder(arguments.out, KIND, OUTPUTS, chosen):
+        if arguments.decision == "posterior":
+            from sysid.weighing.decision import run as weigh
+
+            return weigh(log, references, arguments.out, config, vehicle)
+        return write_result(arguments.out, watched(log, references, config, vehicle))
+
+
+def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
+    """The drives, the reference drives and the vehicle, checked; ValueError or FileNotFoundError says what is wrong."""
+    from sysid.logs.measured import load_any
+    from whill_mjx.vehicle.presets import preset_params
+    from whill_mjx.vehicle.vehicle_file import load_vehicle
+
+    if arguments.vehicle is not None and arguments.reference:
+        raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to them.")
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
+    check_logs(log, references)
+    for path, other in zip(arguments.reference, references, strict=True):
+        if other.sha256 == log.sha256:
+            raise ValueError(f"--reference {path}: has the drives in question themselves. Give drives of other days.")
     vehicle = None
     if arguments.vehicle is not None:
-        from whill_mjx.vehicle.vehicle_file import load_vehicle
-
-        if references:
-            raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to "
-                             "them.")
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")
-        _, vehicle, _ = load_vehicle(arguments.vehicle)
-    config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
-                        without=arguments.without, refit_nulls=arguments.refit_nulls)
-    if arguments.decision == "posterior":
-        from sysid.weighing.decision import run as weigh
-
-        return weigh(log, references, arguments.out, config, vehicle)
-    return write_result(arguments.out, watched(log, references, config, vehicle))
+        spec, vehicle, _ = load_vehicle(arguments.vehicle)
+        check_same_vehicle(log, spec, str(arguments.vehicle), "The vehicle file must be of the same vehicle")
+    base = preset_params(log.spec, LoopConfig.preset) if vehicle is None else vehicle
+    known = {one.effect for one in (*hypotheses(log.spec, base), *outside_hypotheses(log.spec, base, ()))}
+    for name in arguments.without:
+        check_known("--without", name, sorted(known))
+    return log, references, vehicle
 
 
 def cli() -> None:
     """Command line."""
-    command_line.run(Arguments, main, __doc__)
+    command_line.run(Arguments, main, __doc__, stopped=STOPPED)
 
 
 if __name__ == "__main__":

@@ -7,19 +7,49 @@ dataset is docs/log_format.md's; an existing one gets the new trials added.
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
+
 from sysid import command_line
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import Log
+from whill_mjx.io.folders import LOCK_FILE, FolderRefused, check_place, lock_folder
 
 
 def main(config: ConvertConfig) -> Log:
     """Convert and say what was made."""
-    log, notes = convert(config)
+    with refusing(), dataset_folder(config.out):
+        log, notes = convert(config)
     for note in notes:
         print(note)
     print(f"{config.out}: {len(log.trials)} trials, {sum(trial.duration for trial in log.trials):.0f} s; look at it "
           f"with python -m sysid.inspect {config.out}")
     return log
+
+
+@contextmanager
+def dataset_folder(out: Path) -> Iterator[None]:
+    """Hold a dataset that trials are added to; FolderRefused for what is none, or cannot be written."""
+    if out.exists() and not out.is_dir():
+        raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
+    check_place("--out", out)
+    made = not out.exists()
+    if not made and not (out / "dataset.toml").exists() and any(one.name != LOCK_FILE for one in out.iterdir()):
+        raise FolderRefused(f"--out {out}: holds other files, and no dataset.toml. Choose another --out.")
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with lock_folder(out):
+            yield
+    finally:
+        if made and [one.name for one in out.iterdir()] == [LOCK_FILE]:
+            shutil.rmtree(out)
 
 
 def cli() -> None:

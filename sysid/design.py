@@ -12,7 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing
+
+if __name__ == "__main__":
+    listen()
 
 import numpy as np
 
@@ -22,6 +27,8 @@ from sysid.intervals.design import DEFAULT, Criterion, propose
 from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
+from whill_mjx.io.folders import check_place
+from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.specs import VehicleSpec
 
 
@@ -33,17 +40,17 @@ class DesignConfig:
     """Built-in vehicle, vehicle file, or the folder of a fit."""
     out: Path = Path("runs/command.csv")
     """Command file to write: t [s], v [m/s], omega [rad/s]. Beside it a page with the reasons."""
-    space: tuple[float, float] = (8.0, 8.0)
+    space: Annotated[tuple[float, float], Range(0.1, 10_000)] = (8.0, 8.0)
     """Length and width [m] of the free floor."""
-    margin: float | None = None
+    margin: Annotated[float | None, NOT_NEGATIVE] = None
     """How far the drive-axle centre stays from its edges [m]; by default the reach of the body."""
-    v_max: float | None = None
+    v_max: Annotated[float | None, POSITIVE] = None
     """Greatest speed [m/s]; by default the vehicle's, 1 at most."""
-    v_min: float | None = None
+    v_min: Annotated[float | None, Range(high=0)] = None
     """Least speed [m/s]; 0 forbids reversing."""
-    omega_max: float | None = None
+    omega_max: Annotated[float | None, POSITIVE] = None
     """Greatest yaw rate [rad/s]."""
-    seconds: float = 20.0
+    seconds: Annotated[float, Range(1, 3600)] = 20.0
     """Time in motion at most [s]."""
     criterion: Criterion = "a"
     """a: sum of variances, ruled by the largest uncertainty; d: volume."""
@@ -51,7 +58,7 @@ class DesignConfig:
     """What will be measured."""
     parameters: tuple[str, ...] = ()
     """Parameters of interest; by default all that a log can determine."""
-    count: int = 1
+    count: Annotated[int, Range(1, 100)] = 1
     """Manoeuvres to propose, one after the other; further ones are written as NAME_2.csv, ..."""
 
 
@@ -60,15 +67,20 @@ def main(config: DesignConfig) -> list[Path]:
     from sysid.pages.design_page import text, write_page
     from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 
-    spec, params, intervals, noise = load_subject(config.vehicle)
+    with refusing():
+        check_out(config)
+        spec, params, intervals, noise = load_subject(config.vehicle)
+        for name in config.parameters:
+            check_known("--parameters", name, describe(params))
     limits = Limits(
         max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
         min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
         min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
         float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
         config.seconds)
-    chosen, plans, space, before = propose(spec, params, limits, noise, config.channels, intervals, config.criterion,
-                                           config.count, config.parameters or None)
+    with refusing():
+        chosen, plans, space, before = propose(spec, params, limits, noise, config.channels, intervals,
+                                               config.criterion, config.count, config.parameters or None)
     paths = []
     for number, plan in enumerate(chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
@@ -80,6 +92,16 @@ def main(config: DesignConfig) -> list[Path]:
     for path in paths:
         print(f"wrote {path}")
     return paths
+
+
+def check_out(config: DesignConfig) -> None:
+    """Raise OptionError where the command files or the page cannot be written."""
+    if config.out.suffix != ".csv":
+        raise OptionError(f"--out {config.out}: must end in .csv. Correct the name.")
+    for path in (config.out, config.out.with_suffix(".html")):
+        if path.is_dir():
+            raise OptionError(f"--out {config.out}: {path} is a folder. Choose another name.")
+    check_place("--out", config.out)
 
 
 def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, float]], Noise]:

@@ -1,7 +1,8 @@
 """Fit a vehicle to a driving log: `python -m sysid.fit DATASET --out RUN`.
 
 Only training trials are fitted; held-out ones are predicted once, at the end, by the initial and the fitted vehicle.
-Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN/*.png and RUN/vehicle.toml.
+Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN/*.png and RUN/vehicle.toml. A fit that
+was stopped goes on where it was when the same command is given again.
 """
 
 from __future__ import annotations
@@ -10,14 +11,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from whill_mjx.io.command_line import listen
+
+if __name__ == "__main__":
+    listen()
+
 from sysid import command_line
+from sysid.logs.log import Log
 from sysid.logs.measured import load_any
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import parameter_table, table
-from sysid.search.fitting import expected_steps
-from sysid.search.settings import (
-    FitConfig,
-)
+from sysid.replay.models import Model
+from sysid.run_folder import run_folder, settings_of
+from sysid.search.fitting import check_settings, expected_steps
+from sysid.search.settings import GLOBAL, FitConfig
+from sysid.search.studies import open_storage, without_secrets
+from whill_mjx.io.command_line import refusing
+
+KIND = "sysid.fit"
+OUTPUTS = ("series.npz", "model.toml", "model.xml", "trajectories.png", "yaw.png", "errors.png", "close_loop", "steps")
+STOPPED = "stopped; give the same command again to go on."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,17 +58,53 @@ class Arguments(FitConfig):
 
 def main(arguments: Arguments) -> None:
     """Load, fit, write and print the summary."""
-    dataset = arguments.dataset
-    if arguments.close_loop and arguments.model:
-        raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
-                         "model. Leave one of the two out.")
-    settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
-    log = load_any(dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
+    with refusing():
+        if arguments.close_loop and arguments.model:
+            raise ValueError(f"--close-loop asks what the simulator's vehicle lacks, and {arguments.model} is another "
+                             "model. Leave one of the two out.")
+        if arguments.reference and not arguments.close_loop:
+            raise ValueError("--reference: only --close-loop asks for drives of other days. Add it or leave this out.")
+        if arguments.wheels and not arguments.model:
+            raise ValueError("--wheels: only a --model has joints or actuators to name. Add it or leave this out.")
+        settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
+        log = load_any(arguments.dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
+        check_storage(settings)
+        model = check_settings(log, settings)
+        references = [load_any(path) for path in arguments.reference]
+        if arguments.close_loop:
+            from sysid.verdict.pipeline import check_logs
+
+            check_logs(log, references)
+    chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
+              "chained": arguments.chained, **settings_of(settings)}
+    with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):
+        fit(arguments, settings, log, model)
+        if arguments.close_loop:
+            from sysid.pages.loop_report import write_result
+            from sysid.verdict.pipeline import watched
+            from sysid.verdict.result import LoopConfig
+
+            if settings.preset != "physical":
+                print("the loop starts from the physical base model")
+            config = LoopConfig(quick=settings.quick, seed=settings.seed)
+            write_result(arguments.out / "close_loop", watched(log, references, config))
+
+
+def check_storage(settings: FitConfig) -> None:
+    """Raise ValueError for a study's storage that cannot be opened, or that no search would use."""
+    if settings.storage and settings.method not in (*GLOBAL, "both"):
+        raise ValueError(f"--storage {without_secrets(settings.storage)}: --method {settings.method} has no global "
+                         "search to keep. Use --method tpe, cmaes or both, or leave it out.")
+    open_storage(settings.storage)
+
+
+def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None) -> None:
+    """Fit, write and print the summary."""
     for note in log.notes:
         print(note)
     progress, close = command_line.progress_bar(expected_steps(settings))
     try:
-        report = fit_dataset(dataset, arguments.out, config=settings, log=log, progress=progress,
+        report = fit_dataset(arguments.dataset, arguments.out, config=settings, log=log, progress=progress, model=model,
                              source={"train": arguments.train, "held_out_selection": arguments.held_out})
     finally:
         close()
@@ -70,23 +119,14 @@ def main(arguments: Arguments) -> None:
                       "deviations")
         print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
-    fitted = "vehicle.toml" if not settings.model else "model.toml"
+    other = settings.model or log.fields.get("input") == "wheels"
+    fitted = "model.toml" if other else "vehicle.toml"
     print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
-    if arguments.close_loop:
-        from sysid.pages.loop_report import write_result
-        from sysid.verdict.pipeline import watched
-        from sysid.verdict.result import LoopConfig
-
-        references = [load_any(path) for path in arguments.reference]
-        if settings.preset != "physical":
-            print("the loop starts from the physical base model")
-        config = LoopConfig(quick=settings.quick, seed=settings.seed)
-        write_result(arguments.out / "close_loop", watched(log, references, config))
 
 
 def cli() -> None:
     """Command line."""
-    command_line.run(Arguments, main, __doc__)
+    command_line.run(Arguments, main, __doc__, stopped=STOPPED)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,28 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
 
 from sysid import command_line
+from sysid.logs.coverage import Blind
 from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.log import Log
+from sysid.logs.next_drives import NextDrive, next_drives
+from whill_mjx.io.command_line import POSITIVE, Range
+from whill_mjx.io.folders import claim_folder
+
+KIND = "sysid.inspect"
+OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "next_1.csv", "next_2.csv", "next_3.csv")
 
 
 @dataclass(frozen=True)
@@ -33,8 +48,12 @@ class InspectConfig:
     json: bool = False
     """Print JSON instead of text."""
     out: Path | None = None
-    """Folder for inspect.txt, inspect.json and inspect.png; the picture of a robot file goes to the
-    current folder without one."""
+    """Folder for inspect.txt, inspect.json, inspect.png and scripts of the next three drives; the picture of a robot
+    file goes to the current folder without one."""
+    space: Annotated[tuple[float, float], Range(0.1, 10_000)] = (4.0, 4.0)
+    """Length and width of the free floor for the next drives [m]."""
+    v_max: Annotated[float | None, POSITIVE] = None
+    """Fastest speed of the next drives [m/s]; by default half of the vehicle's, at most 0.5 m/s."""
 
 
 def inspect_robot(config: InspectConfig) -> dict[str, Any]:
@@ -60,33 +79,52 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
     return found
 
 
-def write(folder: Path, log: Log, found: dict[str, Any]) -> list[Path]:
-    """Write inspect.txt, inspect.json and inspect.png; returns their paths."""
+def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDrive] = ()) -> list[Path]:
+    """Write inspect.txt, inspect.json, inspect.png and the scripts of drives; returns their paths."""
     from sysid.pages.inspect_plot import write_plot
     from sysid.pages.report import write_report
-    from whill_mjx.logs.dataset import write_text
+    from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv, write_text
 
-    paths = [folder / "inspect.txt", folder / "inspect.json", folder / "inspect.png"]
+    paths = [folder / name for name in OUTPUTS[: 3 + len(drives)]]
     write_text(paths[0], text(found) + "\n")
     write_report(paths[1], found)
     write_plot(paths[2], log, found)
+    for path, drive in zip(paths[3:], drives, strict=True):
+        write_csv(path, COMMAND_HEADER, drive.command.table)
     return paths
 
 
 def main(config: InspectConfig) -> dict[str, Any]:
     """Load, look, print and write."""
-    from sysid.pages.report import plain
     from sysid.replay.model_files import SUFFIXES
 
     if config.dataset.suffix in SUFFIXES:
-        return inspect_robot(config)
-    log = load_whole(config.dataset, config.select, config.format)
-    found = inspect(log)
-    print(json.dumps(plain(found), indent=1) if config.json else text(found))
-    if config.out is not None:
-        for path in write(config.out, log, found):
+        with refusing():
+            return inspect_robot(config)
+    with refusing():
+        log = load_whole(config.dataset, config.select, config.format)
+    if config.out is None:
+        return look(config, log)[0]
+    with claim_folder(config.out, KIND, OUTPUTS) as claim:
+        claim.settle({})  # another look replaces an earlier one as a whole
+        found, drives = look(config, log)
+        for path in write(config.out, log, found, drives):
             print(f"wrote {path}", file=sys.stderr)
     return found
+
+
+def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDrive]]:
+    """What was found, printed, and what to drive next."""
+    from sysid.pages.report import plain
+
+    found = inspect(log)
+    drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max)
+    found["next_drives"] = [
+        {"file": OUTPUTS[3 + k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
+         "v": float(np.abs(one.command.v).max()), "omega": float(np.abs(one.command.omega).max()),
+         "length_width": list(one.size), "start": list(one.start)} for k, one in enumerate(drives)]
+    print(json.dumps(plain(found), indent=1) if config.json else text(found))
+    return found, drives
 
 
 def cli() -> None:

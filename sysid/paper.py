@@ -12,6 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
+
 import numpy as np
 
 from sysid import command_line
@@ -20,12 +25,17 @@ from sysid.logs.measured import load_any
 from sysid.pages.paper_page import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, markdown, write
 from sysid.pages.report import code_hashes, error_rows
 from sysid.pages.series import collect
+from sysid.run_folder import run_folder, settings_of
 from sysid.search.fitting import fit_log, predict
 from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.presets import preset_params
+
+KIND = "sysid.paper"
+OUTPUTS = ("paper.json", "paper.md", "paper.html", "paper_trajectories.png", "paper_yaw.png", "series.npz", "steps")
+STOPPED = "stopped; give the same command again to go on."
 
 
 def select(log: Log, channel: str = "odometry") -> Log:
@@ -84,13 +94,16 @@ def run(log: Log, config: PaperConfig, progress: Progress | None = None) -> tupl
 
 def main(config: PaperConfig) -> dict[str, Any]:
     """Load, fit, write and print the table."""
-    log = load_any(config.dataset)
-    progress, close = command_line.progress_bar(config.trials)
-    try:
-        content, (fit, series) = run(log, config, progress)
-    finally:
-        close()
-    write(config.out, content, fit, series, log)
+    with refusing():
+        log = load_any(config.dataset)
+        select(log, config.channel)
+    with run_folder(config.out, KIND, OUTPUTS, {"data": log.sha256, **settings_of(config, ("dataset", "out"))}):
+        progress, close = command_line.progress_bar(config.trials)
+        try:
+            content, (fit, series) = run(log, config, progress)
+        finally:
+            close()
+        write(config.out, content, fit, series, log)
     print(markdown(content))
     print(caution(content))
     print(f"wrote {config.out / 'paper.html'}, paper.md, paper.json and the figures")
@@ -99,7 +112,7 @@ def main(config: PaperConfig) -> dict[str, Any]:
 
 def cli() -> None:
     """Command line."""
-    command_line.run(PaperConfig, main, __doc__)
+    command_line.run(PaperConfig, main, __doc__, stopped=STOPPED)
 
 
 if __name__ == "__main__":

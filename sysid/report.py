@@ -26,26 +26,41 @@
 
 from __future__ import annotations
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 
+from whill_mjx.io.command_line import listen, refusing
+
+if __name__ == "__main__":
+    listen()
+
+from sysid import command_line
 from sysid.logs.sources import refuse_recording
-from sysid.pages.report import write_html
+from sysid.pages.report import read_report, write_html
+from whill_mjx.io.folders import check_place, lock_folder
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the command."""
+
+    run: Path
+    """Folder that sysid.fit wrote."""
+
+
+def main(options: Options) -> None:
+    """Write the page."""
+    with refusing():
+        refuse_recording(options.run, "the folder that sysid.fit wrote.")
+        read_report(options.run)
+        check_place("RUN", options.run)
+    with lock_folder(options.run, "RUN"):
+        print(f"wrote {write_html(options.run)}")
 
 
 def cli() -> None:
-    """Command line: `python -m sysid.report RUN`."""
-    import argparse
-
-    parser = argparse.ArgumentParser(prog="python -m sysid.report",
-                                     description="Write RUN/report.html of an earlier fit.")
-    parser.add_argument("run", type=Path, help="folder that sysid.fit wrote")
-    run = parser.parse_args().run
-    try:
-        refuse_recording(run, "the folder that sysid.fit wrote.")
-        print(f"wrote {write_html(run)}")
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"error: {error}")
+    """Command line."""
+    command_line.run(Options, main, "Write the page RUN/report.html of an earlier fit.")
 
 
 if __name__ == "__main__":

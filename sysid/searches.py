@@ -15,6 +15,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
+
+from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
+
+if __name__ == "__main__":
+    listen()
 
 import jax
 
@@ -24,13 +30,15 @@ from sysid.logs.measured import load_any
 from sysid.pages.plots import write_search_plot
 from sysid.pages.report import code_hashes, write_report
 from sysid.search.comparison import METHODS, NEAR, Judge, arrivals, trace
-from sysid.search.fitting import make_problem
+from sysid.search.fitting import Problem, check_settings, make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
+from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.html import Section, html_page, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 
 KIND = "sysid-searches"
+OUTPUTS = ("searches.json", "searches.png", "searches.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,21 +51,33 @@ class Arguments(FitConfig):
     """Folder for searches.json, .png and .html."""
     methods: tuple[str, ...] = METHODS
     """Searches to compare: features, lm, both (TPE, then lm), tpe, cmaes."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[int, ...], SEED] = (0,)
     """One run of each search for each."""
-    trials: int = 256
+    trials: Annotated[int, Range(1, 1_000_000)] = 256
     """Parameter sets that the global searches try."""
-    iterations: int = 20
+    iterations: Annotated[int, Range(1, 10_000)] = 20
     """Iterations of the gradient searches."""
-    starts: int = 4
+    starts: Annotated[int, Range(1, 10_000)] = 4
     """Starts of the gradient searches: the initial values, and random ones."""
 
 
 def main(arguments: Arguments) -> list[Trace]:
     """Run all searches with all seeds and write the comparison."""
-    log = load_any(arguments.dataset)
-    config = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
-    problem = make_problem(log, config)
+    with refusing():
+        for method in arguments.methods:
+            check_known("--methods", method, METHODS)
+        if not arguments.methods or not arguments.seeds:
+            raise ValueError("--methods and --seeds: each needs one at least. Leave the option out for the default.")
+        log = load_any(arguments.dataset)
+        config = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
+        check_settings(log, config)
+    with claim_folder(arguments.out, "sysid.searches", OUTPUTS) as claim:
+        claim.settle({})  # timings are made anew
+        return compare(arguments, log, make_problem(log, config))
+
+
+def compare(arguments: Arguments, log: Log, problem: Problem) -> list[Trace]:
+    """Run, write and print in a folder that is held."""
     judge = Judge(problem, log)
     traces = []
     progress, close = command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches", "run")

@@ -19,12 +19,13 @@ from whill_mjx.env import (
     observe,
     repainted,
     reset_state,
+    sense,
     step_state,
     time_step,
 )
 from whill_mjx.io.fields import BATCH, check_fields
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
-from whill_mjx.world.randomize import randomize_params
+from whill_mjx.world.randomize import Variation, randomize_params, vary_params
 
 
 @struct.dataclass
@@ -54,6 +55,9 @@ class BatchEnv:
     """Share of the episodes without an arrival after which the same world is begun again, with the same vehicle and
     start; for training. What fails is met more often so (cf. prioritised level replay, Jiang et al. 2021)."""
 
+    variations: tuple[Variation, ...] = ()
+    """Parameters of the vehicle that are drawn from their ranges, anew for each episode."""
+
     def __post_init__(self) -> None:
         check_fields("batch", BATCH, self)
         if not 0.0 <= self.second_tries < 1.0:
@@ -77,6 +81,28 @@ class BatchEnv:
         """
         return self._split(self._step)(state, actions)
 
+    def begin_one(
+        self, origin: jax.Array, change: Callable[[VehicleParams, State], State] | None = None
+    ) -> tuple[BatchState, TimeStep]:
+        """Start an episode of one instance: its state without the instance axis, and its first time step.
+
+        Args:
+            origin: random key; the same one gives the same world, vehicle and start.
+            change: (parameters, state) -> state, applied before anything is observed; None changes nothing.
+        """
+        state, outcome = self._begin(origin)
+        if change is not None:
+            state = dataclasses.replace(state, env=change(state.params, state.env))
+            outcome = first_outcome(self.env, state.env)
+        env, obs = sense(self.env, state.params, state.env)
+        return dataclasses.replace(state, env=env), time_step(obs, outcome, jnp.array(True))
+
+    def step_one(self, state: BatchState, action: jax.Array) -> tuple[BatchState, TimeStep]:
+        """Advance one instance, from `begin_one`, by one environment step; nothing begins anew."""
+        env, outcome = step_state(self.env, state.params, state.env, action)
+        env, obs = sense(self.env, state.params, env)
+        return dataclasses.replace(state, env=env), time_step(obs, outcome, jnp.array(False))
+
     def observe_repainted(self, state: BatchState, worlds: int) -> jax.Array:
         """(K, N, H, W, 3) images of the same moment in K other worlds of the same shape (`env.repainted`).
 
@@ -93,17 +119,24 @@ class BatchEnv:
 
     def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome = jax.vmap(self._begin)(keys)
-        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)
+        state, obs = self._sense(state)
         return state, time_step(obs, outcome, jnp.ones(keys.shape[:1], bool))
 
     def _step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome, first = jax.vmap(self._advance)(state, actions)
-        obs = jax.vmap(lambda one: observe(self.env, one))(state.env)  # once, after the choice between step and reset
+        state, obs = self._sense(state)  # once, after the choice between step and reset
         return state, time_step(obs, outcome, first)
+
+    def _sense(self, state: BatchState) -> tuple[BatchState, Any]:
+        """State with the memory of the sensors, and what they show (N, ...)."""
+        env, obs = jax.vmap(lambda one, params: sense(self.env, params, one))(state.env, state.params)
+        return dataclasses.replace(state, env=env), obs
 
     def _begin(self, origin: jax.Array, tries: jax.Array | int = 0) -> tuple[BatchState, Outcome]:
         key, params_key = jax.random.split(origin)
         params = randomize_params(params_key, self.params, self.spread) if self.spread else self.params
+        if self.variations:
+            params = vary_params(jax.random.fold_in(params_key, 1), params, self.variations)
         params = jax.tree.map(jnp.asarray, params)
         state = reset_state(self.env, params, key)
         return BatchState(state, params, origin, jnp.asarray(tries, jnp.int32)), first_outcome(self.env, state)
@@ -136,7 +169,8 @@ class BatchEnv:
 
 
 def make_batch(
-    env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0
-) -> BatchEnv:
+    env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0,
+    variations: tuple[Variation, ...] = (),
+) -> BatchEnv:  # fmt: skip
     """`count` instances of `env`; see `BatchEnv` for the rest."""
-    return BatchEnv(env, params, count, spread, tuple(devices), second_tries)
+    return BatchEnv(env, params, count, spread, tuple(devices), second_tries, tuple(variations))

@@ -3,29 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.io.fields import ENV, check_fields
+from whill_mjx.sensors.base import Sensor, Sensors, View, as_sensors, begin_sensors, read_sensors
+from whill_mjx.sensors.registry import known_sensors
+from whill_mjx.tasks.base import scale_action
+from whill_mjx.tasks.parts import BLUE
 from whill_mjx.tasks.starts import draw_start
-from whill_mjx.tasks.tasks import BLUE, Task, goal_position, make_task, reward_terms, sample_world, scale_action
+from whill_mjx.tasks.tasks import Task, make_task
+from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.eye import develop, mounted
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
-from whill_mjx.world.render import pinhole, render
+from whill_mjx.world.render import Quality, pinhole, render
+from whill_mjx.world.render.rich import floor_light
+from whill_mjx.world.rich import furnish, paint
 from whill_mjx.world.scene import Scene, clearance, collides, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
-"""Metrics that are 0 except on the last frame of an episode."""
-
+"""Metrics that are 0 except on the last frame of an episode; the endings of a task come on top (`end_names`)."""
+POSE_METRICS = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
+"""Metrics of every frame."""
+RESERVED = (*POSE_METRICS, "timeout", "diverged", "time_s", "episode_return")
+"""Names that a task's endings may not have."""
+LOOKS = ("plain", "paper", "rich")
+"""What changes the picture from episode to episode: nothing, what the paper randomises, a furnished room."""
+TRAIL = 5
+"""Poses kept for late images and for the lag of the exposure control."""
 DEFAULT_VEHICLE = "whill_cr_ramp"
 """The paper's identified WHILL with its ramp."""
 
@@ -47,9 +66,18 @@ class Env:
     exploring_starts: float = 0.0
     """Share of episodes that begin at a random free place on the way to the goal; for training
     (`whill_mjx.tasks.starts`)."""
+    rich: bool = False
+    """Furnish the room and draw materials, lights and film at random (`whill_mjx.world.rich`), instead of the above."""
+    sensors: Sensors = ()
+    """What is observed, as pairs of name and sensor; none shows the camera image alone, as an array."""
 
     def __post_init__(self) -> None:
         check_fields("environment", ENV, self)
+
+    @property
+    def repaints(self) -> bool:
+        """Whether two episodes in one world look different."""
+        return self.random_looks or self.photometric or self.rich
 
 
 @struct.dataclass
@@ -65,6 +93,8 @@ class State:
     episode_return: jax.Array  # () sum of the rewards since the start
     done: jax.Array  # () bool: the episode has ended; the next step of a batch starts a new one
     key: jax.Array  # random key of the episode
+    trail: jax.Array | None = None  # (TRAIL, 7) latest poses of the chassis, newest first; with rich looks only
+    sensors: tuple = ()  # memory of the sensors
 
 
 @struct.dataclass
@@ -79,42 +109,75 @@ class Outcome:
 
 def make_env(
     task: str | Task = "obstacle_course",
-    vehicle: str | Path | None = None,
+    vehicle: str | Path | VehicleSpec | tuple[VehicleSpec, VehicleParams] | None = None,
     layout: str | None = None,
     random_looks: bool | None = None,
     photometric: bool | None = None,
     height: int = 64,
     width: int = 64,
     exploring_starts: float = 0.0,
+    looks: str | None = None,
+    observations: Mapping[str, Sensor] | Sequence[str] | None = None,
 ) -> tuple[Env, VehicleParams]:
     """Environment, and the nominal parameters of its vehicle.
 
     Args:
-        task: name of a task, or a task with its fields set.
-        vehicle: path of a vehicle file, or the name of a preset; None takes the built-in WHILL Model CR.
+        task: a task with its fields set, the name of a known one, package.module:TASK or path/to/file.py:TASK.
+        vehicle: path of a vehicle file, the name of a preset, a spec (with the physical base model), or a spec and its
+            parameters; None takes the built-in WHILL Model CR.
         layout: "randomised" or "fixed"; None keeps the task's own.
-        random_looks, photometric: see `Env`; None means off, except in a randomised corridor, as in the paper.
+        random_looks, photometric: see `Env`; None takes those of the task's looks, and none where all worlds
+            are the same.
         height, width: image size [pixels].
         exploring_starts: see `Env`.
+        looks: one of LOOKS, which sets `random_looks`, `photometric` and `rich`: "plain" draws nothing, "paper" what
+            the paper randomises, "rich" a furnished room. None takes those of the task, and none where all worlds are
+            the same; the two arguments count more than the task's.
+        observations: sensors by name, or names of the package's sensors (`whill_mjx.sensors`); observations are then a
+            dict. None takes those of the task, and the camera image alone, as an array, where it names none.
 
     Raises:
-        ValueError: unknown task, layout or vehicle; a share that is none.
+        ValueError: unknown task, layout, vehicle, looks or sensor; a share that is none; rich looks of a task that has
+            no lane to furnish.
     """
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
-    spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
-    default = task.randomised and getattr(task, "name", "") == "corridor"
+    spec, params = as_vehicle(vehicle)
+    chosen = task.observations() if observations is None else observations
+    if looks is None:
+        looks = task.looks if task.randomised else "plain"
+    else:
+        random_looks = photometric = None
+    if looks not in LOOKS:
+        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
+    if looks == "rich" and not task.lane:
+        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
+                         "'rich'.")
     env = Env(
         build_model(spec),
         task,
         height,
         width,
-        default if random_looks is None else random_looks,
-        default if photometric is None else photometric,
+        looks == "paper" if random_looks is None else random_looks,
+        looks == "paper" if photometric is None else photometric,
         exploring_starts,
+        looks == "rich",
+        as_sensors(chosen, known_sensors()),
     )
     return env, params
+
+
+def as_vehicle(
+    vehicle: str | Path | VehicleSpec | tuple[VehicleSpec, VehicleParams] | None,
+) -> tuple[VehicleSpec, VehicleParams]:
+    """Spec and parameters of a vehicle as `make_env` takes it."""
+    if isinstance(vehicle, VehicleSpec):
+        return vehicle, preset_params(vehicle, "physical")
+    if isinstance(vehicle, tuple):
+        return vehicle
+    spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
+    return spec, params
 
 
 def reset(env: Env, params: VehicleParams, key: jax.Array) -> tuple[State, TimeStep]:
@@ -129,7 +192,9 @@ def reset(env: Env, params: VehicleParams, key: jax.Array) -> tuple[State, TimeS
         State, and the first time step: reward 0, `first` True.
     """
     state = reset_state(env, params, key)
-    return state, time_step(observe(env, state), first_outcome(env, state), first=jnp.array(True))
+    outcome = first_outcome(env, state)
+    state, obs = sense(env, params, state)
+    return state, time_step(obs, outcome, first=jnp.array(True))
 
 
 def step(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, TimeStep]:
@@ -143,38 +208,49 @@ def step(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tu
             episode as `diverged`.
 
     Returns:
-        Next state, and its time step with obs (H, W, 3) uint8 and reward ().
+        Next state, and its time step with obs (H, W, 3) uint8, or a dict of the sensors' values, and reward ().
     """
     state, outcome = step_state(env, params, state, action)
-    return state, time_step(observe(env, state), outcome, first=jnp.array(False))
+    state, obs = sense(env, params, state)
+    return state, time_step(obs, outcome, first=jnp.array(False))
 
 
-def time_step(obs: jax.Array, outcome: Outcome, first: jax.Array) -> TimeStep:
-    """Image and outcome as one time step."""
+def time_step(obs: Any, outcome: Outcome, first: jax.Array) -> TimeStep:
+    """Observation and outcome as one time step."""
     return TimeStep(obs, outcome.reward, outcome.terminated, outcome.truncated, first, outcome.metrics)
 
 
 def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
     """State at the start of an episode, without its image."""
     key, world_key, looks_key, photometry_key = jax.random.split(key, 4)
-    world = sample_world(env.task, world_key)
-    scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
+    world = env.task.sample_world(world_key)
+    if env.rich:
+        lone = world.scene.boxes.mask.shape[0] == env.task.walls + 1
+        scene = furnish(jax.random.fold_in(world_key, 1), world.scene, lone)
+        scene = paint(looks_key, scene)
+        world = dataclasses.replace(world, scene=scene)
+    else:
+        scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
     photometry = draw_photometry(photometry_key) if env.photometric else neutral()
     start = world.start
     if env.exploring_starts:
         start = draw_start(env.exploring_starts, env.task, env.model.spec, world, jax.random.fold_in(world_key, 0))
     vehicle = place(env.model, params, start[0], start[1], start[2])
-    return State(
+    state = State(
         vehicle=vehicle,
         scene=scene,
         photometry=photometry,
         command=jnp.zeros(2),
-        goal_distance=jnp.linalg.norm(goal_position(scene) - start[:2]),
+        goal_distance=jnp.linalg.norm(env.task.goal(scene) - start[:2]),
         step_count=jnp.zeros((), jnp.int32),
         episode_return=jnp.zeros(()),
         done=jnp.zeros((), bool),
         key=key,
+        trail=jnp.broadcast_to(vehicle.qpos[:7], (TRAIL, 7)) if env.rich else None,
     )
+    if not env.sensors:
+        return state
+    return dataclasses.replace(state, sensors=begin_sensors(env.sensors, view_of(env, params, state)))
 
 
 def repainted(env: Env, state: State, key: jax.Array) -> State:
@@ -182,6 +258,8 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
     random; shapes, places and motion stay."""
     looks_key, photometry_key, key = jax.random.split(key, 3)
     scene, photometry = state.scene, state.photometry
+    if env.rich:
+        scene = paint(looks_key, scene)
     if env.random_looks:
         marker = dataclasses.replace(scene.marker, colour=jnp.array(BLUE))  # as before its own shade was drawn
         scene = randomize_looks(looks_key, dataclasses.replace(scene, marker=marker))
@@ -213,27 +291,24 @@ def _control_period(
     task = env.task
     vehicle = drive(env.model, params, state.vehicle, command)
     vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
-    x, y, yaw = reference_pose(env.model, vehicle.qpos)
-    distance = jnp.linalg.norm(goal_position(state.scene) - jnp.stack([x, y]))
-    collided = collides(footprint(env.model.spec, x, y, yaw), state.scene.boxes) & ~vehicle.diverged
-    reached = (distance <= task.goal_radius) & ~collided & ~vehicle.diverged
-    progress = jnp.where(vehicle.diverged, 0.0, state.goal_distance - distance)
-    terms = reward_terms(task, progress, command[1] - state.command[1], reached, collided)
-    reward = jnp.asarray(sum(terms.values()))
-
-    terminated = reached | collided | vehicle.diverged
     step_count = state.step_count + 1
+    moment = moment_of(env, state, vehicle, command, step_count)
+    terms = task.rewards(moment)
+    reward = jnp.asarray(sum(terms.values()))
+    ends = endings_of(task, moment)
+    terminated = jnp.stack(list(ends.values())).any() | vehicle.diverged
     truncated = (step_count >= task.max_steps) & ~terminated
     after = dataclasses.replace(
         state,
         vehicle=vehicle,
         command=command,
-        goal_distance=distance,
+        goal_distance=moment.goal_distance,
         step_count=step_count,
         episode_return=state.episode_return + reward,
         done=terminated | truncated,
+        trail=None if state.trail is None else jnp.concatenate([vehicle.qpos[None, :7], state.trail[:-1]]),
     )
-    ends = {"success": reached, "collision": collided, "timeout": truncated, "diverged": vehicle.diverged}
+    ends |= {"timeout": truncated, "diverged": vehicle.diverged}
     ends = {name: flag.astype(reward.dtype) for name, flag in ends.items()}
     ends["time_s"] = jnp.where(after.done, step_count * jnp.array(env.model.config.control_dt, float), 0.0)
     ends["episode_return"] = jnp.where(after.done, after.episode_return, 0.0)
@@ -242,10 +317,79 @@ def _control_period(
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 
+def moment_of(
+    env: Env, before: State, vehicle: VehicleState, command: jax.Array, step_count: jax.Array
+) -> Moment:
+    """What rewards, endings and observations look at, after a control period that began in a state.
+
+    Args:
+        env: static model and task.
+        before: at the beginning of the period.
+        vehicle: at its end.
+        command: (2,) v [m/s] and omega [rad/s] of the period.
+        step_count: () control periods since the start of the episode.
+    """
+    x, y, yaw = reference_pose(env.model, vehicle.qpos)
+    body = footprint(env.model.spec, x, y, yaw)
+    distance = jnp.linalg.norm(env.task.goal(before.scene) - jnp.stack([x, y]))
+    collided = collides(body, before.scene.boxes) & ~vehicle.diverged
+    return Moment(
+        scene=before.scene,
+        pose=jnp.stack([x, y, yaw]),
+        twist=jnp.stack(body_twist(env.model, vehicle.qpos, vehicle.qvel)),
+        body=body,
+        command=command,
+        previous_command=before.command,
+        goal_distance=distance,
+        previous_goal_distance=before.goal_distance,
+        collided=collided,
+        reached=(distance <= env.task.goal_radius) & ~collided & ~vehicle.diverged,
+        diverged=vehicle.diverged,
+        time_s=step_count * jnp.array(env.model.config.control_dt, float),
+    )
+
+
+def endings_of(task: Task, moment: Moment) -> dict[str, jax.Array]:
+    """Flags () of the task's endings by name, of which one holds at most; "success" and "collision" among them."""
+    ended, flags = moment.diverged, {}
+    for name, holds in task.endings(moment).items():
+        if name in RESERVED:
+            raise ValueError(f"task {task.name!r}: the ending {name!r} is the library's own. Call yours otherwise.")
+        flags[name] = jnp.asarray(holds, bool) & ~ended
+        ended = ended | flags[name]
+    return {name: flags.get(name, jnp.zeros((), bool)) for name in dict.fromkeys(("success", "collision", *flags))}
+
+
+def end_names(env: Env, state: State) -> tuple[str, ...]:
+    """Names of all metrics that are 0 except on the last frame of an episode."""
+    here = moment_of(env, state, state.vehicle, state.command, state.step_count)
+    return tuple(dict.fromkeys((*END_METRICS, *endings_of(env.task, here))))
+
+
+def view_of(env: Env, params: VehicleParams, state: State) -> View:
+    """One instance as its sensors see it."""
+    return View(env, params, state, moment_of(env, state, state.vehicle, state.command, state.step_count))
+
+
+def sense(env: Env, params: VehicleParams, state: State, seen: State | None = None) -> tuple[State, Any]:
+    """State with the memory of the sensors, and what they show: the camera image (H, W, 3) uint8, or a dict by name.
+
+    Called once a step, after the choice between the next state and a new episode. `seen` is the state that cameras look
+    at, where an evaluation has moved them.
+    """
+    seen = state if seen is None else seen
+    if not env.sensors:
+        return state, observe(env, seen)
+    key = jax.random.fold_in(state.key, state.step_count)
+    view = view_of(env, params, state)
+    memory, obs = read_sensors(env.sensors, state.sensors, view, dataclasses.replace(view, state=seen), key)
+    return dataclasses.replace(state, sensors=memory), obs
+
+
 def first_outcome(env: Env, state: State) -> Outcome:
     """Outcome that goes with the first frame of an episode."""
     false, zero = jnp.zeros((), bool), jnp.zeros(())
-    return Outcome(zero, false, false, dict.fromkeys(END_METRICS, zero) | _pose_metrics(env, state))
+    return Outcome(zero, false, false, dict.fromkeys(end_names(env, state), zero) | _pose_metrics(env, state))
 
 
 def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
@@ -264,9 +408,40 @@ def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
 
 def observe(env: Env, state: State) -> jax.Array:
     """Camera image (H, W, 3) uint8 of one instance."""
+    if env.rich:
+        return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
     image = render(position, rotation, intrinsics, state.scene, env.height, env.width)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
+
+
+METERED = (0.8, 1.8, 3.5)
+"""Distances ahead of the camera at which the exposure control finds the light [m]."""
+SHUTTER = 1.0 / 40.0
+"""Time for which the shutter of a camera in a room is open [s]."""
+
+
+def _observe_rich(env: Env, state: State) -> jax.Array:
+    """The same with mount, exposure control, film and delay of the camera."""
+    eye, lights, trail = state.scene.rich.eye, state.scene.rich.lights, state.trail
+    assert trail is not None
+    position, rotation = camera_pose(env.model, trail[eye.delay])
+    position, rotation = mounted(eye, position, rotation)
+    fov = env.model.spec.camera.fov_y * eye.zoom
+    intrinsics = pinhole(fov, env.height, env.width)
+
+    then, before = camera_pose(env.model, trail[-1])
+    ahead = before[:2, 2] * jax.lax.rsqrt(jnp.sum(before[:2, 2] ** 2) + 1e-6)
+    metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
+    exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
+    rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
+    scene = dataclasses.replace(state.scene, rich=rich)
+    image = render(position, rotation, intrinsics, scene, env.height, env.width, RICH)
+    turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
+    return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)
+
+
+RICH = Quality(antialias=True)

@@ -8,14 +8,13 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, OptionError, Range, check_known, listen, refusing, run
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if __name__ == "__main__":
@@ -31,10 +30,11 @@ from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, 
 from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
 from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
-from whill_mjx.evaluation.sweeps import STANDARD, Axis, Sweep, parse_sweep, run_sweep
+from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, run_sweep
 from whill_mjx.io.folders import RUN_FILE, claim_folder
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.tasks import TASKS, Task, make_task
+from whill_mjx.tasks.options import named_task, read_fields
+from whill_mjx.tasks.tasks import Task, make_task
 
 SCRIPTED = ("planner", "random")
 KIND = "whill_mjx.evaluate"
@@ -48,7 +48,8 @@ class EvaluateOptions:
     policy: Annotated[str, tyro.conf.Positional]
     """Folder of an exported policy or of its training, or "planner" or "random"."""
     task: str | None = None
-    """obstacle_course or corridor; none takes the one that the policy was trained for."""
+    """Name of a task, package.module:TASK or path/to/file.py:TASK; none takes the one that the policy was trained
+    for."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 200
     """Episodes of each driver."""
     out: Path = Path("runs/evaluation")
@@ -59,8 +60,9 @@ class EvaluateOptions:
     """A new world in each episode, or always the same one; none takes that of the training, else randomised."""
     set: tuple[str, ...] = ()
     """Fields of the task, such as gates=1; those that the policy was trained with are found beside it."""
-    looks: Literal["task", "on", "off"] = "task"
-    """Random colours, light and photometric changes; task leaves it to the task."""
+    looks: Literal["task", "on", "off", "plain", "paper", "rich"] = "task"
+    """plain (nothing random), paper (random colours, light and photometric changes) or rich (furnished rooms,
+    docs/looks.md); task leaves it to the task. off and on are older names of plain and paper."""
     spread: Annotated[float, Range(0, 1, below=True)] = 0.0
     """Relative spread of the vehicle's parameters from episode to episode."""
     baselines: tuple[str, ...] = ()
@@ -167,7 +169,7 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
         evaluation = {
             "policy": options.policy,
             "sha256": policy.sha256 if policy else None,
-            "task": {"name": getattr(task, "name", ""), **plain(task)},
+            "task": {"name": task.name, **plain(task)},
             "options": plain(options),
             "device": f"{jax.devices()[0].platform}: {jax.devices()[0].device_kind}",
             "drivers": summaries,
@@ -193,8 +195,7 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     there is one for the same task.
     """
     name = options.task or (policy.task if policy else "obstacle_course")
-    check_known("--task", name, TASKS)
-    known: dict[str, Any] = {field.name: field.default for field in fields(TASKS[name])}
+    task = named_task(name)
     changes: dict[str, Any] = {}
     if policy and policy.task == name:
         changes = trained_fields(policy.path, name)
@@ -203,45 +204,26 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}
-    for text in options.set:
-        field, value = _named(text)
-        if field not in known:
-            raise ValueError(f"--set {text}: task {name!r} has no field {field!r} (known: {', '.join(sorted(known))}).")
-        changes[field] = _parse(value, known[field], text)
+    changes |= read_fields(task, options.set)
     if options.layout is not None:
         changes["layout"] = options.layout
     return make_task(name, **changes)
-
-
-def _parse(text: str, like: Any, whole: str) -> Any:
-    """A field's value from text, of the same type as its default."""
-    try:
-        parts = tuple(float(part) for part in text.split(",")) if isinstance(like, tuple) else ()
-        value = parts or type(like)(text)
-    except ValueError as error:
-        kind = {int: "whole number", float: "number", tuple: "list of numbers"}.get(type(like), type(like).__name__)
-        raise OptionError(f"--set {whole}: {text!r} is no {kind}. Correct it.") from error
-    if parts and len(parts) != len(like):
-        raise OptionError(f"--set {whole}: {len(parts)} numbers where {len(like)} are needed. Correct it.")
-    if not all(math.isfinite(one) for one in parts or (value,) if isinstance(one, float)):
-        raise OptionError(f"--set {whole}: must be finite. Correct it.")
-    return value
 
 
 def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:
     """The sweeps as text, "standard" replaced by those of the task."""
     texts: list[str] = []
     for text in options.sweep:
-        texts += STANDARD[getattr(task, "name", "")] if text == "standard" else [text]
+        texts += task.sweeps if text == "standard" else [text]
     return texts
 
 
 def make_course(options: EvaluateOptions, task: Task, policy: PolicyFile | None, vehicle: str | None) -> Course:
     """The environment with a vehicle: the given one, the options', the policy's, or the built-in one."""
     chosen: str | Path | None = vehicle or options.vehicle or (policy.vehicle if policy else None)
-    flag = {"task": None, "on": True, "off": False}[options.looks]
-    size = (policy.height, policy.width) if policy else (64, 64)
-    env, params = make_env(task, chosen, random_looks=flag, photometric=flag, height=size[0], width=size[1])
+    looks = {"task": None, "on": "paper", "off": "plain"}.get(options.looks, options.looks)
+    height, width = (policy.height or 64, policy.width or 64) if policy else (64, 64)
+    env, params = make_env(task, chosen, height=height, width=width, looks=looks)
     rate = 1.0 / env.model.config.control_dt
     if policy and abs(policy.rate_hz - rate) > 1e-6:
         raise ValueError(f"{policy.path}/policy.json: rate_hz is {policy.rate_hz}; the simulator runs at {rate:g} Hz. "
@@ -256,9 +238,12 @@ def make_driver(source: str, policy: PolicyFile | None, course: Course, options:
     if source == "random":
         return random_driver(course.env.task.action_repeat)
     policy = policy or load_policy(find_policy(source), options.runtime)
-    task, size = course.env.task, (course.env.height, course.env.width)
-    if (policy.height, policy.width) != size:
-        raise ValueError(f"{policy.path}: takes images of {policy.height} x {policy.width}, not {size[0]} x {size[1]}.")
+    task, sensors = course.env.task, {name: sensor.reading(course.env).shape for name, sensor in course.env.sensors}
+    wanted: Any = policy.observation or (policy.height, policy.width, 3)
+    shown: Any = sensors or (course.env.height, course.env.width, 3)
+    if wanted != shown:
+        raise ValueError(f"{policy.path}: observes {wanted}, but the task shows {shown}. Evaluate it on its own "
+                         "task.")
     limits = ((task.v_min, -task.omega_max), (task.v_max, task.omega_max))
     if not np.allclose((policy.low, policy.high), limits):
         raise ValueError(f"{policy.path}: its limits are {policy.low} to {policy.high}, those of the task {limits[0]} "

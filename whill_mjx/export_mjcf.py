@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.io.command_line import Range, listen, refusing, run
+from whill_mjx.io.command_line import PHYSICS_DT, listen, refusing, run
 
 if __name__ == "__main__":
     listen()
@@ -288,7 +288,7 @@ class Options:
     """Vehicle file, or a built-in vehicle."""
     out: Path = Path("runs/mujoco")
     """Folder to write; it must not exist."""
-    physics_dt: Annotated[float, Range(1e-4, 0.05)] = 0.005
+    physics_dt: Annotated[float, PHYSICS_DT] = 0.005
     """Physics step [s]; part of the vehicle, since its controller counts steps."""
     check: bool = True
     """Then drive a figure-eight in C MuJoCo and in the simulator and print how far apart they are."""

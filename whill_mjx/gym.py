@@ -1,7 +1,14 @@
-"""Gymnasium adapter for host-side users: one instance, compiled once per kind of environment and then reused."""
+"""Gymnasium for one vehicle: `WhillEnv`, and an id for every known task, such as WhillCorridor-v0.
+
+Importing this module registers the ids; `gymnasium.make("whill_mjx.gym:WhillCorridor-v0")` imports it by itself.
+Many vehicles in one program are `whill_mjx.gym_vector.WhillVectorEnv`, which `gymnasium.make_vec` makes.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,78 +16,207 @@ import gymnasium
 import jax
 import numpy as np
 
-from whill_mjx.env import make_env, reset, step
-from whill_mjx.tasks.tasks import Task
+from whill_mjx.env import POSE_METRICS
+from whill_mjx.kinds import Kind, check_process, condition_of, find_kind, info_names
+from whill_mjx.sensors.base import Sensor
+from whill_mjx.tasks.tasks import TASKS, Task
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams
 
-INFO = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
-ENDINGS = ("success", "collision", "diverged")
+INFO = POSE_METRICS
 
 
 class WhillEnv(gymnasium.Env):
-    """A task as a `gymnasium.Env`: images (64, 64, 3) uint8 in, actions (2,) in [-1, 1] out.
+    """A task as a `gymnasium.Env`: actions (2,) in [-1, 1] in, an image (64, 64, 3) uint8 or a dict of sensors out.
 
     `info` holds x, y [m], yaw [rad] of the driven-axle centre, v [m/s], omega [rad/s], goal_distance, clearance [m] and
-    the flags success, collision and diverged.
+    the flags success, collision, diverged, and those of the task's other endings. It can be pickled and copied.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
 
     def __init__(
         self,
         task: str | Task = "obstacle_course",
-        vehicle: str | Path | None = None,
+        vehicle: str | Path | VehicleSpec | tuple[VehicleSpec, VehicleParams] | None = None,
         layout: str | None = "randomised",
         render_mode: str | None = None,
+        *,
+        observations: Mapping[str, Sensor] | Sequence[str] | None = None,
+        height: int = 64,
+        width: int = 64,
+        looks: str | None = None,
+        spread: float = 0.0,
     ):
-        """Build the environment; nothing is compiled before the first `reset`.
+        """Build the environment; nothing is compiled before the first `reset` of its kind.
 
         Args:
-            task: name of a task, or a task with its fields set.
-            vehicle: path of a vehicle file or name of a preset; None takes the WHILL Model CR.
+            task: a task with its fields set, the name of a known one, package.module:TASK or path/to/file.py:TASK.
+            vehicle: path of a vehicle file, name of a preset, a spec, or a spec and its parameters; None takes the
+                WHILL Model CR.
             layout: "randomised" or "fixed"; None keeps the task's own.
-            render_mode: "rgb_array" or None.
+            render_mode: "rgb_array" gives the camera image, "human" shows it in a window; None neither.
+            observations: sensors by name, or names of the package's sensors; None takes the task's.
+            height, width: size of the camera image [pixels].
+            looks: "plain", "paper" or "rich", as in `make_env`; None takes the task's.
+            spread: relative spread of the vehicle's parameters, drawn anew for each episode.
 
         Raises:
-            ValueError: unknown task, vehicle, layout or render mode.
+            ValueError: unknown task, vehicle, layout, sensor or render mode; "human" without a display.
         """
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode is {render_mode!r}; use one of {self.metadata['render_modes']} or None.")
-        self.render_mode = render_mode
-        env, params = make_env(task, vehicle, layout)
-        self.env, self.params = env, params
-        self.observation_space = gymnasium.spaces.Box(0, 255, (env.height, env.width, 3), np.uint8)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self._reset = jax.jit(lambda params, key: reset(env, params, key))
-        self._step = jax.jit(lambda params, state, action: step(env, params, state, action))
+        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
+        self._arguments = {
+            "task": task, "vehicle": vehicle, "layout": layout, "observations": observations, "height": height,
+            "width": width, "looks": looks, "spread": spread,
+        }  # fmt: skip
         self._state: Any = None
         self._image: np.ndarray | None = None
+        self._take(find_kind(self._arguments))
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; the same seed gives the same world."""
+    def _take(self, kind: Kind) -> None:
+        self._kind = kind
+        self.env, self.params = kind.batch.env, kind.batch.params
+        self.observation_space, self.action_space = kind.observation_space, kind.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; the same seed gives the same world.
+
+        Args:
+            seed: of this and all later episodes.
+            options: changes of this episode, such as {"start_y": 0.2, "light": 0.5} (`whill_mjx.kinds.OPTIONS`).
+
+        Raises:
+            ValueError: an unknown option.
+        """
+        check_process()
+        condition = condition_of(options)
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
-        self._state, time_step = self._reset(self.params, key)
-        self._image = np.asarray(time_step.obs)
-        return self._image, _info(time_step.metrics)
+        self._state, time_step = self._kind.reset(key, condition)
+        return self._shown(time_step), _info(time_step.metrics)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One environment step; RuntimeError before the first `reset`."""
         if self._state is None:
             raise RuntimeError("step was called before reset; call reset() first.")
         action = np.asarray(action, np.float32)
         if action.shape != (2,):
             raise ValueError(f"the action has shape {action.shape}; it must be (2,): speed and yaw rate in [-1, 1].")
-        self._state, time_step = self._step(self.params, self._state, action)
-        self._image = np.asarray(time_step.obs)
-        info = _info(time_step.metrics)
-        return self._image, float(time_step.reward), bool(time_step.terminated), bool(time_step.truncated), info
+        check_process()
+        self._state, time_step = self._kind.step(self._state, action)
+        ends = bool(time_step.terminated), bool(time_step.truncated)
+        return self._shown(time_step), float(time_step.reward), *ends, _info(time_step.metrics)
 
     def render(self) -> np.ndarray | None:
         """The camera image (H, W, 3) uint8 in mode "rgb_array", otherwise None."""
-        return self._image if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array" or self._state is None:
+            return None
+        return self._picture()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.render_mode == "human":
+            close_window()
+
+    def _shown(self, time_step: Any) -> Any:
+        obs = jax.tree.map(np.asarray, time_step.obs)
+        self._image = None if isinstance(obs, dict) else obs
+        if self.render_mode == "human":
+            show_window(self._picture())
+        return obs
+
+    def _picture(self) -> np.ndarray:
+        if self._image is None:
+            self._image = np.asarray(self._kind.picture(self._state))
+        return self._image
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = {name: value for name, value in self.__dict__.items()
+                if name not in ("_kind", "env", "params", "observation_space", "action_space")}
+        return {**kept, "_state": jax.tree.map(_to_host, self._state)}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._take(find_kind(self._arguments))
+        self._state = jax.tree.map(_from_host, self._state, is_leaf=lambda leaf: isinstance(leaf, _Key))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> WhillEnv:
+        import copy
+
+        other = type(self).__new__(type(self))
+        other.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        return other
+
+
+class _Key:
+    """A random key on its way to another process."""
+
+    def __init__(self, data: np.ndarray):
+        self.data = data
+
+
+def _to_host(leaf: Any) -> Any:
+    if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return _Key(np.asarray(jax.random.key_data(leaf)))
+    return np.asarray(leaf)
+
+
+def _from_host(leaf: Any) -> Any:
+    return jax.random.wrap_key_data(jax.numpy.asarray(leaf.data)) if isinstance(leaf, _Key) else jax.numpy.asarray(leaf)
 
 
 def _info(metrics: dict[str, jax.Array]) -> dict[str, Any]:
-    return {name: float(metrics[name]) for name in INFO} | {name: bool(metrics[name]) for name in ENDINGS}
+    numbers, flags = info_names(metrics)
+    return {name: float(metrics[name]) for name in numbers} | {name: bool(metrics[name]) for name in flags}
+
+
+def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
+    """The mode, if it is known and can be served; ValueError says why not."""
+    if mode is not None and mode not in known:
+        raise ValueError(f"render_mode is {mode!r}; use one of {list(known)} or None.")
+    if mode == "human":
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise ValueError("render_mode 'human' opens a window, but there is no display (DISPLAY is not set). Use "
+                             "'rgb_array', or start the program on a desktop.")
+        import cv2
+
+        if "GUI:                           NONE" in cv2.getBuildInformation():
+            raise ValueError("render_mode 'human' opens a window, but this OpenCV has none (opencv-python-headless). "
+                             "Use 'rgb_array', or install opencv-python instead.")
+    return mode
+
+
+def show_window(image: np.ndarray) -> None:
+    """Show an image (H, W, 3) uint8, enlarged to about 512 pixels."""
+    import cv2
+
+    scale = max(1, 512 // image.shape[0])
+    cv2.imshow("whill_mjx", image.repeat(scale, 0).repeat(scale, 1)[..., ::-1])
+    cv2.waitKey(1)
+
+
+def close_window() -> None:
+    """Close the window of `show_window`."""
+    import cv2
+
+    cv2.destroyAllWindows()
+
+
+def env_id(task: Task) -> str:
+    """Gymnasium's id of a task: WhillObstacleCourse-v0 of obstacle_course."""
+    return f"Whill{''.join(part.capitalize() for part in task.name.split('_'))}-v0"
+
+
+def register_id(task: Task) -> str:
+    """Register the id of a task, and return it."""
+    identity = env_id(task)
+    gymnasium.register(
+        identity, entry_point="whill_mjx.gym:WhillEnv", vector_entry_point="whill_mjx.gym_vector:WhillVectorEnv",
+        kwargs={"task": task.name},
+    )  # fmt: skip
+    return identity
+
+
+for _task in TASKS.values():
+    if env_id(_task) not in gymnasium.registry:
+        register_id(_task)

@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
 
@@ -27,6 +27,7 @@ from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
+from whill_mjx.tasks.options import named_task
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
@@ -44,13 +45,14 @@ class Look:
     """Options of the command."""
 
     scene: str = "obstacle_course"
-    """Name of a task, gallery, or all."""
+    """Name of a task, package.module:TASK, path/to/file.py:TASK, gallery, or all."""
     out: Path = Path("look.png")
     """Picture to write, or video with the ending .mp4 or .gif."""
     layout: str = "randomised"
     """randomised or fixed."""
-    looks: bool = False
-    """Also draw colours, light and textures at random, and change the images photometrically."""
+    looks: Literal["plain", "paper", "rich"] = "plain"
+    """plain, paper (colours, light and textures at random, and images changed photometrically) or rich (furnished
+    rooms, docs/looks.md)."""
     worlds: Annotated[int, Range(1, 100)] = 6
     """Columns of the sheet."""
     steps: Annotated[int, Range(1, 10_000)] = 18
@@ -192,13 +194,15 @@ def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:
-    return make_env(options.scene, layout=options.layout, random_looks=options.looks, photometric=options.looks)
+    return make_env(options.scene, layout=options.layout, looks=options.looks)
 
 
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
-    if options.scene not in (*known, "all"):
+    if ":" in options.scene:
+        named_task(options.scene, "--scene")
+    elif options.scene not in (*known, "all"):
         raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")
     check_known("--layout", options.layout, LAYOUTS)
     if options.out.suffix not in (".png", *VIDEOS):

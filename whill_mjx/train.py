@@ -38,12 +38,13 @@ if __name__ == "__main__":
 import jax
 
 from dreamer import checkpoint, parallel
-from dreamer.export import PolicyContract, export_policy
+from dreamer.export import PolicyContract, export_policy, export_sensing
 from dreamer.train import train
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
+from whill_mjx.evaluation.novelty import largest_surprise, limits
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.folders import Claim, claim_folder, write_whole
@@ -61,27 +62,31 @@ from whill_mjx.learning.setup import (
     find_preset,
     functional_env,
     make_training_env,
+    obs_shape_of,
     ppo_policy,
     step_driver,
+    variations_of,
     with_layout,
     with_repeat,
     with_settings,
 )
 from whill_mjx.learning.shaping import SAFETY, Step, find_safety
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.tasks import LAYOUTS, TASKS
+from whill_mjx.tasks.options import named_task, read_fields
+from whill_mjx.tasks.tasks import LAYOUTS
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
-from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
+from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
 STOPPED = "stopped; give the same command again to go on from the last checkpoint."
 Stage = Callable[[str], None]
 """Gets a line when a stage of the command begins."""
+NOVELTY_SEED, NOVELTY_EPISODES = 3_000_017, 200  # episodes in which a policy meets its own world
 FINAL_SEED = 1_000_003  # keys of the final evaluation, apart from those of the training
 SHIPPED_LOG = "chair"
 LEAST_FREE = 32_000_000
 """Bytes that must be free for a training's folder; a checkpoint of the smallest preset takes some of them."""
-PRESETS = ("auto", "paper", "wallclock", "cpu", "smoke")
+PRESETS = ("auto", "paper", "transfer", "wallclock", "cpu", "smoke")
 Vehicle = tuple[VehicleSpec, VehicleParams, dict[str, Any]]
 """Spec, parameters and provenance."""
 
@@ -97,13 +102,18 @@ class TrainOptions:
     log: Path | None = None
     """Driving-log dataset to fit the vehicle to; none takes the small one that ships with the project."""
     task: str = "obstacle_course"
-    """obstacle_course or corridor."""
+    """Name of a task (obstacle_course, corridor, ...), package.module:TASK or path/to/file.py:TASK."""
     preset: str = "auto"
-    """paper, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
+    """paper, transfer, wallclock, cpu or smoke; auto takes paper on an accelerator and cpu elsewhere."""
     learner: Literal["dreamer", "ppo"] = "dreamer"
     """The world model, or the model-free baseline with as many environment steps."""
+    set: tuple[str, ...] = ()
+    """Fields of the task, such as gates=1; they count more than those that the preset changes."""
     layout: str = "randomised"
     """randomised (a new world in each episode) or fixed."""
+    looks: Literal["plain", "paper", "rich"] | None = None
+    """What changes the picture from episode to episode: nothing, what the paper randomises, or a furnished room with
+    other materials, light and camera (docs/looks.md). None takes the preset's."""
     seed: Annotated[int, SEED] = 0
     """Seed of the training."""
     steps: Annotated[int | None, COUNT] = None
@@ -129,7 +139,7 @@ class TrainOptions:
     seconds stay the preset's. None takes the preset's."""
     targets: bool = False
     """Let the world model also predict goal, speeds and free distances, which the simulator knows
-    (`whill_mjx.learning.privileged`). The
+    (`whill_mjx.sensors.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
     exploring_starts: Annotated[float | None, SHARE] = None
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
@@ -137,6 +147,12 @@ class TrainOptions:
     second_tries: Annotated[float | None, SHARE] = None
     """Share of the training episodes without an arrival after which the same world is begun again, which a simulator
     can do; evaluations never do. None takes the preset's."""
+    spread: Annotated[float | None, Range(0, 1, below=True)] = None
+    """Relative spread of all parameters of the vehicle from episode to episode of the training; none takes the
+    preset's."""
+    vary: tuple[str, ...] = ()
+    """Parameters of the vehicle drawn anew in each episode of the training: body.mass=0.9x:1.1x, an effect such as
+    command_delay.delay=0:0.2 (added where the vehicle lacks it), or fit for all intervals of the vehicle file."""
     instances: Annotated[int | None, COUNT] = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
@@ -180,6 +196,10 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
     if options.log is not None and not options.log.exists():
         raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
+    if any(text != "fit" for text in preset.vary):
+        variations_of([text for text in preset.vary if text != "fit"], None)
+    if "fit" in preset.vary and options.vehicle is not None:
+        variations_of(["fit"], options.vehicle)
     if processes > 1 and options.learner == "ppo":
         raise ValueError("the baseline trains in one process; start it alone or choose --learner dreamer.")
     devices = choose_devices(options.devices)
@@ -264,11 +284,13 @@ def preset_name(name: str) -> str:
 def choose_preset(options: TrainOptions) -> Preset:
     """The preset with the options' changes put in."""
     check_known("--preset", options.preset, PRESETS)
-    check_known("--task", options.task, TASKS)
+    task = named_task(options.task)
     check_known("--layout", options.layout, LAYOUTS)
     check_known("--safety", options.safety, SAFETY)
     name = preset_name(options.preset)
-    preset = with_layout(find_preset(name, options.task), options.layout)
+    preset = find_preset(name, task, options.steps)
+    preset = dataclasses.replace(preset, task=dataclasses.replace(preset.task, **read_fields(task, options.set)))
+    preset = with_layout(preset, options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     learner, baseline = preset.learner, preset.ppo
@@ -294,6 +316,9 @@ def choose_preset(options: TrainOptions) -> Preset:
         eval_every=preset.eval_every if options.eval_every is None else options.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
+        looks=preset.looks if options.looks is None else options.looks,
+        spread=preset.spread if options.spread is None else options.spread,
+        vary=options.vary or preset.vary,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
@@ -336,7 +361,9 @@ def prepare_vehicle(
     if fitted is not None:
         write_whole(target, fitted.read_text())
     else:
-        save_vehicle(target, *vehicle[:2], provenance=vehicle[2])
+        source = options.vehicle if given is not None else None
+        known_intervals = load_intervals(source) if source is not None and source.is_file() else None
+        save_vehicle(target, *vehicle[:2], known_intervals, provenance=vehicle[2])
 
 
 def _shipped_log() -> Path:
@@ -379,10 +406,10 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     """Train the world model and its policy, with an evaluation every `eval_every` steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
-        second_tries=preset.second_tries,
+        preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
+        preset.looks, preset.vary,
     )  # fmt: skip
-    held_out = make_training_env(preset.task, vehicle, preset.eval_episodes)
+    held_out = make_training_env(preset.task, vehicle, preset.eval_episodes, looks=preset.looks)
     evaluate = evaluation_of(held_out, preset, options.seed)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
@@ -407,17 +434,16 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     """Train the model-free baseline with as many environment steps."""
     devices = choose_devices(options.devices)
     batch = make_training_env(
-        preset.task, vehicle, preset.instances, devices=devices, exploring_starts=preset.exploring_starts,
-        second_tries=preset.second_tries,
+        preset.task, vehicle, preset.instances, preset.spread, devices, preset.exploring_starts, preset.second_tries,
+        preset.looks, preset.vary,
     )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt
-    size = (course.env.height, course.env.width)
 
     @jax.jit
     def ends(params: Any) -> dict[str, jax.Array]:
-        step, carry = ppo_policy(preset, params, control_dt, size)
+        step, carry = ppo_policy(preset, params, control_dt, course.env)
         return rollout(course.env, vehicles, keys, step_driver(step, carry, preset.task.action_repeat)).ends
 
     def evaluate(params: Any, env_steps: int) -> dict[str, float]:
@@ -461,7 +487,7 @@ def best_params(options: TrainOptions, preset: Preset, result: Trained) -> Train
 
 def make_course(preset: Preset, vehicle: Path) -> Course:
     """The environment of evaluations."""
-    batch = make_training_env(preset.task, vehicle, 1)
+    batch = make_training_env(preset.task, vehicle, 1, looks=preset.looks)
     return Course(batch.env, batch.params)
 
 
@@ -469,7 +495,7 @@ def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Co
     """What drives, and is exported: the step of one instance and its first carry."""
     control_dt = course.env.model.config.control_dt
     if options.learner == "ppo":
-        return ppo_policy(preset, result.params, control_dt, (course.env.height, course.env.width))
+        return ppo_policy(preset, result.params, control_dt, course.env)
     return dreamer_policy(preset, result.params, control_dt)
 
 
@@ -494,7 +520,8 @@ def evaluate_policy(
         )
     except ImportError as error:
         say(f"reward_curve.png is left out: {error}. Install the base package to draw it.")
-    if options.videos and options.learner == "dreamer" and preset.learner.representation == "reconstruct":
+    seen = options.learner == "dreamer" and not course.env.sensors  # other observations make no picture
+    if options.videos and seen and preset.learner.representation == "reconstruct":
         stage("drawing what the world model predicts")
         try:
             key = jax.random.key(FINAL_SEED + options.seed)
@@ -518,7 +545,14 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         camera=camera_contract(course.env.model, course.params),
     )
     step, carry = policy_of(options, preset, result, course)
+    if "surprise" in carry:
+        keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
+        largest, _ = largest_surprise(course.env, course.params, step, carry, keys)
+        contract = dataclasses.replace(contract, novelty=limits(largest))
+    shown = obs_shape_of(course.env)
     try:
+        if isinstance(shown, dict):
+            return export_sensing(path, step, carry, shown, result.params, contract, vehicle_file=vehicle)
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.plant.make import make_log
+from bridge.options import Parser, whole
+from whill_mjx.io.command_line import guarded
 
 CHANNELS = ("v", "omega", "yaw", "x", "y", "pose_yaw", "pose_x", "pose_y")
 
@@ -91,10 +92,10 @@ def plot(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], out: Path) 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print both spreads per channel and write the picture."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.plant.compare", description=__doc__)
+    parser = Parser(prog="python -m benchmarks.plant.compare", description=__doc__)
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=whole(0), default=1)
     given = parser.parse_args(arguments)
     theirs = groups(read(given.reference))
     with tempfile.TemporaryDirectory() as folder:
@@ -113,4 +114,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

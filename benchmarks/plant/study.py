@@ -7,7 +7,6 @@ Each effect is driven with the disturbances of the plain chair, so that what dif
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +17,8 @@ from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import CHANNELS, drive_like, groups, read, spread
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import drive_all, plan
+from bridge.options import Parser, in_range
+from whill_mjx.io.command_line import guarded
 
 
 def table_of(
@@ -41,10 +42,10 @@ def change(plain: dict[str, np.ndarray], other: dict[str, np.ndarray], unit: dic
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables of the README."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.plant.study", description=__doc__)
+    parser = Parser(prog="python -m benchmarks.plant.study", description=__doc__)
     parser.add_argument("--reference", type=Path, help="dataset of the chair that the plain plant imitates")
     parser.add_argument("--effects", nargs="*", default=list(EFFECTS))
-    parser.add_argument("--factor", type=float, default=1.0, help="of the base sizes")
+    parser.add_argument("--factor", type=in_range(0), default=1.0, help="of the base sizes")
     given = parser.parse_args(arguments)
     unit = spread(table_of({}, replicates=6))
     if given.reference:
@@ -71,4 +72,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

@@ -25,6 +25,8 @@ MAX_CARRY = 64
 """Most entries of the recurrent state; presets have three."""
 MAX_STATE_BYTES = 16 * MIB
 """Largest recurrent state [bytes]: it is copied in every step. Presets have less than 100 kB."""
+SURPRISE = "surprise"
+"""Name of the carry that holds a running mean of how little the images agree with what was expected [nat]."""
 CAMERA_FRAMES = ("base_footprint", "chassis")
 """Frames of the camera: `chassis` in files that name none."""
 CAMERA_RULES = {"x": (10.0, "m"), "y": (10.0, "m"), "z": (10.0, "m"), "roll": (math.pi, "rad"),
@@ -60,12 +62,26 @@ class Contract:
     """Pose and field of view of the training's camera; `frame` is always there."""
     task: str
     vehicle_sha256: str
+    novelty: tuple[float, float] | None = None
+    """Surprise [nat] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
     def tensors(self) -> tuple[list[Tensor], list[Tensor]]:
         """Return the inputs and outputs that the network must have, in order."""
         image = Tensor("image", (self.height, self.width, 3), "uint8")
         action = Tensor("action", (2,), "float32")
         return _named(self.inputs, (image, *self.carry)), _named(self.outputs, (action, *self.carry))
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What the actions of an agent that drives a vehicle mean."""
+
+    low: tuple[float, float]
+    """Command at action -1: v [m/s], omega [rad/s]."""
+    high: tuple[float, float]
+    """Command at action +1."""
+    rate_hz: float
+    action_repeat: int
 
 
 @dataclass(frozen=True)
@@ -82,6 +98,8 @@ class AgentContract:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     task: str
+    commands: Commands | None = None
+    """Of an agent that drives a vehicle by other sensors than its camera alone."""
 
     SINGLE = "observation"
 
@@ -127,12 +145,7 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     image, action = fields.child("image"), fields.child("action")
     image.rule("channels", lambda value: is_integer(value) and value == 3, "must be 3")
     image.rule("encoding", lambda value: value == "rgb8", "must be 'rgb8'")
-    action.rule("names", lambda value: value == ["v", "omega"], "must be ['v', 'omega']")
-    action.rule("units", lambda value: value == ["m/s", "rad/s"], "must be ['m/s', 'rad/s']")
-    limits = f"must be two finite numbers from -{MAX_SPEED:g} to {MAX_SPEED:g}"
-    low = action.rule("low", _is_pair, limits)
-    high = action.rule("high", lambda value: _is_pair(value) and all(a < b for a, b in zip(low, value, strict=True)),
-                       f"{limits}, above low = {low}")
+    commands = _parse_commands(fields, action)
     height, width = (image.rule(key, _is_side, "must be an integer from 1 to 4096") for key in ("height", "width"))
     if height * width > MAX_PIXELS:
         raise PolicyFileError(f"{name} image: height x width = {height} x {width}, but it must have at most "
@@ -140,16 +153,30 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     carry = _parse_carry(fields)
     inputs, outputs = _parse_tensors(fields, 1 + len(carry), 1 + len(carry))
     return Contract(
-        height=height, width=width, low=(float(low[0]), float(low[1])), high=(float(high[0]), float(high[1])),
-        rate_hz=float(fields.rule("rate_hz", lambda value: is_number(value) and 0.01 <= value <= 1000,
-                                  "must be from 0.01 to 1000 [1/s]")),
-        action_repeat=fields.rule("action_repeat", lambda value: is_integer(value) and 1 <= value <= 100,
-                                  "must be an integer from 1 to 100"),
-        carry=carry, inputs=inputs, outputs=outputs,
+        height=height, width=width, low=commands.low, high=commands.high, rate_hz=commands.rate_hz,
+        action_repeat=commands.action_repeat, carry=carry, inputs=inputs, outputs=outputs,
         camera=_parse_camera(fields.child("camera")),
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text"),
         vehicle_sha256=fields.rule("vehicle_sha256", lambda value: value == "" or _is_digest(value),
                                    "must be empty or a SHA-256 (64 hexadecimal digits)"),
+        novelty=_parse_novelty(fields, carry),
+    )
+
+
+def _parse_commands(fields: "Fields", action: "Fields") -> Commands:
+    """Return what actions mean, from the rates of a policy and its table of the action."""
+    action.rule("names", lambda value: value == ["v", "omega"], "must be ['v', 'omega']")
+    action.rule("units", lambda value: value == ["m/s", "rad/s"], "must be ['m/s', 'rad/s']")
+    limits = f"must be two finite numbers from -{MAX_SPEED:g} to {MAX_SPEED:g}"
+    low = action.rule("low", _is_pair, limits)
+    high = action.rule("high", lambda value: _is_pair(value) and all(a < b for a, b in zip(low, value, strict=True)),
+                       f"{limits}, above low = {low}")
+    return Commands(
+        (float(low[0]), float(low[1])), (float(high[0]), float(high[1])),
+        float(fields.rule("rate_hz", lambda value: is_number(value) and 0.01 <= value <= 1000,
+                          "must be from 0.01 to 1000 [1/s]")),
+        fields.rule("action_repeat", lambda value: is_integer(value) and 1 <= value <= 100,
+                    "must be an integer from 1 to 100"),
     )
 
 
@@ -169,6 +196,7 @@ def parse_agent(name: str, table: Mapping[str, Any]) -> AgentContract:
     return AgentContract(
         observation=observation, discrete=kind == "discrete", size=size, carry=carry, inputs=inputs, outputs=outputs,
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text") if "task" in table else "",
+        commands=_parse_commands(fields, action) if "low" in action.table and size == 2 and kind == "box" else None,
     )
 
 
@@ -225,6 +253,18 @@ def _parse_entry(entry: Fields) -> Tensor:
         name=entry.rule("name", _is_text, "must be text"), shape=tuple(shape),
         dtype=entry.rule("dtype", lambda value: isinstance(value, str) and value in DTYPES.values(),
                          f"must be one of {list(DTYPES.values())}"))
+
+
+def _parse_novelty(fields: Fields, carry: tuple[Tensor, ...]) -> tuple[float, float] | None:
+    """Return the limits of the policy's surprise, where the file has them."""
+    if "novelty" not in fields.table:
+        return None
+    known = any(entry.name == SURPRISE for entry in carry)
+    slow, stop = fields.rule(
+        "novelty", lambda value: (known and isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
+                                  and 0 < value[0] < value[1]),
+        f"must be two rising numbers above 0 [nat], beside a carry '{SURPRISE}'")
+    return float(slow), float(stop)
 
 
 def _parse_tensors(fields: Fields, inputs: int, outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -10,6 +10,7 @@ import numpy as np
 from bridge.policy.contract import (
     AGENT_KIND,
     KIND,
+    SURPRISE,
     AgentContract,
     Contract,
     check_kind,
@@ -128,6 +129,18 @@ class Policy:
         if not all(np.isfinite(value).all() for value in self._carry if value.dtype.kind == "f"):
             return np.full(2, np.nan)
         return self._low + self._span * (np.asarray(action, np.float64) + 1) / 2
+
+    @property
+    def novelty(self) -> float:
+        """How little what was seen lately agrees with what the policy expected [nat]; NaN where its file has no score.
+
+        It is the carry "surprise": a running mean of the divergence between the world model's state before and after
+        each image.
+        """
+        for spec, value in zip(self.contract.carry, self._carry, strict=True):
+            if spec.name == SURPRISE:
+                return float(np.mean(value))
+        return float("nan")
 
 
 def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:

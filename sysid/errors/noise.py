@@ -46,8 +46,8 @@ class Whitener:
             white = added(white, np.s_[:, lag:], -xp.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag]))
         return xp.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
 
-    def scaled(self, factor: float) -> Whitener:
-        """The filter for noise that is larger by a factor."""
+    def scaled(self, factor: float | np.ndarray) -> Whitener:
+        """The filter for noise that is larger by a factor, () or (C,)."""
         return Whitener(self.scale * factor, self.coefficients, self.inverse)
 
 

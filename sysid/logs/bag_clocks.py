@@ -16,7 +16,7 @@ SPREADS = 4.0  # of the lateness around it, that such a change is beyond
 LASTING = 0.3  # share of the change that the rest of the recording may differ from it by
 UNEVEN = 0.1  # s of lateness that comes and goes, below which receipt is steady
 PERIODS = 1.5  # the same, in periods of the header's stamps
-REGULAR = 0.3  # share of the period that the header's stamps may vary by, for receipt to be what is uneven
+REGULAR = 0.3  # share of the period that most of the header's stamps vary by at most, for receipt to be what is uneven
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def find_bursts(received: np.ndarray, stamped: np.ndarray) -> float:
         return 0.0
     steps = np.diff(stamped)
     period = float(np.median(steps))
-    if period <= 0 or np.percentile(np.abs(steps - period), 90) > REGULAR * period:
+    if period <= 0 or np.percentile(np.abs(steps - period), 70) > REGULAR * period:
         return 0.0
     late, since = received - stamped, stamped - stamped[0]
     low, high = np.percentile(late - np.polyval(np.polyfit(since, late, 1), since), [5, 95])

@@ -11,21 +11,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, Trial, command_in_force
+from sysid.logs.log import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
+MOVING = 0.05  # m/s or rad/s of a pose that moves
+NONE = 0.02  # m/s, below which a speed is none
 VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
+APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
 WHOLE = 0.8  # share of the motion that a direction must explain
 LITTLE = 0.75  # the same, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
-SURE = 6.0  # standard errors that such an angle must have, taken as if samples were independent
+SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
-REACH = 10.0  # s of a clock that is looked for
-LATE = 0.6  # s that the fit does not reach
+REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
+LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
+UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step of the pose that is a reset
 FEW = 3  # resets of one drive; more steps are noise
-ZERO = 0.02  # of the pose's speed, below which reported speeds are none
+FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
+EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
+PLAINER = 0.1  # share of the motion that another explanation must explain more of
 
 
 @dataclass(frozen=True)
@@ -51,48 +57,50 @@ class Direction:
     """Share of the motion that this explains."""
 
 
-def contradictions(trials: Sequence[Trial]) -> dict[str, list[str]]:
-    """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it."""
-    return {name: _of_stream(name, trials) for name in ("odometry", "ground_truth")}
+def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
+    """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it.
+
+    Args:
+        reach: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
+    """
+    return {name: _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
+            for name in ("odometry", "ground_truth")}
 
 
-def _of_stream(name: str, trials: Sequence[Trial]) -> list[str]:
-    found: list[str] = []
-    if name == "odometry":
-        found += _resets(trials)
-        found += _empty_speeds(trials)
-        if found:
-            return found
+def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
+    if name == "odometry" and (found := [*_resets(trials), *_empty_speeds(trials)]):
+        return found
+    lates = [late for trial in trials if (late := lateness(trial, name)) is not None]
+    if len(lates) > len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
+        late = float(np.median(lates))
+        return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
+                f"beside it: another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s "
+                f"{'from' if late > 0 else 'to'} its t."]
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
-        return found
-    plain = _median([direction(one) for one in motions])
+        return []
+    plain = _pooled([direction(one, reach) for one in motions])
     if plain.explained < LITTLE:
-        mirrored = _median([direction(one, mirrored=True) for one in motions])
+        mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
             return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
                     "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
-        lates = [late for one in motions if (late := lateness(one)) is not None]
-        if len(lates) > len(motions) / 2:
-            late = float(np.median(lates))
-            return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
-                    f"beside it: another clock. Subtract {late:.1f} s from its t."]
-        if name == "odometry" and _median([direction(one, world=True) for one in motions]).explained > WHOLE:
+        if name == "odometry" and _in_fixed_frame(motions):
             return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
                     "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
         if name == "odometry" and plain.explained < LITTLE / 2:
-            found.append(f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of "
-                         "how the pose moves. Check that both are of one vehicle, frame and clock.")
-        return found
+            return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
+                    "the pose moves. Check that both are of one vehicle, frame and clock."]
+        return []
     if plain.explained > WHOLE and ANGLE < abs(plain.angle) < BACKWARDS and abs(plain.angle) > SURE * plain.error:
         degrees = np.rad2deg(plain.angle)
         side = "left" if degrees > 0 else "right"
         what = "the outside pose" if name == "ground_truth" else "its pose"
         remedy = (f"add {degrees:.0f} deg to its yaw (sysid.convert takes --truth-turned {-degrees:.0f})"
                   if name == "ground_truth" else "its speeds agree with the commands; turn x and y")
-        found.append(f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
-                     f"the vehicle's. Correct them: {remedy}.")
-    return found
+        return [f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
+                f"the vehicle's. Correct them: {remedy}."]
+    return []
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -112,7 +120,7 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                    for columns in ((source.x, source.y), (source.yaw,)))
     held = command_in_force(trial.command, t - RESPONSE)
     v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    if odometry is not None and odometry.v.std() > ZERO:
+    if odometry is not None and odometry.v.std() > NONE:
         shifts = np.linspace(-half, half, 5)
         v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
                     for one in (odometry.v, odometry.omega))
@@ -121,41 +129,88 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
     return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
 
 
-def direction(motion: Motion, mirrored: bool = False, world: bool = False) -> Direction:
+def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
     """Direction in which a pose travels.
 
     Args:
+        reach: how far from the axle's centre its point may be [m].
         mirrored: with y negated.
-        world: where v is the speed along the fixed x axis.
     """
     x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
     cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
-    along = (x if world else cos * x + sin * y) + 1j * (0.0 * y if world else -sin * x + cos * y)
+    along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
     design = np.column_stack([motion.v, motion.omega])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    if abs(gains[1]) > reach:
+        gains[1] *= reach / abs(gains[1])
+        gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
     left = along - design @ gains
     power = float(np.square(np.abs(along)).sum())
     explained = 1 - float(np.square(np.abs(left)).sum()) / max(power, 1e-12)
-    error = np.sqrt(np.mean(np.square(left.imag)) / np.square(motion.v).sum()) / max(abs(gains[0]), 1e-9)
-    return Direction(float(np.angle(gains[0])), float(error), explained)
+    # What v alone shows: on a circle a turned axis and a point before the axle move alike.
+    alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
+    independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
+    error = np.sqrt(np.mean(np.square(left.imag)) / independent / max(np.mean(np.square(alone)), 1e-12))
+    return Direction(float(np.angle(gains[0])), float(error / max(abs(gains[0]), 1e-9)), explained)
 
 
-def lateness(motion: Motion) -> float | None:
+def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
+    """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
+    fixed, own = [], []
+    for one in motions:
+        cos, sin = np.cos(one.yaw), np.sin(one.yaw)
+        x, y = one.steps.T
+        fixed.append(_explained(one.v, np.column_stack([x, y])))
+        own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
+    return bool(np.median(fixed) > max(WHOLE, float(np.median(own)) + PLAINER))
+
+
+def _explained(signal: np.ndarray, design: np.ndarray) -> float:
+    """Share of a signal's (T,) square that columns (T, C) explain."""
+    left = signal - design @ np.linalg.lstsq(design, signal, rcond=None)[0]
+    return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
+
+
+def lateness(trial: Trial, name: str) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
-    explains what nothing else does; None otherwise."""
-    speed, rate = np.hypot(*motion.steps.T), np.abs(motion.v)
-    best, at, now = 0.0, 0, 0.0
-    most = min(round(REACH / GRID_DT), len(speed) // 2)
-    for lag in range(-most, most + 1, 5):
-        ours = slice(max(lag, 0), len(speed) + min(lag, 0))
-        theirs = slice(max(-lag, 0), len(speed) - max(lag, 0))
-        pairs = [(speed[ours], rate[theirs]), (motion.turn[ours], motion.omega[theirs])]
-        both = min(_correlation(*pair) for pair in pairs)
-        now = both if lag == 0 else now
-        if both > best:
-            best, at = both, lag
-    late = at * GRID_DT
-    return late if best > WHOLE and now < LITTLE and abs(late) > LATE else None
+    explains what nothing else does; None otherwise.
+
+    Rates of turning are compared, or of motion where there is no turn: no frame changes them.
+    """
+    source, odometry = getattr(trial, name), trial.odometry
+    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+        return None
+    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
+    t = np.arange(begin, end, LAG_DT)
+    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
+    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
+    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
+                 for one in (source.x, source.y, source.yaw))
+    held = command_in_force(trial.command, t - RESPONSE)
+    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    commanded = odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
+    if odometry is not None and not commanded:
+        v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
+    pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))
+             if min(ours.std(), theirs.std()) > VARIED]
+    if not pairs:
+        return None
+    ours, theirs = pairs[0]
+    most = min(round(REACH / LAG_DT), len(t) - 1)
+    alike = np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)])
+    now, k = float(alike[most]), int(np.argmax(alike))
+    bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
+    late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
+    near = round(LATE[commanded] / LAG_DT)
+    against = -float(alike[most - near : most + near + 1].min())  # where the sign is reversed
+    clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
+    return late if clear and abs(late) > LATE[commanded] else None
+
+
+def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
+    """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
+    one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
+    return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
 
 
 def _resets(trials: Sequence[Trial]) -> list[str]:
@@ -171,6 +226,7 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
         jumps = np.zeros(len(dt), bool)
         for step, speed in zip(steps, (stream.v, stream.omega), strict=False):
             way = np.maximum(np.abs(speed[1:]), np.abs(speed[:-1])) * dt
+            way = np.max([np.roll(way, shift) for shift in (-2, -1, 0, 1, 2)], axis=0)  # rows held up catch up at once
             usual = float(np.percentile(step / dt, 95)) * dt
             jumps |= step > JUMP[0] + JUMP[1] * np.maximum(way, usual)
         at = np.flatnonzero(jumps)
@@ -185,25 +241,42 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
-    """Odometry whose pose moves while its speeds are zero."""
-    empty = [trial for trial in trials if isinstance(one := trial.odometry, OdometryStream) and one.x is not None
-             and one.y is not None and np.hypot(np.ptp(one.x), np.ptp(one.y)) > 0.3
-             and float(np.abs(one.v).sum() / max(len(one.v), 1)) * float(np.ptp(one.t))
-             < ZERO * float(np.hypot(np.diff(one.x), np.diff(one.y)).sum())]
-    if len(empty) <= len(trials) / 2:
+    """Odometry whose pose moves, or turns, while the speed of it is exactly zero."""
+    found = [shares for trial in trials if (shares := _empty_shares(trial)) is not None]
+    if not found:
         return []
-    return ["odometry: its speeds v are all zero though its pose moves with the commands: the driver does not fill the "
-            "twist. Compute v and omega from the pose, or record a topic that has them."]
+    usual = [float(np.median(known)) if (known := [one[k] for one in found if np.isfinite(one[k])]) else 0.0
+             for k in (0, 1)]
+    empty = [name for name, share in zip(("v", "omega"), usual, strict=True) if share > EMPTY]
+    if not empty:
+        return []
+    how = "all zero" if max(usual) > 0.95 else f"zero in {max(usual):.0%} of that time"
+    return [f"odometry: its pose moves with the commands, but its speeds {' and '.join(empty)} are {how}: the driver "
+            "does not fill the twist. Compute v and omega from the pose, or record a topic that has them."]
 
 
-def _median(found: Sequence[Direction]) -> Direction:
-    angle = float(np.angle(np.median([np.exp(1j * one.angle).real for one in found])
-                           + 1j * np.median([np.exp(1j * one.angle).imag for one in found])))
-    return Direction(angle, float(np.median([one.error for one in found])),
+def _empty_shares(trial: Trial) -> tuple[float, float] | None:
+    """Shares of the time in which the pose travels and v is exactly zero, and in which it turns and omega is; nan where
+    it does not."""
+    stream = trial.odometry
+    if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < 20:
+        return None
+    half = max(SMOOTHING, float(np.median(np.diff(stream.t))))
+    x, y, turn = (np.abs(np.interp(stream.t + half, stream.t, one) - np.interp(stream.t - half, stream.t, one))
+                  / (2 * half) for one in (stream.x, stream.y, stream.yaw))
+    shares = []
+    for rate, speed in ((np.hypot(x, y), stream.v), (turn, stream.omega)):
+        faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
+        shares.append(float((speed == 0)[faster].mean()) if faster.sum() > 10 else float("nan"))
+    return shares[0], shares[1]
+
+
+def _pooled(found: Sequence[Direction]) -> Direction:
+    """The direction of all trials together, each by how well it shows one."""
+    weights = np.array([1 / max(one.error, 1e-4) ** 2 for one in found])
+    each = np.exp(1j * np.array([one.angle for one in found]))
+    angle = float(np.angle((weights * each).sum()))
+    apart = np.angle(each * np.exp(-1j * angle))
+    scatter = float((weights * apart**2).sum() / weights.sum() / max(len(found) - 1, 1))
+    return Direction(angle, float(np.sqrt(max(1 / weights.sum(), scatter))),
                      float(np.median([one.explained for one in found])))
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / norm if norm > 1e-9 else 0.0

@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
+from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import Bag, clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.rosbag import PACKED, clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.text_files import integrate_speeds, read_drives, text_files
+from whill_mjx.io.command_line import Range
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
@@ -30,16 +34,16 @@ class ConvertConfig:
     """Options of the command."""
 
     source: Path
-    """ROS bag, folder of bags, or a measured set."""
+    """ROS bag, CSV or TUM file, folder of one of them, or a measured set."""
     out: Path = Path("runs/dataset")
     """Dataset folder; made where it does not exist, else the trials are added."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
-    wheel_radius: float | None = None
+    wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
     """Nominal wheel radius [m], where it is not the vehicle's."""
-    track: float | None = None
+    track: Annotated[float | None, Range(0.01, 5)] = None
     """Nominal track [m], where it is not the vehicle's."""
-    mass: float | None = None
+    mass: Annotated[float | None, Range(0.01, 1e4)] = None
     """Mass [kg], where it is not the vehicle's."""
     command_topic: str | None = None
     """Twist or TwistStamped sent to the vehicle."""
@@ -47,20 +51,28 @@ class ConvertConfig:
     """The vehicle's own Odometry; '' goes without."""
     truth_topic: str | None = None
     """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
-    truth_ahead: float = 0.0
+    truth_ahead: Annotated[float, Range(-10, 10)] = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
-    truth_turned: float = 0.0
+    truth_turned: Annotated[float, Range(-360, 360)] = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
+    input: Literal["auto", "commands", "wheels"] = "auto"
+    """What drives the model: commands, or measured wheel speeds (of joint states or odometry); auto takes the latter
+    where no recording has commands."""
     stamp: Literal["receive", "header"] = "receive"
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
     """One trial per bag, or one per drive between standstills."""
-    pause: float = 2.0
+    pause: Annotated[float, Range(0, 3600)] = 2.0
     """Least standstill between two drives [s]."""
     held_out: tuple[str, ...] = ()
     """Trials that are never to be fitted."""
     select: tuple[str, ...] = ()
     """Part of a measured set: RUN, GROUP or robotN."""
+    columns: tuple[str, ...] = ()
+    """What columns of CSV files hold, each as ROLE=[FILE/]COLUMN[:UNIT], e.g. command.v=speed_set:km/h; the rest is
+    guessed."""
+    command_timeout: float | None = None
+    """How long the base drives on where no command comes [s]; by default a command holds until the next."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +85,14 @@ class Drive:
     ground_truth: np.ndarray | None  # (T, 4)
 
 
+@dataclass(frozen=True)
+class Source:
+    """What a recording says of itself: where it is, and its streams by their own names."""
+
+    path: Path
+    streams: dict[str, str]
+
+
 def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     """Write the dataset and load it again.
 
@@ -83,30 +103,37 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
     """
     if not config.source.exists():
-        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a folder of bags or a measured set.")
+        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of them, or a "
+                                "measured set.")
     bags = find_bags(config.source)
     notes: list[str] = []
-    refused: list[ValueError] = []
-    if bags:
+    more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
+    if not bags and not is_known(config.source) and text_files(config.source):
         spec = _spec(config)
-        drives = []
-        for path in bags:
+        drives, notes, found = _text_drives(config, spec)
+        more |= found
+    elif bags:
+        spec = _spec(config)
+        wheels = config.input == "wheels"
+        drives, notes, refused = _bags_drives(bags, config, spec, wheels)
+        if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
             try:
-                found, more = bag_drives(path, config)
-            except ValueError as error:
-                refused.append(error)
-                notes.append(f"left out: {error}")
-                continue
-            drives += found
-            notes += [f"{path.name}: {note}" for note in more]
-        if len(refused) == len(bags):
+                drives, notes, refused = _bags_drives(bags, config, spec, True)
+                wheels = True
+            except ValueError:
+                drives = []
+            if not drives:
+                _, _, refused = _bags_drives(bags, config, spec, False)
+        if not drives and refused:
             raise refused[0]
+        if wheels:
+            more["input"] = "wheels"
     else:
         from sysid.logs.inspection import load_whole
 
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
-        drives = [trial_drive(trial) for trial in log.trials]
+        drives = [_moved(trial_drive(trial), config.truth_ahead, config.truth_turned) for trial in log.trials]
         if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
             notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
     if not drives:
@@ -116,14 +143,66 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    notes += write_dataset(config.out, spec, drives, config.held_out)
-    return load_log(config.out), notes
+    notes += write_dataset(config.out, spec, drives, config.held_out, more)
+    log = load_log(config.out)
+    made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
+    again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
+    return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
 
 
-def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str]]:
-    """Trials of one bag, and notes."""
+def _bags_drives(
+    bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec, wheels: bool
+) -> tuple[list[Drive], list[str], list[ValueError]]:
+    """Trials of several bags, notes, and why some are left out."""
+    drives: list[Drive] = []
+    notes: list[str] = []
+    refused: list[ValueError] = []
+    for path in bags:
+        try:
+            cut_out, said = bag_drives(path, config, spec, wheels)
+        except ValueError as error:
+            refused.append(error)
+            notes.append(f"left out: {error}")
+            continue
+        drives += cut_out
+        notes += [f"{path.name}: {note}" for note in said]
+    return drives, notes, refused
+
+
+def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive], list[str], dict[str, Any]]:
+    """Trials of CSV and TUM files, notes, and what dataset.toml says of them."""
+    drives: list[Drive] = []
+    notes: list[str] = []
+    found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
+    inputs = {one.measured_input for one in found}
+    if len(inputs) > 1:
+        raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
+                         "those without into a dataset of their own.")
+    decided = list(dict.fromkeys(str(column) for one in found for column in one.columns))
+    for one in found:
+        source = Source(config.source, {column.role.partition(".")[0]: column.file for column in one.columns})
+        cut_out, said = cut_drives(re.sub(r"[^\w.-]+", "_", one.name), one.tables, source, config)
+        drives += cut_out
+        notes += [f"{one.name}: {note}" for note in (*one.notes, *said)]
+    notes += [f"column {one}{f' ({one.why})' if one.why else ''}" for one in found[0].columns]
+    more: dict[str, Any] = {"columns": decided}
+    if inputs == {True}:
+        more["input"] = "wheels"
+    return drives, notes, more
+
+
+def bag_drives(
+    path: Path, config: ConvertConfig, spec: VehicleSpec, wheels: bool = False
+) -> tuple[list[Drive], list[str]]:
+    """Trials of one bag, and notes.
+
+    Args:
+        spec: nominal geometry, of wheels whose angles or rates were recorded.
+        wheels: the input is measured wheel speeds.
+    """
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
-    bag = in_order(read_bag(path, {name: topic for name, topic in asked.items() if topic is not None}), config.stamp)
+    topics = {name: topic for name, topic in asked.items() if topic is not None}
+    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
     times = stream_times(bag, config.stamp)
     notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
                            for name, stream in bag.streams.items()), *clock_notes(bag, config.stamp)]
@@ -135,9 +214,19 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
         if dropped:
             notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
         tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
+    stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
+    source = Source(path, {name: stream.topic for name, stream in bag.streams.items()})
+    drives, said = cut_drives(stem, tables, source, config)
+    return drives, [*notes, *said]
+
+
+def cut_drives(
+    stem: str, tables: dict[str, np.ndarray], source: Source, config: ConvertConfig
+) -> tuple[list[Drive], list[str]]:
+    """The trials of one recording, whole or cut at standstill, and notes."""
     if "ground_truth" in tables:
         tables["ground_truth"][:, 3] -= np.deg2rad(config.truth_turned)
-    stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
+    notes = []
     if config.split == "bag":
         spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),
                   min(table[-1, 0] for name, table in tables.items() if name != "command"))]
@@ -147,7 +236,7 @@ def bag_drives(path: Path, config: ConvertConfig) -> tuple[list[Drive], list[str
     drives = []
     for number, span in enumerate(spans, start=1):
         name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
-        drives.append(cut(name, tables, span, config.truth_ahead, bag))
+        drives.append(cut(name, tables, span, config.truth_ahead, source))
     return drives, notes
 
 
@@ -155,12 +244,13 @@ def _recording_name(path: Path) -> str:
     """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
     if not path.is_file():
         return path.name
-    alone = path.stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
-    return path.absolute().parent.name if alone else path.stem
+    stem = Path(path.stem).stem if path.suffix in PACKED else path.stem
+    alone = stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
+    return path.absolute().parent.name if alone else stem
 
 
 def cut(
-    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], truth_ahead: float, bag: Bag
+    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], truth_ahead: float, source: Source
 ) -> Drive:
     """The part of a recording between two times [s] as a trial that counts from its start.
 
@@ -171,11 +261,11 @@ def cut(
     for stream, table in tables.items():
         inside = table[(table[:, 0] >= begin - 1e-9) & (table[:, 0] <= end + 1e-9)].copy()
         if stream == "command":
-            before = table[table[:, 0] < begin - 1e-9]
+            before = table[table[:, 0] <= begin + 1e-6]
             first = before[-1, 1:] if len(before) else np.zeros(2)
             inside = np.vstack([[begin, *first], inside[inside[:, 0] > begin + 1e-6]])
         if len(inside) < 2:
-            raise ValueError(f"{bag.path}: topic {bag.streams[stream].topic} has {len(inside)} messages in the drive "
+            raise ValueError(f"{source.path}: {source.streams[stream]} has {len(inside)} messages in the drive "
                              f"from {begin - _origin(tables):.1f} to {end - _origin(tables):.1f} s; at least 2 are "
                              "needed. Use --split bag, or leave the topic out.")
         inside[:, 0] -= begin
@@ -237,7 +327,7 @@ def trial_drive(trial: Trial) -> Drive:
         source = trial.odometry
         x, y, yaw = (source.x, source.y, source.yaw)
         if x is None or y is None or yaw is None:
-            x, y, yaw = _integrate(source.t, source.v, source.omega)
+            x, y, yaw = integrate_speeds(source.t, source.v, source.omega)
         odometry = np.column_stack([source.t, x, y, yaw, source.v, source.omega])
     if trial.ground_truth is not None:
         truth = trial.ground_truth
@@ -248,8 +338,26 @@ def trial_drive(trial: Trial) -> Drive:
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
 
 
-def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = ()) -> list[str]:
+def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
+    """The drive with its outside pose at the drive-axle centre and along the vehicle, as of `cut`."""
+    if drive.ground_truth is None or ahead == turned == 0.0:
+        return drive
+    truth = drive.ground_truth.copy()
+    truth[:, 3] -= np.deg2rad(turned)
+    truth[:, 1] -= ahead * np.cos(truth[:, 3])
+    truth[:, 2] -= ahead * np.sin(truth[:, 3])
+    truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
+    return replace(drive, ground_truth=truth)
+
+
+def write_dataset(
+    folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
+    more: Mapping[str, Any] | None = None,
+) -> list[str]:
     """Write the trials that the loader accepts into a dataset folder; an existing dataset keeps its fields and trials.
+
+    Args:
+        more: further fields of a new dataset.toml.
 
     Returns:
         Notes on the trials that were left out.
@@ -270,7 +378,10 @@ def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held
         raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
                          "trials to its held_out by hand.")
     if known and any((folder / "trials").glob("*")):
-        load_log(folder)  # trials are not added to what cannot be loaded
+        log = load_log(folder)  # trials are not added to what cannot be loaded
+        if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
+            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
+                             "trials is another. Choose another --out.")
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
         accepted, refused = _write_accepted(partial, drives)
@@ -280,7 +391,7 @@ def write_dataset(folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held
             reason = notes[0] if not missing else f"{missing[0]} is held out, but it is {notes[0]}"
             raise ValueError(f"{reason.removeprefix('left out: ')} Nothing was written.")
         if not known:
-            write_fields(partial, spec, held_out)
+            write_fields(partial, spec, held_out, more)
             spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
         (folder / "trials").mkdir(parents=True, exist_ok=True)
         if not known:
@@ -328,16 +439,6 @@ def _increasing(t: np.ndarray) -> tuple[np.ndarray, int]:
             keep.append(i)
             latest = value
     return np.array(keep, int), len(t) - len(keep)
-
-
-def _integrate(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dead reckoning of speeds: what an odometry would report that only logged its wheels."""
-    dt = np.diff(t)
-    turn = (omega[1:] + omega[:-1]) / 2 * dt
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
-    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
-            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
 
 
 def _origin(tables: dict[str, np.ndarray]) -> float:

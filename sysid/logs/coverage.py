@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +11,17 @@ from sysid.logs.contradictions import contradictions
 from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.streams import speeds, standstill
+from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import time_faults
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
+LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
+CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
 FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
+Responses = Mapping[str, Mapping[str, Mapping[str, Shift]]]
+"""Channel -> trial -> "v" or "omega" -> how late it follows the command."""
 SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw", "v", "omega")}
 
 
@@ -107,20 +111,28 @@ def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
     return groups
 
 
-def sanity(log: Log) -> list[str]:
-    """Signs that a column has another unit, sign or origin than it should, as sentences."""
+def sanity(log: Log, responses: Responses | None = None) -> list[str]:
+    """Signs that a column has another unit, sign or origin than it should, as sentences.
+
+    Args:
+        responses: `response_shift` of every trial by channel, where it is known.
+    """
     trials, skid = log.trials, log.spec.drive == "skid"
     found = []
-    contradicted = contradictions(trials)
+    contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
+        shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
-            gains = [found_gain for trial in trials if (found_gain := _gain(trial, channel, index)) is not None]
+            gains = _gains(trials, channel, index, list(shifts.values()))
             if not gains or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
-            gain, follows = (float(value) for value in np.median(gains, axis=0))
-            where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(gains)} trials)"
-            odd = not (0.1 if skid and name == "omega" else 0.4) < gain < 2.0  # a skid drive scrubs most of its turn
+            least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn
+            gain, follows = max(gains, key=lambda one: (least < one[0] < 2.0, abs(one[1])))
+            if abs(gains[-1][1]) > CLOSELY:
+                gain, follows = gains[-1]
+            where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
+            odd = not least < gain < 2.0
             if odd and abs(follows) < FOLLOWS:
                 found.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
@@ -142,6 +154,21 @@ def sanity(log: Log) -> list[str]:
                      f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
                      "against it say little of a model; a fit leaves such trials out.")
     return found
+
+
+def _gains(
+    trials: Sequence[Trial], channel: str, index: int, shifts: Sequence[Mapping[str, Shift]]
+) -> list[tuple[float, float]]:
+    """Two estimates of a measured speed (1) or yaw rate (2) over the command, each with its correlation (medians).
+
+    One is at the delay and lag that fit best, and errs where commands are short or periodic. The other is at a usual
+    delay, and errs where the vehicle follows late.
+    """
+    best = [shift for one in shifts if (shift := one.get(("v", "omega")[index - 1]))]
+    usual = [one for trial in trials if (one := _gain(trial, channel, index)) is not None]
+    both = ([(one.gain, one.correlation) for one in best], usual)
+    return [(float(np.median([gain for gain, _ in found])), float(np.median([follows for _, follows in found])))
+            for found in both if found]
 
 
 def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:

@@ -69,7 +69,7 @@ def inspect(log: Log) -> dict[str, Any]:
                if any(found.values())},
             **({"ground_truth after odometry": _pooled(list(clocks.values()))} if any(clocks.values()) else {})},
         "pose_jitter": _median([pose_jitter(trial) for trial in log.trials]),
-        "sanity": sanity(log),
+        "sanity": sanity(log, responses),
         "trials": [{"trial": trial.name, "group": trial.group, "manoeuvre": trial.manoeuvre, "seconds": trial.duration,
                     "held_out": trial.held_out, "excitation": asdict(excitations[trial.name]),
                     "streams": {name: asdict(one) | {"rate": one.rate} for name, one in qualities[trial.name].items()},
@@ -151,6 +151,14 @@ def text(found: dict[str, Any]) -> str:
     lines += ["", "What this log cannot determine"]
     for blind in found["blind_spots"]:
         lines += [f"  {blind['cause']} -> {blind['hidden']}", f"      remedy: {blind['remedy']}"]
+    if found.get("next_drives"):
+        lines += ["", "Next drives (ramped, within the space; --out writes them as t,v,omega; keep a hand on the stop)"]
+    for one in found.get("next_drives", ()):
+        (length, width), (x, y, yaw) = one["length_width"], one["start"]
+        lines.append(f"  {one['file']} {one['manoeuvre']}, {one['seconds']:.0f} s, to {one['v']:.2f} m/s and "
+                     f"{one['omega']:.2f} rad/s: {one['why']}")
+        lines.append(f"      path of {length:.1f} x {width:.1f} m; start {x:.1f}, {y:.1f} m from a corner, heading "
+                     f"{np.rad2deg(yaw):.0f} deg")
     return "\n".join(lines)
 
 

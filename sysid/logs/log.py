@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from whill_mjx.io import fields as tables
+from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
@@ -27,6 +28,7 @@ START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command 
 
 SLOWEST = 4.0  # s between rows that no log has in all of its streams
 LEAST_ROWS = 10  # of a stream to be asked for its rate
+LONGER = 200.0  # times that one stream of a trial lasts as long as another, which no recording does
 TIME_UNITS = (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3))
 
 COMMAND_COLUMNS = ("t", "v", "omega")
@@ -172,12 +174,20 @@ def load_log(folder: str | Path) -> Log:
     if unknown:
         raise ValueError(f"{folder / 'dataset.toml'}: held_out names {unknown}, which are not under trials/. "
                          "Correct the names, or nothing is really held out.")
-    trials = tuple(load_trial(path, path.name in held_out) for path in trial_folders)
+    timeout = fields.get("command_timeout")
+    trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    if fields.get("input") == "wheels":
+        trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
+        notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
     return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
 
 
-def load_trial(folder: Path, held_out: bool = False) -> Trial:
-    """Load and check one trial folder."""
+def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
+    """Load and check one trial folder.
+
+    Args:
+        timeout: after which the base stops where no command comes [s]; None where a command holds until the next.
+    """
     command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
     command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
     odometry = ground_truth = None
@@ -189,7 +199,8 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
         ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
     if odometry is None and ground_truth is None:
         raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them.")
-    _check_seconds(folder, [one.t for one in (command, odometry, ground_truth) if one is not None])
+    _check_seconds(folder, {name: one.t for name, one in (("command.csv", command), ("odometry.csv", odometry), (
+        "ground_truth.csv", ground_truth)) if one is not None})
     for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
         if stream is not None:
             _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
@@ -197,6 +208,8 @@ def load_trial(folder: Path, held_out: bool = False) -> Trial:
         odometry = replace(odometry, yaw=np.unwrap(odometry.yaw))
     if ground_truth is not None:
         ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
+    if timeout is not None:
+        command = with_timeout(command, timeout)
     return make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
 
 
@@ -228,6 +241,23 @@ def make_trial(
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
     return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
+
+
+def held_from_middle(rates: Command) -> Command:
+    """Measured speeds as commands: each holds from half an interval before its time to half an interval after."""
+    middle = (rates.t[1:] + rates.t[:-1]) / 2
+    return Command(np.concatenate([rates.t[:1], middle]), rates.v, rates.omega)
+
+
+def with_timeout(command: Command, timeout: float) -> Command:
+    """The commands that a base takes which stops where none has come for a time [s]: standstill in each longer pause,
+    and after the last."""
+    pauses = np.diff(np.append(command.t, np.inf)) > timeout + 1e-6
+    stop = pauses & ((command.v != 0) | (command.omega != 0))
+    t = np.concatenate([command.t, command.t[stop] + timeout])
+    order = np.argsort(t, kind="stable")
+    zero = np.zeros(int(stop.sum()))
+    return Command(t[order], np.append(command.v, zero)[order], np.append(command.omega, zero)[order])
 
 
 def manoeuvre_of(trial_name: str) -> str:
@@ -283,10 +313,27 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
         raise ValueError(f"{path}: {error}") from None
 
 
+def check_same_vehicle(log: Log, spec: VehicleSpec, place: str, rule: str) -> None:
+    """Raise ValueError where a vehicle of another geometry is given beside a log.
+
+    Args:
+        place: where it was given.
+        rule: the rule that is broken, in words.
+    """
+    for name in ("wheel_radius", "track", "wheelbase", "drive"):
+        mine, theirs = getattr(log.spec, name), getattr(spec, name)
+        if mine != theirs:
+            raise ValueError(f"{place}: {name} is {theirs}, but {mine} in {log.name!r}. {rule}; correct dataset.toml "
+                             "or leave it out.")
+
+
 def hash_files(folder: Path) -> str:
     """SHA-256 over names and contents of all data files of a dataset."""
     digest = hashlib.sha256()
+    results = {path.parent for path in folder.rglob(RUN_FILE)}  # of commands that were given a place in here
     for path in sorted(folder.rglob("*")):
+        if not results.isdisjoint(path.parents):
+            continue
         if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
             digest.update(str(path.relative_to(folder)).encode() + b"\0")
             with path.open("rb") as file:
@@ -304,18 +351,31 @@ def read_fields(path: Path) -> dict[str, Any]:
     return tables.check_table(str(path), tables.DATASET, content)
 
 
-def _check_seconds(folder: Path, times: list[np.ndarray]) -> None:
+def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
     """Rows must not be as far apart as no recording's are: this finds milliseconds and smaller units.
 
     Args:
-        times: of each stream (T,).
+        times: of each file (T,).
     """
-    steps = [float(np.median(np.diff(t))) for t in times if len(t) >= LEAST_ROWS]
-    if steps and min(steps) > SLOWEST:
-        step = min(steps)
-        unit, size = next((one for one in TIME_UNITS if step > 1.5e-3 * one[1]), TIME_UNITS[-1])
-        raise ValueError(f"{folder}: t steps by {step:g} from row to row, a rate of {1 / step:.2g} Hz if that were "
-                         f"seconds: it seems to be in {unit}. Divide t by {size:.0f}.")
+    steps = {name: float(np.median(np.diff(t))) for name, t in times.items() if len(t) > 1}
+    spans = {name: float(t[-1] - t[0]) for name, t in times.items() if len(t) > 1}
+    for name, t in times.items():
+        if steps.get(name, 0.0) <= SLOWEST:
+            continue
+        shortest = min(spans, key=lambda other: spans[other])
+        longer = spans[name] / max(spans[shortest], 1e-9)
+        if longer < LONGER and (len(t) < LEAST_ROWS or name == "command.csv" and min(steps.values()) <= SLOWEST):
+            continue  # commands may be sent only when they change
+        step, others = steps[name], ""
+        if longer > LONGER:
+            size = min((size for _, size in TIME_UNITS), key=lambda size: abs(np.log(longer / size)))
+            unit = next(unit for unit, one in TIME_UNITS if one == size)
+            others = f", and lasts {longer:.2g} times as long as {shortest}"
+        else:
+            unit, size = next((one for one in TIME_UNITS if step > 1.5e-3 * one[1]), TIME_UNITS[-1])
+        raise ValueError(f"{folder / name}: t steps by {step:g} from row to row, a rate of {1 / step:.2g} Hz if that "
+                         f"were seconds{others}: it seems to be in {unit}. Divide t by {size:.0f}"
+                         f"{' in all streams' if not others and len(times) > 1 else ''}.")
 
 
 def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Command) -> None:

@@ -6,6 +6,9 @@ Dataset 6 (Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): fiv
 
 Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
 both systems repeat the last value between updates.
+
+Two faults of the DRIVE files are mended here. Their converter turned the positions of a window by the mean of its first
+five yaws but counted yaw from the first one; and an ICP update that fell between two windows is in neither.
 """
 
 from __future__ import annotations
@@ -13,12 +16,14 @@ from __future__ import annotations
 import io
 import warnings
 from array import array
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sysid.logs.gyro import told_sign
 from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.sources import about
@@ -39,8 +44,13 @@ CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
 MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
-# The gyro of this run is mounted or logged with the opposite sign: slope against the ICP yaw rate is -0.93.
-GYRO_SIGN = {"warthog_gravel": -1.0}
+FRAME_SAMPLES = 5
+"""Samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions."""
+RARE = 0.5  # of an update, by which intervals that a run does not show are counted
+BREAK = 0.5
+"""Probability of a lost update from which the motion over a joint is not compared bin by bin."""
+HELD = 1e-9
+"""Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
 MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
@@ -58,6 +68,14 @@ def detect_format(path: str | Path) -> str:
     if any(path.glob("*.npz")) and not (path / "report.json").exists():  # a fit keeps its series so
         return "drive_norlab"
     raise ValueError(f"{path}: {about(path)}")
+
+
+def is_known(path: Path) -> bool:
+    """Whether a folder is a dataset or a measured set."""
+    try:
+        return bool(detect_format(path))
+    except (ValueError, FileNotFoundError):
+        return False
 
 
 def drive_spec(run: str) -> VehicleSpec:
@@ -80,8 +98,8 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
     Args:
         folder: folder with the .npz and .csv.gz files.
         runs: file stems, e.g. ("warthog_sand_1",).
-        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the note on
-            the log states how often and by how much.
+        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
+            is then that of wheels and gyro, by its probability, and the note on the log states how often and how much.
 
     Returns:
         One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
@@ -127,7 +145,8 @@ def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -
 def only_changes(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> PoseStream:
     """The samples at which the pose differs from the one before (yaw unwrapped); the first sample is the start."""
     yaw = np.unwrap(yaw)
-    changed = np.flatnonzero((np.diff(x) != 0) | (np.diff(y) != 0) | (np.diff(yaw) != 0)) + 1
+    moved = np.abs([np.diff(x), np.diff(y), np.diff(yaw)]).max(axis=0)
+    changed = np.flatnonzero(moved > HELD) + 1
     return PoseStream(t[changed], x[changed], y[changed], yaw[changed])
 
 
@@ -157,27 +176,34 @@ def _drive_windows(path: Path, run: str, chained: bool
     spec = drive_spec(run)
     command_v, command_omega = twist_from_wheels(spec, block("cmd_left"), block("cmd_right"))
     wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
-    x, y, yaw = block("icp_x"), block("icp_y"), np.unwrap(block("icp_yaw"), axis=1)
-    gyro = GYRO_SIGN.get(run, 1.0) * block("imu_yaw")
+    x, y, yaw = in_first_frame(block("icp_x"), block("icp_y"), block("icp_yaw"))
+    gyro = block("imu_yaw")
     for name in DRIVE_COLUMNS:
         if not (np.abs(block(name)) < LARGEST).all():
             raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
                              "incomplete windows.")
+    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(len(data))])
+    gyro *= sign or 1.0
+    joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
     length = DRIVE_STEP_ROWS if chained else 1
     t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
-    trials, missed = [], []
+    trials: list[Trial] = []
+    missed: list[tuple[float, float]] = []
     rates = {}
     for row in range(0, len(data) - length + 1, length):
         rows = slice(row, row + length)
         step, window = divmod(row, DRIVE_STEP_ROWS)
         name = f"{run}/{step:03d}.{window}"
-        pose = (x[row], y[row], yaw[row])
+        pose: tuple[np.ndarray, ...] = (x[row], y[row], yaw[row])
         breaks: list[tuple[float, float]] = []
-        for k in range(row + 1, row + length):
-            pose, gap, between = _chain(pose, (x[k], y[k], yaw[k]))
-            missed.append(gap)
-            if gap > 0:
-                breaks.append((between[0] * DRIVE_DT, between[1] * DRIVE_DT))
+        for k in range(row, row + length - 1):
+            assert joints is not None
+            likely = float(joints.probability[k])
+            pose = _chain(pose, (x[k + 1], y[k + 1], yaw[k + 1]), likely * joints.way[k], likely * joints.turn[k])
+            missed.append((likely, float(abs(joints.way[k]))))
+            if likely > BREAK:
+                before, after = (DRIVE_ROWS * (k - row) + joints.between[k]) * DRIVE_DT
+                breaks.append((float(before), float(after)))
         command = Command(t, command_v[rows].ravel(), command_omega[rows].ravel())
         odometry = OdometryStream(t, None, None, None, wheel_v[rows].ravel(), wheel_omega[rows].ravel())
         start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]), measured=True)
@@ -189,37 +215,90 @@ def _drive_windows(path: Path, run: str, chained: bool
                             breaks=tuple(breaks)))
         rates[name] = t, gyro[rows].ravel()
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
+    if sign != 1.0:
+        note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
+                 ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
     if chained:
-        late = np.array([gap for gap in missed if gap > 0] or [0.0])
-        note += (f", chained by the last pose of each 2 s window: {np.mean(np.array(missed) > 0):.0%} of the joints "
-                 f"miss an ICP update; those are off by {np.median(late):.2f} m (median), {late.max():.2f} m at most")
+        likely, way = np.array(missed or [(0.0, 0.0)]).T
+        late = way[likely > 0.5] if (likely > 0.5).any() else np.zeros(1)
+        note += (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an "
+                 f"ICP update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), "
+                 f"{late.max():.2f} m at most")
     return trials, note, rates
 
 
-def _chain(
-    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float, tuple[int, int]]:
-    """Both windows in the frame of the first, the motion that the joint misses [m] (0 where it misses none), and the
-    samples between which it does.
+def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Windows (N, 40) in the frame of their first sample, yaw unwrapped.
 
-    The second window's frame is that of its own first sample. An ICP update between the last sample of the first
-    window and the first sample of the second is lost; then the time since the last change is over 1.5 update periods.
+    The publishers' converter (dataset_parser.py, build_torch_ready_dataset) turned the positions by the mean of the
+    first five yaws, which it did not unwrap: where yaw passes +-pi within them the mean is far off.
     """
+    turned = yaw[:, :FRAME_SAMPLES].mean(axis=1, keepdims=True)
+    cos, sin = np.cos(turned), np.sin(turned)
+    return cos * x - sin * y, sin * x + cos * y, np.unwrap(yaw, axis=1)
+
+
+@dataclass(frozen=True)
+class _Joints:
+    """What is lost between each window of N and the next one: an ICP update may be in neither."""
+
+    probability: np.ndarray  # (N - 1,) that one is lost
+    way: np.ndarray  # (N - 1,) m, that the wheels went between the last update of a window and its end
+    turn: np.ndarray  # (N - 1,) rad, that the gyro turned meanwhile
+    between: np.ndarray  # (N - 1, 2) int, samples of the update before and of the one after, from the window's start
+
+
+def _joints(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, v: np.ndarray, omega: np.ndarray) -> _Joints:
+    """Joints of windows (N, 40) in the frame of their first sample.
+
+    An update at a window's first sample shows in none. Whether there was one follows from two things. Updates come at
+    the run's usual intervals: either one lasts over the joint, or two meet there. And the first update of a window is
+    as far from the one before as wheels and gyro moved meanwhile: since the last update of the window before, or since
+    the window's start alone. Within windows both are apart by so much (Laplace, which bears jumps).
+    """
+    count = len(x)
+    changes = [np.flatnonzero(np.abs(np.diff([x[k], y[k], yaw[k]], axis=1)).max(axis=0) > HELD) + 1
+               for k in range(count)]
+    way, turn = (DRIVE_DT * np.cumsum(np.pad(rate, ((0, 0), (1, 0))), axis=1) for rate in (v, omega))  # before a sample
+
+    def apart(k: int, begin: int, end: int, gone: float, turned: float) -> np.ndarray:
+        """(2,) motion of the ICP between two samples of a window, less a way and a turn."""
+        middle = (yaw[k, begin] + yaw[k, end]) / 2
+        ahead = np.cos(middle) * (x[k, end] - x[k, begin]) + np.sin(middle) * (y[k, end] - y[k, begin])
+        return np.array([ahead - gone, yaw[k, end] - yaw[k, begin] - turned])
+
+    inside = [apart(k, a, b, way[k, b] - way[k, a], turn[k, b] - turn[k, a])
+              for k in range(count) for a, b in pairwise(changes[k])]
+    usual = np.abs(inside).mean(axis=0) if inside else np.ones(2)
+    found = _Joints(*(np.zeros(count - 1) for _ in range(3)), np.full((count - 1, 2), DRIVE_ROWS))
+    ratio = np.full(count - 1, np.nan)
+    for k in range(count - 1):
+        if len(changes[k]) and len(changes[k + 1]):
+            last, first = int(changes[k][-1]), int(changes[k + 1][0])
+            found.between[k] = last, DRIVE_ROWS + first
+            found.way[k], found.turn[k] = way[k, -1] - way[k, last], turn[k, -1] - turn[k, last]
+            lost = apart(k + 1, 0, first, way[k + 1, first], turn[k + 1, first])
+            whole = lost - [found.way[k], found.turn[k]]
+            ratio[k] = ((np.abs(whole) - np.abs(lost)) / np.maximum(usual, HELD)).sum()
+    known = np.isfinite(ratio)
+    intervals = np.bincount([b - a for one in changes for a, b in pairwise(one)], minlength=2 * DRIVE_ROWS) + RARE
+    rate = np.log(intervals / intervals.sum())
+    last, first = found.between[known, 0], found.between[known, 1]
+    ratio[known] += rate[DRIVE_ROWS - last] + rate[first - DRIVE_ROWS] - rate[first - last]
+    found.probability[known] = 1 / (1 + np.exp(-np.clip(ratio[known], -50, 50)))
+    return found
+
+
+def _chain(
+    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...], way: float, turn: float
+) -> tuple[np.ndarray, ...]:
+    """Both windows in the frame of the first, the second of which starts that far on [m, rad]."""
     x0, y0, yaw0 = (float(values[-1]) for values in first)
+    x0, y0, yaw0 = x0 + way * np.cos(yaw0 + turn / 2), y0 + way * np.sin(yaw0 + turn / 2), yaw0 + turn
     cos, sin = np.cos(yaw0), np.sin(yaw0)
     x, y, yaw = second
-    joined = (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
-              np.concatenate([first[2], yaw0 + yaw]))
-    n = len(first[0])
-    changes = np.flatnonzero(np.diff(joined[0]) != 0) + 1
-    before, after = changes[changes < n], changes[changes > n]
-    if len(before) < 2 or len(after) < 2:
-        return joined, 0.0, (n, n)
-    period = float(np.median(np.diff(changes)))
-    if after[0] - before[-1] <= 1.5 * period:
-        return joined, 0.0, (n, n)
-    speed = np.hypot(joined[0][after[-1]] - joined[0][after[0]], joined[1][after[-1]] - joined[1][after[0]])
-    return joined, float(speed / max(after[-1] - after[0], 1) * period), (int(before[-1]), int(after[0]))
+    return (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
+            np.concatenate([first[2], yaw0 + yaw]))
 
 
 def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:

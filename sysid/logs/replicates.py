@@ -20,6 +20,11 @@ PERIODS = 1.5  # of the commands, by which a change may come earlier or later
 TIMING = (0.05, 0.2)  # s, bounds of that time
 VALUE = (2e-3, 0.005)  # m/s or rad/s, and share of the largest command, by which values may differ
 LONGEST = 3600.0  # s of drive that are compared
+ROUNDED = 0.02  # s that times of two tables may differ by, row by row, where they are compared row by row
+NEAR = 0.25
+"""Distance of two commands (root mean square over a drive), as a share of the larger one, at which a model still leaves
+nearly the same of both. What it leaves grows at least in proportion to the command: three quarters of it are common."""
+GLANCE = 0.5  # s between the instants at which drives are compared first
 
 
 @dataclass(frozen=True)
@@ -85,13 +90,55 @@ def shift_between(a: Course, b: Course) -> float | None:
     return b.begin - a.begin + lag * TABLE_DT
 
 
-def side_by_side(a: Course, b: Course, most: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Commands (T, 2) of two drives at the same times since their first motion; None where one does not move, or where
-    their motion begins more than `most` apart in the recordings [s] or does not last as long."""
-    if not (a.moves and b.moves) or abs(a.begin - b.begin) > most or abs(a.end - b.end) > TIMING[1] + most:
-        return None
-    t = np.arange(0.0, min(max(a.end - a.begin, b.end - b.begin), LONGEST), TABLE_DT)
-    return a.at(t), b.at(t)
+def near(a: Course, b: Course, most: float) -> bool:
+    """Whether the commands of two drives are nearly the same function of time, channel by channel.
+
+    Args:
+        most: how far apart the drives may begin in their recordings [s].
+    """
+    if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=ROUNDED):
+        ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
+    elif not (a.moves and b.moves) or abs(a.begin - b.begin) > most or abs(a.end - b.end) > TIMING[1] + most:
+        return False
+    else:
+        t = np.arange(0.0, min(max(a.end - a.begin, b.end - b.begin), LONGEST), TABLE_DT)
+        ours, theirs = a.at(t), b.at(t)
+    apart = np.linalg.norm(ours - theirs, axis=0)
+    size = np.maximum(np.linalg.norm(ours, axis=0), np.linalg.norm(theirs, axis=0))
+    return bool((apart <= NEAR * size + NONE * np.sqrt(len(ours))).all())
+
+
+@dataclass(frozen=True)
+class Glance:
+    """Commands at some instants since the first motion, and between which values they lie around them."""
+
+    values: np.ndarray  # (K, 2)
+    low: np.ndarray  # (K, 2)
+    high: np.ndarray  # (K, 2)
+    length: float  # s of motion; nan where there is none
+
+
+def glance(course: Course) -> Glance:
+    """What is compared of a drive first."""
+    if not course.moves or course.end - course.begin > LONGEST:
+        return Glance(*(np.zeros((0, 2)),) * 3, float("nan"))
+    around = 2 * TIMING[1]  # s by which two commands of replicates may be apart in time
+    t = np.arange(0.0, course.end - course.begin, GLANCE)
+    near = np.arange(-around, around + TABLE_DT, TABLE_DT)
+    table = course.at((t[:, None] + near).ravel()).reshape(len(t), len(near), 2)
+    return Glance(course.at(t), table.min(axis=1), table.max(axis=1), course.end - course.begin)
+
+
+def may_be_alike(a: Glance, b: Glance) -> bool:
+    """Whether two drives may have the same commands: whatever `shift_between` accepts passes."""
+    count = min(len(a.values), len(b.values))
+    if not count:
+        return True
+    if abs(a.length - b.length) > 2 * TIMING[1]:
+        return False
+    allowed = VALUE[0] + VALUE[1] * np.maximum(np.abs(a.high), np.abs(a.low)).max(axis=0)
+    values = a.values[:count]
+    return bool(((values >= b.low[:count] - allowed) & (values <= b.high[:count] + allowed)).all())
 
 
 def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
@@ -101,11 +148,14 @@ def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]
         most: how much earlier or later than in the first of them the commands may come in the recording [s].
     """
     courses = [course_of(trial) for trial in trials]
+    glances = [glance(course) for course in courses]
     groups: list[list[int]] = []
     of_manoeuvre: dict[str, list[list[int]]] = {}
     for i, trial in enumerate(trials):
         mine = of_manoeuvre.setdefault(trial.manoeuvre, [])
         for group in mine:
+            if not may_be_alike(glances[group[0]], glances[i]):
+                continue
             shift = shift_between(courses[group[0]], courses[i])
             if shift is not None and abs(shift) <= most:
                 group.append(i)

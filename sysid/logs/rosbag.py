@@ -7,30 +7,46 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from sysid.logs.bag_clocks import find_bursts, find_step
+from sysid.logs.wheel_states import (
+    CHAIR_DEFINITION,
+    CHAIR_STATE,
+    COARSE,
+    JOYSTICK_FIELDS,
+    chair_odometry,
+    chair_row,
+    joint_row,
+    joint_twist,
+)
 from whill_mjx.io.reading import LONGEST_REASON
 
 TOPICS = {
     "command": ("/whill/controller/cmd_vel", "/cmd_vel", "/whill/cmd_vel"),
-    "odometry": ("/whill/odom", "/odom", "/whill/odometry"),
+    "odometry": ("/whill/odom", "/odom", "/whill/odometry", "/whill/states/model_cr2"),
     "ground_truth": ("/ground_truth/odom", "/ground_truth/pose"),
 }
 """Names that are looked for, the first found is taken. Odometry topics are never guessed to be ground truth."""
 TYPES = {
     "command": ("Twist", "TwistStamped"),
-    "odometry": ("Odometry",),
+    "odometry": ("Odometry", CHAIR_STATE),
     "ground_truth": ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"),
 }
 COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"), "ground_truth": ("x", "y", "yaw")}
+WHEELS = ("JointState", CHAIR_STATE, "Odometry")
+"""Types of the input where wheel speeds stand for commands, the first found is taken."""
 OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic"}
 SUFFIXES = (".db3", ".mcap", ".bag")
+PACKED = (".zst", ".zstd")
+UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
 MAX_SET_BACK = 0.5  # s that a stamp may run back by before the clock counts as set
 
 
@@ -57,7 +73,8 @@ class Bag:
 
 def is_bag(path: Path) -> bool:
     """Whether a path is one recording: a folder with metadata.yaml, or a file of a known kind."""
-    return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in SUFFIXES)
+    packed = path.suffix in PACKED and Path(path.stem).suffix in SUFFIXES
+    return (path / "metadata.yaml").is_file() or (path.is_file() and (path.suffix in SUFFIXES or packed))
 
 
 def find_bags(source: Path) -> list[Path]:
@@ -67,27 +84,41 @@ def find_bags(source: Path) -> list[Path]:
     return sorted(path for path in source.iterdir() if is_bag(path)) if source.is_dir() else []
 
 
-def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
+def read_bag(
+    path: Path, topics: dict[str, str] | None = None, geometry: tuple[float, float] = (0.1325, 0.496),
+    wheels: bool = False,
+) -> Bag:
     """Streams of a recording.
 
     Args:
         path: folder of a rosbag2, or a .db3, .mcap or .bag file.
         topics: "command", "odometry", "ground_truth" -> topic; those left out are looked for, "" leaves one out.
+        geometry: nominal wheel radius and track [m], for angles and rates of wheels.
+        wheels: take measured wheel speeds in place of the commands.
 
     Raises:
         ValueError: naming the file, the topic, the rule and the remedy.
     """
+    if path.suffix in PACKED:
+        with TemporaryDirectory() as folder:
+            unpacked = _unpacked(path, Path(folder))
+            try:
+                return replace(read_bag(unpacked, topics, geometry, wheels), path=path)
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(unpacked), str(path))) from None
     try:
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise ValueError(f"{path}: reading ROS bags needs the package rosbags ({error}). "
                          "Run `pip install rosbags`.") from None
     notes: list[str] = []
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
+        with AnyReader([path], default_typestore=store) as reader:
             known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
-            chosen = choose_topics(path, known, topics or {}, notes)
+            chosen = choose_topics(path, known, topics or {}, notes, wheels)
             rows: dict[str, list[tuple[float, float, tuple[float, ...]]]] = {stream: [] for stream in chosen}
             names = {topic: stream for stream, topic in chosen.items()}
             connections = [one for one in reader.connections if one.topic in names]
@@ -104,29 +135,80 @@ def read_bag(path: Path, topics: dict[str, str] | None = None) -> Bag:
                          "repairs one.") from None
     streams = {}
     for stream, topic in chosen.items():
-        table = np.array([values for _, _, values in rows[stream]], float).reshape(-1, len(COLUMNS[stream]))
+        table = np.array([values for _, _, values in rows[stream]], float)
+        table = table.reshape(len(rows[stream]), -1)
         unset = np.isinf(table).any(axis=1)
-        finite = np.isfinite(table).all(axis=1)
+        finite = np.isfinite(table).all(axis=1) | (short_type(known[topic]) == "JointState") & ~unset
         if unset.all() and len(unset):
+            if short_type(known[topic]) == "JointState":
+                raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
+                                 "--command-topic.")
             raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
                              f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
         if unset.any():
             notes.append(f"{topic}: {unset.sum()} messages with an orientation that is all zero are left out")
         if not (finite | unset).all():
             notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
-        received, stamped = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
-        if len(received) < 2:
-            raise ValueError(f"{path}: topic {topic} has {len(received)} usable messages; at least 2 are needed. Name "
+        times, stamps = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
+        if len(times) < 2:
+            raise ValueError(f"{path}: topic {topic} has {len(times)} usable messages; at least 2 are needed. Name "
                              f"another topic with {OPTIONS[stream]}, or '' to go without.")
-        streams[stream] = BagStream(topic, known[topic], received, stamped, table[finite])
+        values = table[finite]
+        if values.shape[1] != len(COLUMNS[stream]):
+            kind = short_type(known[topic])
+            times, stamps, values = _of_wheels(stream, kind, times, stamps, values, geometry)
+            if (step := float(np.median(np.diff(times)))) > COARSE:
+                notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. "
+                             "Ask the driver for 20 ms (publish_interval_ms)")
+        streams[stream] = BagStream(topic, known[topic], times, stamps, values)
     return Bag(path, streams, notes)
 
 
-def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], notes: list[str]) -> dict[str, str]:
-    """Topic of each stream, from what the bag has, what was asked for, and the names that are usual."""
+def _of_wheels(
+    stream: str, kind: str, received: np.ndarray, stamped: np.ndarray, rows: np.ndarray, geometry: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times and values of a stream of wheel angles and rates (T, 4), in order of time."""
+    later = np.append(True, np.diff(np.maximum.accumulate(received)) > 1e-6)
+    received, stamped, rows = received[later], stamped[later], rows[later]
+    if kind == CHAIR_STATE:
+        values = chair_odometry(received, rows, *geometry)
+        return received, stamped, values if stream == "odometry" else values[:, 3:]
+    return received, stamped, joint_twist(received, rows, *geometry)
+
+
+def _unpacked(path: Path, folder: Path) -> Path:
+    """A packed bag, as a recorder leaves it that was killed before it wrote metadata.yaml, unpacked into a folder."""
+    from rosbags.rosbag2.reader import zstd  # the standard library's, or what stands for it in older Pythons
+
+    target = folder / path.stem
+    try:
+        with zstd.open(path, "rb") as source, target.open("wb") as out:
+            while part := source.read(1 << 20):
+                if out.tell() > UNPACKED_BYTES:
+                    raise ValueError(f"{path}: is larger than {UNPACKED_BYTES / 1e9:g} GB unpacked. Split it.")
+                out.write(part)
+    except (zstd.ZstdError, EOFError) as error:
+        raise ValueError(f"{path}: cannot be unpacked ({error}). Copy it again, or unpack it with zstd -d.") from None
+    return target
+
+
+def choose_topics(
+    path: Path, known: dict[str, str], asked: dict[str, str], notes: list[str], wheels: bool = False
+) -> dict[str, str]:
+    """Topic of each stream, from what the bag has, what was asked for, and the names that are usual.
+
+    Args:
+        wheels: the input is measured wheel speeds.
+    """
     listing = ", ".join(f"{name} ({short_type(kind)})" for name, kind in sorted(known.items())) or "none"
     chosen: dict[str, str] = {}
+    types = {**TYPES, "command": WHEELS} if wheels else TYPES
     for stream in TOPICS:
+        if wheels and stream == "command" and stream not in asked:
+            chosen.update(_wheel_topic(path, known, listing))
+            continue
+        if wheels and stream == "odometry":
+            continue
         if stream in asked:
             topic = asked[stream]
             if not topic:
@@ -134,9 +216,9 @@ def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], note
             if topic not in known:
                 raise ValueError(f"{path}: no topic {topic!r} (topics with messages: {listing}). Correct "
                                  f"{OPTIONS[stream]}.")
-            if short_type(known[topic]) not in TYPES[stream]:
+            if short_type(known[topic]) not in types[stream]:
                 raise ValueError(f"{path}: topic {topic} is {known[topic]}; {stream} must be one of "
-                                 f"{', '.join(TYPES[stream])}. Name another topic with {OPTIONS[stream]}.")
+                                 f"{', '.join(types[stream])}. Name another topic with {OPTIONS[stream]}.")
             chosen[stream] = topic
             continue
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
@@ -149,7 +231,8 @@ def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], note
             notes.append(f"{stream} is taken from {fitting[0]}, the only topic of a fitting type")
     if "command" not in chosen and "command" not in asked:
         raise ValueError(f"{path}: no command topic found (topics with messages: {listing}). Name the Twist or "
-                         "TwistStamped that was sent to the vehicle with --command-topic.")
+                         "TwistStamped that was sent to the vehicle with --command-topic; or take the measured wheel "
+                         "speeds in its place, with an outside pose: --input wheels.")
     if "command" not in chosen:
         raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
     if not {"odometry", "ground_truth"} & set(chosen):
@@ -158,14 +241,33 @@ def choose_topics(path: Path, known: dict[str, str], asked: dict[str, str], note
     return chosen
 
 
+def _wheel_topic(path: Path, known: dict[str, str], listing: str) -> dict[str, str]:
+    """The topic whose wheel speeds are the input."""
+    for kind in WHEELS:
+        fitting = [name for name, one in known.items()
+                   if short_type(one) == kind and name not in TOPICS["ground_truth"]]
+        usual = [name for name in TOPICS["odometry"] if name in fitting]
+        if len(fitting) == 1 or usual:
+            return {"command": (usual or fitting)[0]}
+    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState "
+                     "or an Odometry with --command-topic.")
+
+
 def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
     """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw; all of them nan where a number is not
     finite, and infinite where the orientation was never set."""
     row = _columns(stream, kind, message)
-    return row if np.isfinite(row).all() or np.isinf(row).all() else (float("nan"),) * len(row)
+    whole = all(map(math.isfinite, row)) or all(map(math.isinf, row)) or kind == "JointState"
+    return row if whole else (math.nan,) * len(row)
 
 
 def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    if kind == CHAIR_STATE:
+        return chair_row(message)
+    if kind == "JointState":
+        return joint_row(message)
+    if kind == "Odometry" and stream == "command":
+        return float(message.twist.twist.linear.x), float(message.twist.twist.angular.z)
     if stream == "command":
         twist = message.twist if kind == "TwistStamped" else message
         return float(twist.linear.x), float(twist.angular.z)
@@ -190,7 +292,7 @@ _POSE: dict[str, Callable[[Any], Any]] = {
 
 def yaw_of(w: float, x: float, y: float, z: float) -> float:
     """Heading [rad] of a quaternion of any length."""
-    return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def header_time(message: Any) -> float:

@@ -51,7 +51,7 @@ def _about_folder(path: Path) -> str:
         return ("a ROS bag whose metadata.yaml is missing, so that it is not unpacked. "
                 f"{packed.name} is {_about_file(packed)}")
     if text := next((one for one in files if one.suffix in (".csv", ".txt", ".tum")), None):
-        return f"a folder of text files, not a dataset. {text.name} is {_about_file(text)}"
+        return f"a folder of text files ({text.name}), not a dataset. {convert}"
     return ("no dataset.toml, no *.npz and no MRCLAM_*_Odometry.dat.gz in it. Name the folder that holds one of them; "
             "the formats are in docs/log_format.md.")
 
@@ -69,12 +69,11 @@ def _about_file(path: Path) -> str:
         return f"one file of a recording. Give its folder: {path.parent}"
     rows = _first_rows(path)
     if rows and all(len(row) == TUM and _numbers(row) for row in rows):
-        return ("a trajectory in TUM form (time, position, quaternion), without the commands that a trial needs. Write "
-                "it as ground_truth.csv with t, x, y, yaw beside command.csv; docs/log_format.md has both.")
+        return ("a trajectory in TUM form (time, position, quaternion). Put it into one folder with a CSV of the "
+                f"commands or wheel speeds, then: python -m sysid.convert {path.parent} --out DATASET")
     if path.suffix in (".csv", ".txt", ".tsv"):
         names = f" with the columns {', '.join(rows[0][:12])}" if rows and not _numbers(rows[0]) else ""
-        return (f"a text file{names}. A trial is a folder trials/NAME with command.csv (t, v, omega) and odometry.csv "
-                "or ground_truth.csv: write its columns into these; docs/log_format.md has their units.")
+        return f"a text file{names}. Convert it first: python -m sysid.convert {path} --out DATASET"
     return "a file of a kind that is not known. Give a dataset's folder, or a ROS bag to python -m sysid.convert."
 
 

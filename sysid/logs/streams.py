@@ -155,11 +155,10 @@ def find_shift(
     target = signal[count:-count]
     for lag in lags:
         slow = _first_order(reference, lag, dt)
-        moved = [slow[count - k : len(slow) - count - k] for k in range(-count, count + 1)]
-        scores = np.abs([_correlation(one, target) for one in moved])
+        scores = np.abs(_correlations(slow, target))[::-1]  # the earliest window is that of the latest signal
         k = int(np.argmax(scores))
         if best is None or scores[k] > best[0]:
-            best = (float(scores[k]), lag, scores, k, moved[k])
+            best = (float(scores[k]), lag, scores, k, slow[2 * count - k : len(slow) - k])
     assert best is not None
     top, lag, scores, k, aligned = best
     if k in (0, 2 * count) or not np.isfinite(top):
@@ -267,6 +266,19 @@ def _mean_over(t: np.ndarray, values: np.ndarray, half: float) -> np.ndarray:
     return (np.interp(t + half, t, integral) - np.interp(t - half, t, integral)) / (2 * half)
 
 
+def _correlations(values: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Correlations (T - M + 1,) of a target (M,) with all windows of values (T,) as long."""
+    from scipy.signal import correlate
+
+    centred, size = target - target.mean(), len(target)
+    values = values - values.mean()
+    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (values, values**2)]
+    total, squares = (one[size:] - one[:-size] for one in sums)
+    power = np.maximum(squares - total**2 / size, 0.0) * float(centred @ centred)
+    found = correlate(values, centred, mode="valid")
+    return np.asarray(np.where(power > 1e-18, found / np.sqrt(np.maximum(power, 1e-18)), 0.0))
+
+
 def _first_order(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
     """Response (T,) of lag y' + y = u, for u that holds from each sample to the next."""
     if lag <= 0:
@@ -276,12 +288,6 @@ def _first_order(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
     keep = np.exp(-dt / lag)
     response = lfilter([1 - keep], [1, -keep], values[:-1], zi=[keep * values[0]])[0]
     return np.concatenate([values[:1], response])
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    norm = np.sqrt((a @ a) * (b @ b))
-    return float(a @ b / norm) if norm > 1e-12 else 0.0
 
 
 def added_up(when: np.ndarray, rate: np.ndarray, t: np.ndarray) -> np.ndarray:

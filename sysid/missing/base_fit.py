@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
 from sysid.missing.drives import Drives
-from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try
 from sysid.search.result import Progress
+from whill_mjx.io.steps import step
 
 CHOICES = tuple(Try(factor) for factor in (0.1, 1.0, 10.0, 100.0))
 PATIENCE = Patience(tolerance=1e-3, first=3)
@@ -40,19 +42,23 @@ class BaseFit:
         solver = GaussNewton(BoxStep(passes=1), CHOICES, PATIENCE, prior)
         state, measured = solver.init(start[None]), float((self.drives.mask > 0).sum())
         for _ in range(iterations):
-            at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)
-            residual = self._white(at[None])
-            jacobian = self.whitener.apply(slopes, self.drives.mask).reshape(1, -1, len(start))
-            state = state._replace(cost=solver.cost(residual, state.u))
-            tried = solver.tries(state, *solver.normal(residual, jacobian, state.u))
-            points = tried.points[0]
-            white = self._white(self.drives.simulate(self.space.to_values(points)))
-            state = solver.step(state, tried, solver.cost(white, points)[None])
+            state = State(*step("base fit", partial(self._advanced, solver, state), *state))
             if progress is not None:
                 progress(1, f"base fit, cost {state.cost[0] / measured:.3f}")
             if solver.done(state).all():
                 break
         return np.asarray(state.u[0])
+
+    def _advanced(self, solver: GaussNewton, state: State) -> State:
+        """After an iteration of a single start."""
+        at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)
+        residual = self._white(at[None])
+        jacobian = self.whitener.apply(slopes, self.drives.mask).reshape(1, -1, state.u.shape[1])
+        state = state._replace(cost=solver.cost(residual, state.u))
+        tried = solver.tries(state, *solver.normal(residual, jacobian, state.u))
+        points = tried.points[0]
+        white = self._white(self.drives.simulate(self.space.to_values(points)))
+        return solver.step(state, tried, solver.cost(white, points)[None])
 
     def _white(self, features: np.ndarray) -> np.ndarray:
         """White residuals (N, n) of features (N, B, K, C)."""

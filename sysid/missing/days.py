@@ -11,16 +11,14 @@ import numpy as np
 
 from sysid.errors.noise import BIN_SHIFT, Whitener, replicate_groups, scatter
 from sysid.errors.space import Space
-from sysid.logs.log import Trial
-from sysid.logs.replicates import course_of, side_by_side
+from sysid.logs.log import START_NOISE, Trial
+from sysid.logs.replicates import course_of, near
 from sysid.missing.evidence import Columns
 
 ASSUMED_DAYS = 4.0
 """How many days the mean over all hypotheses counts as, beside the days' information on one."""
 EXCESS = 0.06
 """Standard deviation of a day's excess where reference days do not determine it."""
-
-EVEN = 0.97  # least correlation of two commands for their drives to be compared bin by bin
 
 
 class Binned(Protocol):
@@ -62,6 +60,8 @@ class Reference:
     known: bool
     """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
     remark: str
+    noise: np.ndarray | float = 1.0
+    """(C,) noise of the drives in question over that of the reference days."""
 
     @property
     def shared(self) -> float:
@@ -72,14 +72,15 @@ class Reference:
         apart = []
         for number in {one.day for one in self.leftovers}:
             mine = [one for one in self.leftovers if one.day == number]
-            series = np.stack([one.series - self.expected_on_others(one) for one in mine])
+            series = np.stack([self.noise_of(one) for one in mine])
             white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
             courses = np.zeros(len(mine), int)
             for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
                 courses[group] = course
             apart.append(scatter(white, courses))
         finite = [one for one in apart if np.isfinite(one)]
-        return float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
+        usual = float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
+        return usual * float(np.mean(1 / np.square(self.noise)))
 
     def expected(self, trial: Trial, bins: int) -> np.ndarray:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
@@ -90,6 +91,14 @@ class Reference:
         """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
         return expected_without(self.leftovers, one) if self.known else np.zeros_like(one.series)
 
+    def noise_of(self, one: Leftover) -> np.ndarray:
+        """(K, C) what is noise of a reference drive, as large as in the drives in question."""
+        return (one.series - self.expected_on_others(one)) * self.noise
+
+    def noisier(self, factor: np.ndarray) -> Reference:
+        """The same for drives in which each channel's noise is larger by a factor (C,)."""
+        return replace(self, whitener=self.whitener.scaled(factor), noise=self.noise * factor)
+
     def target_of(self, drives: Binned) -> np.ndarray:
         """(B, K, C) measured features less what the model is known to leave of such drives."""
         bins = drives.target.shape[1]
@@ -97,22 +106,10 @@ class Reference:
 
 
 def alike(a: Trial, b: Trial) -> bool:
-    """Whether two trials have the same course of commands up to size, so that bins correspond."""
-    if a.manoeuvre != b.manoeuvre:
-        return False
-    if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=0.02):
-        ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
-    elif (both := side_by_side(course_of(a), course_of(b), BIN_SHIFT)) is not None:
-        ours, theirs = both
-    else:
-        return False
-    for x, y in zip(ours.T, theirs.T, strict=True):
-        if np.allclose(x, y, atol=1e-6):
-            continue
-        size = np.linalg.norm(x) * np.linalg.norm(y)
-        if size == 0 or x @ y < EVEN * size:
-            return False
-    return True
+    """Whether two trials are nearly the same drive, so that the model leaves about the same in their bins: commands
+    that are close as functions of time, in shape and in size, from the same speeds."""
+    same_start = max(abs(a.start.v - b.start.v), abs(a.start.omega - b.start.omega)) <= START_NOISE
+    return a.manoeuvre == b.manoeuvre and same_start and near(course_of(a), course_of(b), BIN_SHIFT)
 
 
 def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
@@ -155,10 +152,12 @@ class Wander:
     """Root mean square of it over the days, for a new one; 0 where reference days do not show it."""
     scatter: float = 0.0
     """Excess of what a reference day's replicates do not share."""
+    level: float = 1.0
+    """Mean square of the white residual where nothing is missing: less with sensors quieter than on those days."""
 
     def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
         """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
-        return max(float(np.nan_to_num(scatter(residual, courses) - self.scatter)), 0.0)
+        return max(float(np.nan_to_num((scatter(residual, courses) + 1) / self.level - 1 - self.scatter)), 0.0)
 
     def at(self, columns: Sequence[Columns], hypothesis: int, q: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the coordinates of a hypothesis near q (k,)."""

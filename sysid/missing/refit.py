@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Generator, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from sysid.missing.joint_fit import Refit, Start
 from sysid.replay.cores import on_all_cores
 from sysid.replay.quotients import Quotients
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
+from whill_mjx.io.steps import step
 
 CHOICES = (Try(1.0, easing=0.2), Try(1.0, 0.3, easing=0.2), Try(30.0, easing=6.0))
 TOLERANCE = 2e-3
@@ -74,6 +77,10 @@ class Refitter:
     def white_of(self, u: np.ndarray) -> np.ndarray:
         """(N, B, n) white features of the base model with parameters u (N, P)."""
         return self.white(self.drives.simulate(np.stack([self.values_at((), one, np.zeros(0)) for one in u])))
+
+    def replayed(self, sets: np.ndarray) -> list[np.ndarray]:
+        """White features (N, B, n) of parameter sets (N, all), alone in a list."""
+        return [self.white(self.drives.simulate(sets))]
 
     def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = ITERATIONS) -> Refit:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
@@ -196,19 +203,33 @@ def side_by_side(fits: Sequence[tuple[Refitter, Start]], iterations: int) -> lis
     the simulator at one time goes into one call."""
     if not fits:
         return []
+    def compute() -> list[Any]:
+        return [part for fit in _advanced_together(fits, iterations) for part in (
+            fit.u, fit.q, fit.cost, fit.residual, fit.jacobian, fit.values)]
+
+    inputs = [part for one, start in fits for part in (
+        one.target, one.precision, start.u, start.q, *(() if start.slopes is None else (start.slopes,)))]
+    parts = iter(step("refits", compute, *inputs))
+    return [Refit(start.hypotheses, next(parts), next(parts), float(next(parts)), next(parts), next(parts),
+                  next(parts)) for _, start in fits]
+
+
+def _advanced_together(fits: Sequence[tuple[Refitter, Start]], iterations: int) -> list[Refit]:
+    """As `side_by_side`, of one fit at least."""
     refitter = fits[0][0]
     runs = [one.run(start, iterations) for one, start in fits]
     asked = {number: next(run) for number, run in enumerate(runs)}
     done: dict[int, Refit] = {}
     while asked:
-        white = refitter.white(refitter.drives.simulate(np.concatenate(list(asked.values()))))
+        sets = np.concatenate(list(asked.values()))
+        (white,) = step("replays", partial(refitter.replayed, sets), sets)
         place, following = 0, {}
-        for number, sets in asked.items():
+        for number, mine in asked.items():
             try:
-                following[number] = runs[number].send(white[place : place + len(sets)])
+                following[number] = runs[number].send(white[place : place + len(mine)])
             except StopIteration as end:
                 done[number] = end.value
-            place += len(sets)
+            place += len(mine)
         asked = following
     return [done[number] for number in range(len(fits))]
 

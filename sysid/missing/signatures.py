@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sysid.missing.days import Leftover, Reference, alike, difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import Columns, Evidence, with_values
 from sysid.search.result import Progress
+from whill_mjx.io.steps import step
 from whill_mjx.vehicle.types import VehicleParams
 
 UNSEEN = 1e-3  # change by an axis that only acts through others, as a share of theirs, below which it does nothing
@@ -29,6 +31,10 @@ def base_columns(drives: Drives, reference: Reference, values: np.ndarray, names
         return row
 
     return drives.linearised(sets, reference.u, difference_sizes(reference.spread))[1]
+
+
+def _simulated(drives: Drives, sets: np.ndarray) -> list[np.ndarray]:
+    return [drives.simulate(sets)]
 
 
 def signature_columns(
@@ -57,7 +63,7 @@ def signature_columns(
                 jobs.append((number, level, position, top - bottom))
     seen = []
     for part in np.array_split(np.stack(sets), min(PARTS, len(sets))):
-        seen.append(drives.simulate(part))
+        seen += step("signatures", partial(_simulated, drives, part), part)
         if progress is not None:
             progress(1, "signatures")
     flat, cursor = np.concatenate(seen), 0
@@ -128,7 +134,7 @@ def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:
 
 def white_leftover(reference: Reference, one: Leftover, mask: np.ndarray) -> np.ndarray:
     """(n,) white noise of a reference drive, put into the bins of another drive of weights `mask` (K, C)."""
-    series = (one.series - reference.expected_on_others(one)) * one.mask
+    series = reference.noise_of(one) * one.mask
     inside = np.flatnonzero(one.mask.prod(-1) > 0)
     last = inside[-1] + 1 if len(inside) else len(series)
     fitted = np.resize(series[:last], mask.shape)  # a longer drive repeats a shorter one's noise

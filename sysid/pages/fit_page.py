@@ -58,7 +58,9 @@ def summary(report: dict[str, Any]) -> str:
     """The headline and the mean errors, held-out trials first and apart."""
     held, train = report["summary"]["held_out"], report["summary"]["training"]
     dataset = report["dataset"]
-    parts = [paragraph(headline(report), "lead"),
+    notes = dataset.get("notes") or []
+    limits = [note for note in notes if note.startswith(("not fitted", "the log has no commands"))]
+    parts = [paragraph(headline(report), "lead"), *(paragraph(f"{note[0].upper()}{note[1:]}.") for note in limits),
              paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} trials "
                        f"fitted, {len(dataset['held_out'])} held out. Model: {report['model']['preset']} with "
                        f"{', '.join(report['model']['effects'])}.")]
@@ -70,7 +72,8 @@ def summary(report: dict[str, Any]) -> str:
     parts.append(paragraph('"Ideal" follows its commands at once and without slip; "initial" is the model before the '
                            "fit. The floor is the spread between replicates, which no model of the mean motion can "
                            "beat. Root mean squares, averaged over trials.", "dim"))
-    parts += [bullets(dataset["notes"])] if dataset.get("notes") else []
+    others = [note for note in notes if note not in limits]
+    parts += [bullets(others)] if others else []
     return "".join(parts)
 
 

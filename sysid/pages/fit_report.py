@@ -15,7 +15,7 @@ from sysid.pages.calibration import calibration_notes
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
 from sysid.replay.models import Model, describe_parameters, get_parameters, save_model
-from sysid.search import starts
+from sysid.search import starts, thin
 from sysid.search.fitting import Fit, fit_log, predict
 from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
@@ -40,7 +40,8 @@ def make_report(
     return {
         "schema": SCHEMA, "kind": KIND,
         "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
-                    "notes": [*log.notes, *calibration_notes(fit.uncertainty.estimates, log.spec, log.training),
+                    "notes": [*log.notes, *thin.notes(fit.space),
+                              *calibration_notes(fit.uncertainty.estimates, log.spec, log.training),
                               *(fit.model.notes if fit.model is not None else ())],
                     "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out], **(source or {})},

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid.logs.log import Log, command_in_force
 from sysid.logs.streams import speeds
+from whill_mjx.io.folders import whole_file
 
 COLOURS = {"command": "tab:gray", "odometry": "tab:blue", "ground_truth": "tab:red"}
 LABELS = {"command": "command", "odometry": "odometry", "ground_truth": "outside pose"}
@@ -38,11 +39,9 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     lower.suptitle("Standard deviation between replicates: no model can predict better", fontsize=11)
     _spread(lower.subplots(1, len(UNITS), sharey=True), found)
     figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp.png")
-    figure.savefig(temporary, dpi=100)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=100)
     pyplot.close(figure)
-    temporary.replace(path)
     return path
 
 

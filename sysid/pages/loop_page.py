@@ -31,6 +31,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
         sections.append(Section("A wrench without a name", wrench(report["unnamed"])))
     if report["verdict"] != "named":
         sections.append(Section("What these drives would have shown", detectable(report)))
+    if report["noise"]:
+        sections.append(Section("Noise of the sensors", noise(report)))
     sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
     page = html_page(f"{report['dataset']['name']}: {report['verdict']}", sections,
                      f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}")
@@ -46,6 +48,8 @@ def verdict(report: dict[str, Any]) -> str:
              paragraph(f"The squared residual exceeds the noise by {missing['excess_before']:.0%} before and by "
                        f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
                        f"{missing['p_value']:.2g}.")]
+    if text := report["noise_sentence"]:
+        parts.append(paragraph(f"{text[0].upper()}{text[1:]}."))
     parts += [paragraph(f"Warning: {one}.") for one in report["warnings"]]
     if report["contradicted"]:
         parts += [paragraph("Contradicted, and so not named:"), bullets(report["contradicted"])]
@@ -61,6 +65,8 @@ def verdict(report: dict[str, Any]) -> str:
     if rows:
         parts.append(table(["effect", "kind", "or one of", "parameter", "value", "95 % from", "to", "unit"],
                            rows))
+        if left_open := [text for one in report["effects"] for text in not_determined(one["parameters"])]:
+            parts.append(bullets(left_open))
         parts.append(bullets([f"{one['name']}: {one['equation']}" for one in report["effects"] if one["equation"]]))
         for one in report["effects"]:
             evidence = one["evidence"]["by_manoeuvre"]
@@ -72,6 +78,19 @@ def verdict(report: dict[str, Any]) -> str:
                 "effect fitted to the others lowers the squared residual there"))
             parts += [paragraph(agreement(one)), predictions(one)]
     return "".join(parts)
+
+
+def not_determined(parameters: dict[str, Any]) -> list[str]:
+    """Which parameters of an effect the drives do not determine up to an end of their physical range, in words."""
+    out = []
+    for name, p in parameters.items():
+        below, above = p["open"]
+        if below or above:
+            unit = "" if p["unit"] == "-" else f" {p['unit']}"
+            least, most = (f"{end:.3g}{unit}" for end in p["interval"])
+            where = "" if below and above else f" above {least}" if above else f" below {most}"
+            out.append(f"the drives do not determine {name}{where}")
+    return out
 
 
 def agreement(effect: dict[str, Any]) -> str:
@@ -219,6 +238,13 @@ def detectable(report: dict[str, Any]) -> str:
     return table(["effect", "parameter", "smallest size with 80 % power", "unit", "noticed on simulated days"],
                  [[one["effect"], one["parameter"], one["value"] if one["value"] is not None else "not visible",
                    one["unit"], "" if one["power"] is None else f"{one['power']:.0%}"] for one in report["detectable"]])
+
+
+def noise(report: dict[str, Any]) -> str:
+    """Noise of each channel beside that of the reference days."""
+    rows = [[name, one["factor"], *one["interval"], "yes" if one["changed"] else ""]
+            for name, one in report["noise"].items()]
+    return table(["channel", "noise over that of the reference days", "95 % from", "to", "surely another"], rows)
 
 
 def base(report: dict[str, Any]) -> str:

@@ -2,10 +2,14 @@
 
     schema, kind      1, "sysid-close-loop"
     verdict, reason   "named", "none" or "unexplained", and why in one sentence
+    noise             channel -> factor on the noise of the reference days, its 95 % interval, and whether it surely
+                      `changed`; empty without reference days
+    noise_sentence    the channels that changed, null where none did
     warnings          what speaks against taking a name as certain, in sentences
     question          what was asked: against a reference, or of the model family
-    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, unit},
-                      p_value, equation, evidence
+    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, open, unit},
+                      p_value, equation, evidence; an interval lies within the physical range, and drives that allow
+                      values beyond an end of it leave that end `open`
     before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
                       noise_floor of the same where there are replicates: of the same manoeuvres, held out or not
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
@@ -48,6 +52,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors.noise_level import said
 from sysid.follow_up.calibrated import calibrated
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
@@ -60,7 +65,7 @@ from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
 from sysid.missing.days import Reference
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.unexplained import held_back_gains
-from sysid.pages.loop_page import describe_unnamed, sentence
+from sysid.pages.loop_page import describe_unnamed, not_determined, sentence
 from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
@@ -69,7 +74,7 @@ from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
 from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe
-from whill_mjx.vehicle.types import parameters_of
+from whill_mjx.vehicle.types import Parameter, parameters_of
 
 SCHEMA = 1
 KIND = "sysid-close-loop"
@@ -94,8 +99,10 @@ def make_report(result: Result) -> dict[str, Any]:
     asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
+    noise = {} if result.noise is None else result.noise.report()
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
+        "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
         "warnings": warnings(result), "question": asked, "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
@@ -228,7 +235,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "name": one.effect, "kind": one.kind, "variant": one.variant, "class": found.classes[index],
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
-                    "interval": sorted(end[axis.parameter] for end in ends),
+                    **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
                     "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
                 "p_value": found.accepted[index].p, "equation": equation_of(one),
                 "evidence": evidence_for(result, slice(start, stop), one.effect)})
@@ -236,10 +243,26 @@ def effects(result: Result) -> list[dict[str, Any]]:
     return out
 
 
+def in_range(parameter: str, value: float, ends: Sequence[float]) -> dict[str, Any]:
+    """An interval within the range that is physical for a parameter, and which of its ends the drives leave `open`:
+    they would allow values beyond that range as well. A value beyond it has an interval of its own."""
+    about = about_of(parameter)
+    known = [one for one in (about.low, about.high, about.neutral, value) if np.isfinite(one)]
+    low, high = sorted(ends)
+    least = low if value < about.low and np.isfinite(low) else min(known)
+    most = high if value > about.high and np.isfinite(high) else max(known)
+    return {"interval": [max(low, least), min(high, most)], "open": [low < least, high > most]}
+
+
+def about_of(parameter: str) -> Parameter:
+    """What is known of a dotted parameter before any data."""
+    effect, _, name = parameter.partition(".")
+    return parameters_of(EFFECTS[effect])[name]
+
+
 def unit_of(parameter: str) -> str:
     """Unit of a dotted parameter name."""
-    effect, _, name = parameter.partition(".")
-    return parameters_of(EFFECTS[effect])[name].unit
+    return about_of(parameter).unit
 
 
 def equation_of(one: Hypothesis) -> str:
@@ -310,11 +333,14 @@ def base_table(result: Result) -> list[dict[str, Any]]:
 def summary(report: dict[str, Any]) -> str:
     """What a person reads first."""
     lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+    if report["noise_sentence"] is not None:
+        lines.append(f"noise: {report['noise_sentence']}")
     lines += [f"  warning: {one}" for one in report["warnings"]]
     for one in report["effects"]:
         values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
                            for name, p in one["parameters"].items())
         lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
+        lines += [f"    {text}" for text in not_determined(one["parameters"])]
     if report["next_manoeuvre"] is not None:
         lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
     for part in ("training", "held_out"):
@@ -342,7 +368,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     vehicle = vehicle_of(result, unnamed["parameters"]) if kept else fitted_after(result)
     known = describe(vehicle)
     bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
-              if name in known and np.isfinite(p["interval"]).all()}
+              if name in known and np.isfinite(p["interval"]).all() and not any(p["open"])}
     save_vehicle(out / "vehicle.toml", result.log.spec, vehicle, bounds,
                  {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
 from sysid.pages.svg import COLOURS, line_chart, replay_line
+from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
@@ -38,13 +39,13 @@ class PaperConfig:
     """Driving log with the five manoeuvres, as many replicate drives of each as there are."""
     out: Path = Path("runs/paper")
     """Folder for paper.json, paper.md, paper.html, the figures and vehicle.toml."""
-    trials: int = 500
+    trials: Annotated[int, Range(1, 1_000_000)] = 500
     """Parameter sets that TPE tries."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of TPE."""
     channel: Literal["odometry", "ground_truth"] = "odometry"
     """Positions that J compares: the paper's are wheel odometry."""
-    physics_dt: float = 0.005
+    physics_dt: Annotated[float, PHYSICS_DT] = 0.005
     """Physics step [s]."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
 from sysid.logs.metrics import ideal_replay
 from sysid.pages.series import TrialSeries
 from sysid.search.result import Trace
+from whill_mjx.io.folders import whole_file
 
 MAX_PANELS = 12
 
@@ -59,8 +59,7 @@ def write_plots(
                 axis.axis("equal")
         axes.flat[0].legend(fontsize=7)
         paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=110)
-        pyplot.close(figure)
+        _save(figure, paths[-1], 110)
     paths.append(folder / "errors.png")
     _error_bars(pyplot, paths[-1], rows, {trials[index].name for index in chosen})
     return paths
@@ -100,8 +99,7 @@ def write_paper_figures(
                 axis.axis("equal")
         axes.flat[0].legend(fontsize=7)
         paths.append(folder / f"paper_{kind}.png")
-        figure.savefig(paths[-1], dpi=150)
-        pyplot.close(figure)
+        _save(figure, paths[-1], 150)
     return paths
 
 
@@ -152,8 +150,7 @@ def _error_bars(pyplot: Any, path: Path, rows: list[dict[str, Any]], names: set[
     axes[0].set_title(f"Error per trial, {channel.replace('_', ' ')} (* held out)")
     axes[1].set_xticks(range(len(mine)), [row["trial"] + ("*" if row["held_out"] else "") for row in mine],
                        rotation=60, ha="right", fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    _save(figure, path, 110)
 
 
 def write_search_plot(path: Path, traces: Sequence[Trace]) -> Path:
@@ -186,11 +183,19 @@ def write_search_plot(path: Path, traces: Sequence[Trace]) -> Path:
             axis.set_ylabel(label)
             axis.grid(alpha=0.3, which="both")
     axes[0, 1].legend(fontsize=8)
-    temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, dpi=120, format="png")
-    pyplot.close(figure)
-    os.replace(temporary, path)
+    _save(figure, path, 120)
     return path
+
+
+def _save(figure: Any, path: Path, dpi: int) -> None:
+    """Write a figure, whole or not at all, and close it."""
+    from matplotlib import pyplot
+
+    try:
+        with whole_file(path) as temporary:
+            figure.savefig(temporary, dpi=dpi)
+    finally:
+        pyplot.close(figure)
 
 
 def _median_step(steps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

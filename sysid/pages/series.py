@@ -7,7 +7,6 @@ outside pose (T, 3) and x, y, yaw, v, omega of the odometry (T, 5); columns that
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import CHANNELS, ideal_replay
+from whill_mjx.io.folders import whole_file
 from whill_mjx.io.reading import read_arrays
 
 REPLAYED = ("measured", "ideal", "initial", "fitted")
@@ -85,9 +85,8 @@ def save(folder: Path, series: Sequence[TrialSeries]) -> Path:
             arrays |= {f"{index}.{name}.{replay}": values.astype(np.float32)
                        for replay, values in channel.values.items()}
     path = Path(folder) / FILE
-    temporary = path.with_name(path.name + ".tmp.npz")
-    np.savez_compressed(temporary, about=np.array(json.dumps(about)), **arrays)
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        np.savez_compressed(temporary, about=np.array(json.dumps(about)), **arrays)
     return path
 
 

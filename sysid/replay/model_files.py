@@ -54,7 +54,11 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
     loader = importlib.util.spec_from_file_location(path.stem, path)
     assert loader is not None and loader.loader is not None
     module = importlib.util.module_from_spec(loader)
-    loader.loader.exec_module(module)
+    try:
+        loader.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{path}: ends in {type(error).__name__} when it is run ({error}). Correct it; run it alone "
+                         "to see where.") from error
     if not hasattr(module, attribute):
         raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
     found = getattr(module, attribute)

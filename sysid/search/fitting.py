@@ -18,7 +18,8 @@ from sysid.errors.space import Space, make_space, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
-from sysid.logs.log import Log, Prediction, Trial
+from sysid.logs.log import Log, Prediction, Trial, check_same_vehicle
+from sysid.logs.sources import refuse_recording
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
 from sysid.replay.models import (
@@ -34,7 +35,8 @@ from sysid.replay.models import (
 )
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
-from sysid.search import least_squares, slopes, starts, tpe
+from sysid.replay.wheel_model import wheel_model
+from sysid.search import least_squares, slopes, starts, thin, tpe
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import (
     FEATURE_ITERATIONS,
@@ -47,6 +49,7 @@ from sysid.search.settings import (
     FitConfig,
 )
 from sysid.search.valleys import FIRST, LOOK, gradient_search
+from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -97,15 +100,12 @@ def fit_log(
         model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
     """
     config = config or FitConfig()
+    check_options(config)
     began = time.perf_counter()
     given = make_problem(log, config, params, model)
     model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
     trials = objective.trials
-    wanted = space.names if config.profile == ("all",) else config.profile
-    check_names(space, wanted)
-    if wanted and config.method in GLOBAL:
-        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
-                         "profile starts from. Use --method features, lm or both.")
+    wanted = profiled(space, config)
 
     scan = coarse = search = None
     points = least_squares.random_starts(space, config.starts, config.seed)
@@ -196,16 +196,47 @@ class Problem:
 
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
-    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training)
-    if not trials:
-        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    trials = _training(log, config)
+    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
     trials = odometry_frames.at_frames(trials, frame)
+    model, plant, params, space, intervals = _subject(log, config, trials, params, model)
+    plant = replace(plant, frame=frame)
+    if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
+        space = space.without(odometry_frames.AGE, "speeds are those of the odometry's frames")
+    noise = estimate_noise(odometry_frames.at_frames(log.training, frame))
+    objective = make_objective(plant, params, space, trials, noise)
+    objective = replace(objective, prior=bounds_alone(space))
+    return Problem(plant, params, space, objective, intervals, model, frame)
+
+
+def check_settings(log: Log, config: FitConfig) -> Model | None:
+    """Raise ValueError or FileNotFoundError for settings that cannot fit a log; returns the model that they name."""
+    model = load_model(config.model, log.spec, config.wheels, config.parameters) if config.model else None
+    space = _subject(log, config, _training(log, config), None, model)[3]
+    profiled(space, config)
+    return model
+
+
+def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
+    """The training trials with the channels that are fitted."""
+    if not log.training:
+        raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    return tuple(_keep_channels(trial, config.channels) for trial in log.training)
+
+
+def _subject(
+    log: Log, config: FitConfig, trials: tuple[Trial, ...], params: Any = None, model: Model | None = None
+) -> tuple[Model | None, Plant, Any, Space, dict[str, tuple[float, float]]]:
+    """What is fitted: the model where it is not the simulator's vehicle, its plant, where the search starts, the
+    parameters that are free, and intervals of an earlier vehicle file."""
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is None and log.fields.get("input") == "wheels":
+        model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
@@ -231,24 +262,27 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
         sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
         params = with_effects(params, (*config.effects, *measured, *sizes))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
-    plant = replace(plant, frame=frame)
-    if frame is not None and odometry_frames.AGE in space.names and odometry_frames.AGE not in config.parameters:
-        space = space.without(odometry_frames.AGE, "speeds are those of the odometry's frames")
-    noise = estimate_noise(odometry_frames.at_frames(log.training, frame))
-    objective = make_objective(plant, params, space, trials, noise)
-    objective = replace(objective, prior=bounds_alone(space))
-    return Problem(plant, params, space, objective, intervals, model, frame)
+        space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
+    return model, plant, params, space, intervals
+
+
+def profiled(space: Space, config: FitConfig) -> tuple[str, ...]:
+    """Parameters whose profile is wanted; ValueError where there can be none."""
+    wanted = tuple(space.names) if config.profile == ("all",) else config.profile
+    check_names(space, wanted)
+    if wanted and config.method in GLOBAL:
+        raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
+                         "profile starts from. Use --method features, lm or both.")
+    return wanted
 
 
 def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
     """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
     from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
 
+    refuse_recording(path, "a vehicle file.")
     spec, params, _ = read_vehicle(path)
-    for name in ("wheel_radius", "track", "wheelbase", "drive"):
-        if getattr(spec, name) != getattr(log.spec, name):
-            raise ValueError(f"{path}: {name} is {getattr(spec, name)}, but {getattr(log.spec, name)} in {log.name!r}. "
-                             "The vehicle file must be of the same vehicle; correct dataset.toml or leave it out.")
+    check_same_vehicle(log, spec, str(path), "The vehicle file must be of the same vehicle")
     return params, load_intervals(path)
 
 

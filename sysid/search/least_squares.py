@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from sysid.errors.robust import huber_weight, robust_cost
 from sysid.errors.space import Residuals, Space, is_delay
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
+from whill_mjx.io.steps import step
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
 """Factors on each start's damping that are tried in one iteration."""
@@ -65,7 +67,7 @@ def fit(
     history: list[float] = []
     for iteration in range(iterations):
         going = np.flatnonzero(~solver.done(state))
-        part, first, spent = descent.advanced(state.of(going))
+        part, first, spent = descent.kept(state.of(going))
         initial = float(first[0]) if iteration == 0 else initial
         state, evaluations = state.put(going, part), evaluations + spent
         history.append(float(state.cost.min()))
@@ -97,6 +99,15 @@ class _Descent:
     solver: GaussNewton
     robust: bool
     equations: Sums | None
+
+    def kept(self, state: State) -> tuple[State, np.ndarray, int]:
+        """As `advanced`, as a step that is kept (`whill_mjx.io.steps`)."""
+        def compute() -> list[Any]:
+            after, first, spent = self.advanced(state)
+            return [*after, first, spent]
+
+        *after, first, spent = step("iteration", compute, *state)
+        return State(*after), first, int(spent)
 
     def advanced(self, state: State) -> tuple[State, np.ndarray, int]:
         """The starts after an iteration, their costs (S,) before it, and how many sets were replayed."""
@@ -160,11 +171,15 @@ def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tup
     What lies behind such level ground comes first, since no derivative shows it: a limit that was never met, say.
     The rest is in the order of its costs.
     """
-    tangent = _Tangent.at(objective, u, robust)
     points, held = _along_ranges(u, np.linspace(0.0, 1.0, GRID).tolist())
     sides = 2 * held + (points > u).any(1)
-    costs, followed = tangent.followed(objective, points, held, robust)
-    level = np.abs(costs - tangent.cost) <= PLATEAU * tangent.cost
+
+    def compute() -> tuple[Any, ...]:
+        tangent = _Tangent.at(objective, u, robust)
+        return tangent.cost, *tangent.followed(objective, points, held, robust)
+
+    cost, costs, followed = step("far points", compute, u)
+    level = np.abs(costs - cost) <= PLATEAU * cost
     behind = np.isin(sides, sides[level])
     order = np.lexsort((costs, ~behind))
     order = order[~level[order]]
@@ -214,7 +229,7 @@ def profile_delays(
     delays = [index for index, name in enumerate(space.names) if is_delay(name)]
     if not delays:
         return []
-    tangent = _Tangent.at(objective, u, robust)
+    tangent = cache(lambda: _Tangent.at(objective, u, robust))
     for index in delays:
         values = space.to_values(u)
         around = np.tile(values, (13 * len(NEAR), 1))
@@ -223,7 +238,12 @@ def profile_delays(
         grid = np.unique(grid.round(9))
         at = np.tile(u, (len(grid), 1))
         at[:, index] = grid
-        costs, followed = tangent.followed(objective, at, np.full(len(at), index), robust)
+        held = np.full(len(at), index)
+
+        def compute(at: np.ndarray = at, held: np.ndarray = held) -> tuple[np.ndarray, np.ndarray]:
+            return tangent().followed(objective, at, held, robust)
+
+        costs, followed = step("delay", compute, at)
         profiles.append((space.names[index], space.to_values(at)[:, index], costs, followed))
     return profiles
 
@@ -238,7 +258,11 @@ def random_starts(space: Space, count: int, seed: int) -> np.ndarray:
 def costs_of(objective: Residuals, u: np.ndarray, robust: bool = False) -> np.ndarray:
     """Mean squares (N,), or Huber losses, of unit coordinates (N, P)."""
     equations = getattr(objective, "equations", None)
-    sums = robust_cost(objective.residuals(u), robust) if equations is None else equations.costs(u, robust)
+
+    def compute() -> list[Any]:
+        return [robust_cost(objective.residuals(u), robust) if equations is None else equations.costs(u, robust)]
+
+    (sums,) = step("costs", compute, u)
     return np.asarray(sums / objective.counted)
 
 

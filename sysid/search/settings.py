@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from sysid.errors.prior import SPREAD
 from sysid.search.studies import BATCH
+from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
@@ -26,21 +27,21 @@ class FitConfig:
     method: Literal["features", "lm", "tpe", "cmaes", "both"] = "features"
     """features: gradient search on motion in short bins, whitened in the end. lm: on poses. tpe, cmaes: global search.
     both: a short global search that gives the gradient search on poses its starts."""
-    trials: int = 192
+    trials: Annotated[int, Range(1, 1_000_000)] = 192
     """Parameter sets that the global search tries."""
     storage: str = ""
     """Where the global search keeps its study, for several processes at once: journal:FILE or a database URL."""
     study: str = "fit"
     """Name of the study there."""
-    starts: int = 1
+    starts: Annotated[int, Range(1, 10_000)] = 1
     """Starts of the gradient search: the initial values, and random ones (features: each the best of many) or the best
     of the global search (both: at least one of them)."""
-    iterations: int = 40
+    iterations: Annotated[int, Range(1, 10_000)] = 40
     """Iterations of the gradient search, after the first one on features."""
     elsewhere: bool = True
     """Whether the gradient search also starts far away along ranges where that costs little, from other delays, and
     from random points close to its end."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Seed of both searches."""
     quick: bool = False
     """Fewer trials, candidates and iterations: minutes on two cores."""
@@ -57,11 +58,11 @@ class FitConfig:
     pose shows them."""
     profile: tuple[str, ...] = ()
     """Parameters whose profile likelihood is traced, or `all`: each takes a search of its own."""
-    physics_dt: float = 0.0025
+    physics_dt: Annotated[float, PHYSICS_DT] = 0.0025
     """Physics step [s]: with 5 ms a skid that begins errs by several noise scales, and gains and limit with it."""
     vehicle: Path | None = None
     """Vehicle file of an earlier fit: where the search starts, and what is known before (instead of the preset)."""
-    spread: float = SPREAD
+    spread: Annotated[float, Range(0, 10, above=True)] = SPREAD
     """With a vehicle file: standard deviation of a parameter from day to day, as a share of its value (assumed)."""
     model: str = ""
     """Another model in place of the simulator's vehicle: an MJCF or URDF file, or FILE.py[:NAME] (docs/fit.md)."""

@@ -12,6 +12,7 @@ errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from sysid.errors.robust import huber_weight, robust_cost
 from sysid.errors.space import Residuals
 from sysid.search.gauss_newton import BoxStep, normal_sums
 from sysid.search.result import FitResult, Progress
+from whill_mjx.io.steps import step
 
 ROTATIONS = 3
 """Of the ellipsoid's axes, at random: each has points at both ends of all P axes."""
@@ -84,7 +86,12 @@ def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
     """Covariance (P, P) of errors in unit coordinates, for residuals with these derivatives (B, K, P)."""
-    return likely_by(np.einsum("bkp,bkq->pq", jacobian, jacobian), variance)
+    return likely_by(_products(jacobian), variance)
+
+
+def _products(jacobian: np.ndarray) -> np.ndarray:
+    """J^T J (P, P) of derivatives (B, K, P)."""
+    return np.asarray(np.einsum("bkp,bkq->pq", jacobian, jacobian))
 
 
 def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:
@@ -98,14 +105,19 @@ def descend(
     """The result with where damped Gauss-Newton steps with averaged slopes lead from its u, as long as costs fall."""
     u, cost, spent, misses = result.u, result.cost, 0, 0
     box, history = BoxStep(move=objective.space.moved), []
-    slopes = objective.jacobian(u[None])[1][0]
+    (products,) = step("slopes", lambda: [_products(objective.jacobian(u[None])[1][0])], u)
     for number in range(ROUNDS):
         before = cost
-        covariance = likely(slopes, cost) * SIZES[number % len(SIZES)] ** 2
-        residual, slopes = average_slopes(objective, u, covariance, seed + number)
-        (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], huber_weight(residual) if robust else None)
-        points = box.points(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS))
-        costs = robust_cost(objective.residuals(points), robust) / objective.counted
+        covariance = likely_by(products, cost) * SIZES[number % len(SIZES)] ** 2
+
+        def compute(u: np.ndarray = u, covariance: np.ndarray = covariance, seed: int = seed + number) -> list[Any]:
+            residual, slopes = average_slopes(objective, u, covariance, seed)
+            weight = huber_weight(residual) if robust else None
+            (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], weight)
+            points = box.points(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS))
+            return [_products(slopes), points, robust_cost(objective.residuals(points), robust) / objective.counted]
+
+        products, points, costs = step("round", compute, u, covariance)
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)
         if costs.min() < cost:
             u, cost = points[costs.argmin()], float(costs.min())

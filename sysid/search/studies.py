@@ -77,8 +77,8 @@ def open_storage(text: str | Any | None) -> Any:
                 time.sleep(POLL)
         return optuna.storages.RDBStorage(text, engine_kwargs={"pool_pre_ping": True})
     except ImportError as error:
-        raise ValueError(f"storage {public!r} needs {error.name or _masked(str(error), text)}. Install it: "
-                         "pip install psycopg2-binary.") from None
+        raise ValueError(f"storage {public!r} needs {error.name or 'a driver for this database'}. Install it, for "
+                         "PostgreSQL by pip install psycopg2-binary.") from None
     except (SQLAlchemyError, TypeError, ValueError) as error:  # the last two of options that the driver does not know
         reason = _masked(str(error).strip().splitlines()[0], text)
         raise ValueError(f"storage {public!r} cannot be opened: {reason}. Check the server, the name and the "

@@ -11,6 +11,7 @@ from sysid.errors.pose_objective import Objective
 from sysid.errors.space import Space
 from sysid.search.result import FitResult, Progress
 from sysid.search.studies import SharedStudy, open_storage
+from whill_mjx.io.steps import step
 
 __all__ = ["fit"]
 
@@ -39,7 +40,13 @@ def fit(
              **(problem or {})}
     shared = SharedStudy(space.names, space.to_unit(space.initial), method=method, seed=seed,
                          storage=open_storage(storage), study=study, problem=about)
-    shared.run(costs, evaluations, progress)
+
+
+    def kept(u: np.ndarray) -> np.ndarray:
+        """Costs as a step, unless a storage keeps them: others may have added to it since."""
+        return costs(u) if storage else step("candidates", lambda: [costs(u)], u)[0]
+
+    shared.run(kept, evaluations, progress)
     u, values, initial = shared.table()
     order = np.argsort(values)
     return FitResult(u=u[order[0]], cost=float(values[order[0]]), initial_cost=float(values[initial]),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.logs.log import Log
+from sysid.logs.log import Log, check_same_vehicle
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives
@@ -26,6 +26,7 @@ from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
 from sysid.verdict.search import search
+from sysid.verdict.sensor_noise import compared, with_noise
 
 
 def find_missing(
@@ -42,7 +43,7 @@ def find_missing(
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
-    _check(log, references)
+    check_logs(log, references)
     if log.fields.get("pose_stamps") == "receipt":
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
@@ -56,6 +57,9 @@ def find_missing(
     drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
+    noise = compared(drives, at, reference, config.thresholds.alpha)
+    usual, ready = ready, with_noise(ready, noise)
+    reference = ready.reference
     evidence, slopes = gather(drives, reference, found, full, progress)
     gathered = time.perf_counter()
     refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
@@ -67,7 +71,7 @@ def find_missing(
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(evidence, found, refitter, ready.wander, outcome.scan, config.thresholds,
+        nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
                                 config.refit_nulls, config.seed, progress, outcome.pairs)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     alone = stands_alone(log.training, reference.known)
@@ -76,11 +80,11 @@ def find_missing(
         outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds, wheels)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, ready.wander.p_excess))
+        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, usual.wander.p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
@@ -96,7 +100,12 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
         close()
 
 
-def _check(log: Log, references: Sequence[Log]) -> None:
+def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
+    """Raise ValueError for logs in which nothing can be found."""
+    for one in (log, *references):
+        if one.fields.get("input") == "wheels":
+            raise ValueError(f"log {one.name!r}: its input is measured wheel speeds; what a vehicle lacks shows after "
+                             "commands only. Record them, or fit the wheels with python -m sysid.fit.")
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
@@ -105,9 +114,6 @@ def _check(log: Log, references: Sequence[Log]) -> None:
         if not other.training:
             raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
                              "held_out.")
-        for name in ("wheel_radius", "track", "wheelbase", "drive"):
-            mine, theirs = getattr(log.spec, name), getattr(other.spec, name)
-            if mine != theirs:
-                raise ValueError(f"reference {other.name!r}: {name} is {theirs}, but {mine} in {log.name!r}. A "
-                                 "reference must be a drive of the same vehicle; correct dataset.toml or leave it out.")
+        check_same_vehicle(log, other.spec, f"reference {other.name!r}", "A reference must be a drive of the same "
+                                                                         "vehicle")
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import Log
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, Wander
@@ -18,6 +19,7 @@ from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
 from sysid.verdict.found import NullRefits, Search, Thresholds
+from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,17 @@ class LoopConfig:
 
     preset: Literal["paper", "physical"] = "physical"
     """Base model."""
-    iterations: int = 15
+    iterations: Annotated[int, Range(1, 10_000)] = 15
     """Iterations of the base fit."""
-    draws: int = 1000
+    draws: Annotated[int, Range(1, 10_000_000)] = 1000
     """Simulated nulls that the decision is calibrated on."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of the simulated nulls."""
-    refit_nulls: int = 0
+    refit_nulls: Annotated[int, Range(0, 1_000_000)] = 0
     """Simulated days with nothing missing that are refitted as the drives are; from 100 they decide too."""
     quick: bool = False
     """Fewer iterations, nulls and candidates."""
-    physics_dt: float = 0.005
+    physics_dt: Annotated[float, PHYSICS_DT] = 0.005
     """Physics step [s]."""
     with_effects: tuple[str, ...] = ()
     """Effects of the catalogue that the base model has as well, fitted like its own."""
@@ -119,6 +121,8 @@ class Result:
     null_refits: NullRefits | None = None
     stood: tuple[Stood, ...] = ()
     """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
+    noise: NoiseLevels | None = None
+    """Noise of each channel over that of the reference days; None without such days."""
 
     @property
     def reference(self) -> Reference:

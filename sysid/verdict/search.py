@@ -43,7 +43,7 @@ def search(
     evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
     first = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
     report("scan")
-    count = float((refitter.drives.mask > 0).sum())
+    count = float((refitter.drives.mask > 0).sum()) * wander.level
     excess = partial(excess_of, count=count)
     explained = partial(explained_share, base, count, thresholds)
     similar = imitation(evidence, hypotheses)

@@ -10,13 +10,14 @@ from __future__ import annotations
 import io
 import json
 import lzma
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from whill_mjx.io.folders import write_whole
 
 SCHEMA = 1
 STEP = 0.06
@@ -130,10 +131,7 @@ def save(path: Path, evidence: Evidence) -> None:
     arrays["wander"] = evidence.wander.astype(np.float32)
     buffer = io.BytesIO()
     np.savez(buffer, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)  # type: ignore[arg-type]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    temporary.write_bytes(lzma.compress(buffer.getvalue()))
-    os.replace(temporary, path)
+    write_whole(path, lzma.compress(buffer.getvalue()))
 
 
 def load(path: Path) -> Evidence:

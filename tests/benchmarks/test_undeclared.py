@@ -120,6 +120,32 @@ def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, resul
 
 
 @pytest.mark.quick
+def test_logs_noisier_than_their_reference_days_have_figures_of_their_own(tmp_path, results):
+    recorded = json.loads(results.read_text())
+    levels = {"odometry.v": {"factor": 3.9, "interval": [3.5, 4.3], "changed": True},
+              "pose.yaw": {"factor": 4.5, "interval": [4.1, 4.9], "changed": True}}
+    judged(tmp_path, "noise_4_000", {**NOTHING, "stage": "noisy", "noise": 4.0, "noise_levels": levels}, {})
+    undeclared_figures.figures(tmp_path)
+    after = json.loads(results.read_text())
+    assert after["figures"]["false_alarms_sensor_noise_4"]["unit"].startswith("of 1 logs with nothing in them at 4 ")
+    assert after["figures"]["noise_factor_coverage_sensor_noise_4"]["value"] == 0.5
+    assert after["figures"]["false_alarms"] == recorded["figures"]["false_alarms"]
+    assert [row for row in after["confusion"] if row["stage"] != "noisy"] == [
+        row for row in recorded["confusion"] if row["stage"] != "noisy"]
+
+
+@pytest.mark.quick
+def test_noisier_logs_of_all_kinds_are_mixed_and_dealt_to_processes(tmp_path):
+    jobs = contact.noisy_jobs(tmp_path, (0.5, 2.0), 40, 1, "1/1")
+    scaled = contact.scaled_jobs(tmp_path, (4.0,), 1, "1/1")
+    assert len(jobs) == 2 * (40 + len(scaled)) == len({job.label for job in jobs})
+    assert {job.noise for job in jobs} == {0.5, 2.0}
+    assert 0.3 < sum(bool(job.effects) for job in jobs[:50]) / 50 < 0.6
+    parts = [contact.noisy_jobs(tmp_path, (0.5, 2.0), 40, 1, part) for part in ("1/2", "2/2")]
+    assert sorted(job.label for part in parts for job in part) == sorted(job.label for job in jobs)
+
+
+@pytest.mark.quick
 def test_another_vehicle_has_figures_of_its_own_and_sizes_in_proportion(tmp_path, results):
     recorded = json.loads(results.read_text())
     judged(tmp_path, "null_000", NOTHING, {})

@@ -12,6 +12,8 @@ class PointRobot:
 
     period = 0.1
     goal = 0.3
+    longest = 100
+    intrinsics = (60.0, 60.0, 32.0, 32.0)
 
     def __init__(self, task="", vehicle=None):
         self.reset(0)
@@ -32,11 +34,19 @@ class PointRobot:
         image = np.full((64, 64, 3), 255, np.uint8)
         image[0, self.steps % 64] = 254 - self.steps % 100  # each frame differs, as a real camera's do
         reached = self.x >= self.goal
-        return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=reached or self.steps >= 100,
-                     odometry=(self.x, self.y, self.yaw, v, omega))
+        done = reached or self.steps >= self.longest
+        return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
+                     odometry=(self.x, self.y, self.yaw, v, omega),
+                     ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 10.0, 1.0]))
 
 
 class EndlessRobot(PointRobot):
     """Never arrives within a test."""
 
     goal = 100.0
+
+
+class RovingRobot(EndlessRobot):
+    """Drives about in a single episode."""
+
+    longest = 100_000

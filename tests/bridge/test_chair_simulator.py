@@ -24,6 +24,23 @@ def test_chair_drives_forward_as_commanded_and_reports_its_odometry(chair):
     assert not np.array_equal(frame.image, start.image) and not frame.done
 
 
+def test_scan_shows_the_free_distance_shrink_ahead_and_grow_behind(chair):
+    start = chair.reset(3)
+    for _ in range(20):
+        frame = chair.step(0.3, 0.0)
+    moved = np.hypot(frame.x - start.x, frame.y - start.y)
+    ahead, behind = 0, len(frame.ranges) // 2
+    assert start.ranges.shape == frame.ranges.shape and np.all((frame.ranges > 0) & (frame.ranges <= 10))
+    assert start.ranges[ahead] - frame.ranges[ahead] == pytest.approx(moved, abs=0.1) or frame.ranges[ahead] == 10
+    assert frame.ranges[behind] - start.ranges[behind] == pytest.approx(moved, abs=0.1) or start.ranges[behind] == 10
+    assert np.any(frame.ranges != start.ranges)
+
+
+def test_camera_of_the_chair_has_square_pixels_and_its_centre_in_the_middle(chair):
+    fx, fy, cx, cy = chair.intrinsics
+    assert fx == fy > 10 and (cx, cy) == (32, 32)
+
+
 def test_same_seed_gives_the_same_first_image_and_another_seed_another(chair):
     first, again, other = (chair.reset(seed).image for seed in (5, 5, 6))
     assert np.array_equal(first, again) and not np.array_equal(first, other)

@@ -28,6 +28,7 @@ class ScriptedPolicy:
     action: tuple = (0.4, 0.0)
     steps: int = 0
     resets: int = 0
+    novelty: float = 0.0
 
     def reset(self):
         self.steps = 0
@@ -222,3 +223,20 @@ def test_compressed_image_is_decoded_and_a_damaged_one_named():
     assert command.v == 0.4
     assert world.controller.on_compressed(world.now + 0.1, world.now + 0.1, 0.0, buffer.getvalue()[:-9]) is None
     assert "its end is missing" in world.controller.unusable
+
+
+@pytest.mark.parametrize("action, speeds", [("ignore", (0.4, 0.4, 0.4)), ("slow", (0.4, 0.12, 0.12)),
+                                            ("stop", (0.4, 0.12, 0.0))])  # fmt: skip
+def test_surroundings_unlike_the_training_slow_down_and_then_stop_until_an_operator_rearms(action, speeds):
+    world = World({"on_novel": action})
+    world.policy.contract.novelty = (10.0, 20.0)
+    world.drive()
+    for novelty, speed in zip((5.0, 15.0, 25.0), speeds, strict=True):
+        world.policy.novelty = novelty
+        assert world.image().v == pytest.approx(speed)
+    world.policy.novelty = 5.0
+    again = [world.image().v for _ in range(5)][-1]
+    assert again == (0.0 if action == "stop" else 0.4)
+    if action == "stop":
+        assert world.controller.supervisor.arm()
+        assert [world.image().v for _ in range(5)][-1] == 0.4

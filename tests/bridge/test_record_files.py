@@ -8,7 +8,7 @@ import tomllib
 
 import pytest
 
-from bridge.record import TrialWriter, finish, parse_arguments, toml_text, write_dataset_file
+from bridge.record import TrialWriter, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 
 pytestmark = pytest.mark.quick
@@ -30,8 +30,8 @@ def test_trial_has_the_columns_of_the_format_and_one_time_origin(tmp_path):
     assert not list((tmp_path / "trials").iterdir())  # not before it is whole
     folder = writer.close()
     assert read(folder / "command.csv") == [{"t": 0.0, "v": 0.999, "omega": 0.0}, {"t": 0.05, "v": 0.5, "omega": -0.2}]
-    assert read(folder / "odometry.csv") == [{"t": 0, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0}]
-    assert read(folder / "ground_truth.csv") == [{"t": 0.1, "x": 3.0, "y": 4.0, "yaw": 1.5}]
+    assert read(folder / "odometry.csv") == [{"t": 0, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0, "stamp": 0}]
+    assert read(folder / "ground_truth.csv") == [{"t": 0.1, "x": 3.0, "y": 4.0, "yaw": 1.5, "stamp": 0}]
 
 
 def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
@@ -111,3 +111,36 @@ def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(
     assert "No space left on device" in said and "Make room" in said
     (partial,) = tmp_path.glob(".full.partial-*")
     assert len((partial / "odometry.csv").read_text().splitlines()) == 2 and not (tmp_path / "trials" / "full").exists()
+
+
+def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_path, capsys):
+    writer = TrialWriter(tmp_path, "killed_1")
+    for i in range(3):
+        writer.odometry(i * 0.1, i * 0.05, 0.0, 0.0, 0.5, 0.0, stamp=100 + i * 0.1)
+    writer.flush()
+    (partial,) = tmp_path.glob(".killed_1.partial-*")
+    assert main(["--recover", str(tmp_path)]) == 0 and partial.exists()  # its recorder still runs
+    with open(partial / "odometry.csv", "a") as file:
+        file.write("0.300000,0.15")
+    gone = partial.with_name(".killed_1.partial-4194304")  # above the largest number that a process can have
+    partial.rename(gone)
+    assert main(["--recover", str(tmp_path)]) == 0
+    rows = read(tmp_path / "trials" / "killed_1" / "odometry.csv")
+    assert [row["x"] for row in rows] == [0.0, 0.05, 0.1] and rows[2]["stamp"] == 100.2
+    assert "recovered" in capsys.readouterr().err
+    gone.mkdir()
+    assert main(["--recover", str(tmp_path)]) == 2 and "exists already" in capsys.readouterr().err
+
+
+def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):
+    writer = TrialWriter(tmp_path, "a")
+    writer.odometry(5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.imu(5.02, 0.3, stamp=77.25)
+    assert read(writer.close() / "imu.csv") == [{"t": 0.02, "gyro": 0.3, "stamp": 77.25}]
+
+
+@pytest.mark.parametrize("words", [["logs"], ["logs", "a", "--recover"], ["logs", "a", "--seconds", "-1"]])
+def test_unfit_options_are_refused(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        parse_arguments(words)
+    assert end.value.code == 2

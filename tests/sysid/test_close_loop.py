@@ -120,6 +120,25 @@ def test_finds_nothing_where_nothing_is(drives, sloping):
     assert result.search.verdict == "none"
 
 
+def noisier(log, yaw_rate):
+    """A log with more white noise on the reported yaw rate [rad/s]."""
+    random = np.random.default_rng(5)
+    trials = [replace(one, odometry=replace(one.odometry, omega=one.odometry.omega + yaw_rate * random.standard_normal(
+        len(one.odometry.t)))) for one in log.trials]
+    return replace(log, trials=tuple(trials))
+
+
+def test_a_noisier_sensor_is_no_missing_effect_and_hides_none(drives, sloping):
+    result = find_missing(noisier(drives["plain"], 0.04), (), CONFIG, reference=sloping.prepared)
+    changed = {name for name, one in result.noise.report().items() if one["changed"]}
+    assert (result.search.verdict, changed) == ("none", {"odometry.omega"})
+    low, high = result.noise.interval(1)
+    assert low < 17**0.5 < high  # beside the 0.01 rad/s of the reference days
+    result = find_missing(noisier(drives["sloping"], 0.04), (), CONFIG, reference=sloping.prepared)
+    assert result.search.verdict == "named"
+    assert "slope" in result.search.classes[0]
+
+
 def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, sloping):
     config = replace(CONFIG, without=("slope", "wind"))
     result = find_missing(drives["sloping"], (), config, reference=sloping.prepared)
@@ -203,6 +222,8 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     write_run(tmp_path, sloping, report)
     read = json.loads((tmp_path / "report.json").read_text())
     assert read["verdict"] == "named"
+    assert read["noise_sentence"] is None
+    assert {name for name, one in read["noise"].items() if not one["changed"]} == set(CHANNELS)
     assert read["effects"][0]["name"] in ("slope", "wind")
     values = read["effects"][0]["parameters"]
     if "slope.along_x" in values:

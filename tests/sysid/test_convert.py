@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from conftest import shared_folder
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2.reader import zstd
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import sysid.convert as convert_module
 from sysid.logs.conversion import ConvertConfig, convert
@@ -19,6 +20,7 @@ from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_t
 from sysid.logs.measured import load_any, load_drive
 from sysid.logs.rosbag import yaw_of
 from sysid.logs.sources import refuse_recording
+from sysid.logs.wheel_states import CHAIR_DEFINITION, CHAIR_STATE, JOYSTICK_FIELDS
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -231,7 +233,7 @@ def zero_stamps(rows):
 
 
 @pytest.mark.parametrize(("edit", "options", "rule"), [
-    (drop(COMMAND), {}, r"no command topic found \(topics with messages: .*--command-topic"),
+    (drop(COMMAND), {"input": "commands"}, r"no command topic found \(topics with messages: .*--command-topic"),
     (drop(ODOMETRY, 1), {}, "topic /whill/odom has 1 usable messages.*--odometry-topic"),
     (None, {"odometry_topic": "/nowhere"}, "no topic '/nowhere'.*Correct --odometry-topic"),
     (None, {"command_topic": ODOMETRY}, "/whill/odom is nav_msgs/msg/Odometry; command must be"),
@@ -379,9 +381,13 @@ def test_a_bag_whose_recorder_was_killed_is_read_by_the_name_of_its_folder(bag, 
     log, _ = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "log"))
     assert [trial.name for trial in log.trials] == ["circle_1"]
     (tmp_path / "packed").mkdir()
-    (tmp_path / "packed" / "packed_0.db3.zstd").write_bytes(b"(")
-    with pytest.raises(ValueError, match=r"metadata.yaml is missing.*packed_0.db3.zstd is .* \(zstd -d\)"):
-        convert(ConvertConfig(tmp_path / "packed", tmp_path / "log"))
+    packed = tmp_path / "packed" / "packed_0.db3.zstd"
+    packed.write_bytes(zstd.compress(file.read_bytes()))
+    log, _ = convert(ConvertConfig(tmp_path / "packed", tmp_path / "packed_log"))
+    assert [trial.name for trial in log.trials] == ["packed"]
+    packed.write_bytes(b"(")
+    with pytest.raises(ValueError, match=r"packed_0.db3.zstd: cannot be unpacked .*zstd -d"):
+        convert(ConvertConfig(tmp_path / "packed", tmp_path / "other"))
 
 
 TUM = "# timestamp tx ty tz qx qy qz qw\n" + "1.0 0.1 0.2 0 0 0 0 1\n" * 3
@@ -409,9 +415,9 @@ def given(bag, tmp_path):
     ("bags", r"a folder of ROS bags \(figure_1\). Convert it first: python -m sysid.convert"),
     ("bags/figure_1", "a ROS bag. Convert it first: python -m sysid.convert"),
     ("drive.db3", "a ROS bag. Convert it first: python -m sysid.convert"),
-    ("poses.txt", "a trajectory in TUM form .* ground_truth.csv"),
-    ("texts", "a folder of text files, not a dataset. poses.txt is a trajectory in TUM form"),
-    ("wheels.csv", "a text file with the columns time, left, right. A trial is a folder"),
+    ("poses.txt", "a trajectory in TUM form .* commands or wheel speeds, then: python -m sysid.convert"),
+    ("texts", r"a folder of text files \(poses.txt\), not a dataset. Convert it first"),
+    ("wheels.csv", "a text file with the columns time, left, right. Convert it first: python -m sysid.convert"),
     ("run", "the folder of a fit. Give the folder of the dataset"),
     ("log/trials/figure_1", "one trial, not a dataset. Give the folder that holds dataset.toml"),
     ("log/dataset.toml", "a file of a dataset. Give its folder"),
@@ -499,3 +505,48 @@ def test_a_tracked_body_that_was_turned_is_turned_back(bag, tmp_path):
     log, _ = convert(ConvertConfig(bag, tmp_path / "b", truth_turned=10.0))
     turn = log.trials[0].ground_truth.yaw - plain.trials[0].ground_truth.yaw
     np.testing.assert_allclose(turn, np.deg2rad(-10.0), atol=1e-5)
+
+
+def test_a_bag_of_joint_states_and_an_outside_pose_has_wheel_speeds_as_its_input(tmp_path):
+    def wheels(rows):
+        kept = [row for row in rows if row[1] == TRUTH]
+        for t in np.arange(0.0, 21.0, 0.02):
+            v, omega, *_ = motion(np.array([t]))
+            rates = [float(v[0] + side * 0.25 * omega[0]) / 0.1 for side in (-1, 1)]
+            state = message("sensor_msgs/msg/JointState", header=header(T0 + t), name=["left_wheel", "right_wheel"],
+                            position=np.zeros(2), velocity=np.array(rates), effort=np.zeros(0))
+            kept.append((t, ODOMETRY, "sensor_msgs/msg/JointState", state))
+        return sorted(kept, key=lambda row: row[0])
+
+    write_bag(tmp_path / "bag", edit=wheels)
+    options = {"vehicle": "rover", "wheel_radius": 0.1, "track": 0.5}
+    log, _ = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", **options))
+    (trial,) = log.trials
+    assert log.fields["input"] == "wheels" and trial.odometry is None and trial.ground_truth is not None
+    middle = int(np.searchsorted(trial.command.t, 5.0))
+    assert (trial.command.v[middle], trial.command.omega[middle]) == pytest.approx((0.5, 1.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("joystick", [True, False])
+def test_a_bag_with_the_states_of_a_chair_has_odometry(tmp_path, joystick):
+    kind = f"whill_msgs/msg/{CHAIR_STATE}"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(CHAIR_DEFINITION + (JOYSTICK_FIELDS if joystick else ""), kind))
+    state, twist_kind = store.types[kind], "geometry_msgs/msg/Twist"
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        commands = writer.add_connection("/whill/controller/cmd_vel", twist_kind, typestore=store)
+        states = writer.add_connection("/whill/states/model_cr2", kind, typestore=store)
+        for t in np.arange(0.0, 12.0, 0.05):
+            stamp, angle = int((T0 + t) * 1e9), 0.5 * max(t - 2.0, 0.0) / 0.1325
+            speed = 0.5 * 3.6 * (t > 2.0)
+            writer.write(commands, stamp, store.serialize_cdr(twist(0.5 * (t > 2.0), 0.0), twist_kind))
+            fields = {"battery_power": 90, "battery_current": 1.0, "right_motor_angle": -np.angle(np.exp(1j * angle)),
+                      "left_motor_angle": np.angle(np.exp(1j * angle)), "right_motor_speed": -speed,
+                      "left_motor_speed": speed, "power_on": 1, "speed_mode_indicator": 0, "error": 0,
+                      **({"joy_front": 0, "joy_side": 0} if joystick else {})}
+            writer.write(states, stamp, store.serialize_cdr(state(**fields), kind))
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log"))
+    stream = log.trials[0].odometry
+    assert stream.x[-1] == pytest.approx(0.5 * (stream.t[-1] - 2.0), abs=0.01)
+    assert stream.v[100] == pytest.approx(0.5, abs=1e-3) and abs(stream.omega).max() < 1e-3
+    assert any("odometry from /whill/states/model_cr2" in note for note in notes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,17 @@ from conftest import shared_folder
 
 import sysid
 import sysid.inspect as inspect_module
+from sysid.errors.space import make_space
 from sysid.inspect import InspectConfig, main
+from sysid.logs import replicates
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
 from sysid.logs.inspection import inspect, load_whole, text
-from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of
+from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, load_log, manoeuvre_of, with_timeout
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.next_drives import next_drives
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
+from sysid.search import thin
+from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR
 
 pytestmark = pytest.mark.quick
@@ -170,7 +176,7 @@ def turned(pose, degrees):
     (lambda pose: turned(pose, -90), "the outside pose moves 90 deg to the left of its own heading"),
     (lambda pose: replace(pose, y=-pose.y), "the frame is left-handed"),
     (lambda pose: replace(pose, x=pose.y, y=pose.x), "the frame is left-handed"),
-    (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes 5.0 s later .* another clock"),
+    (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes (4.9|5.0|5.1) s later .* another clock"),
 ])
 def test_an_outside_pose_that_contradicts_the_odometry_is_named_and_no_sign_is_said_to_be_reversed(change, said):
     good = trial_of(lively())
@@ -188,7 +194,7 @@ def reset_at_9_s(o):
 @pytest.mark.parametrize(("change", "said"), [
     (reset_at_9_s, "at 9.[01] s.* its pose jumps by .* it was reset there"),
     (lambda o: replace(o, v=o.v * np.cos(o.yaw)), "the twist is in the frame odom"),
-    (lambda o: replace(o, v=0 * o.v), "its speeds v are all zero though its pose moves"),
+    (lambda o: replace(o, v=0 * o.v), "its pose moves .*, but its speeds v are all zero"),
     (lambda o: replace(o, x=-o.y, y=o.x), "its pose moves 90 deg to the left of its own heading"),
 ])
 def test_odometry_whose_pose_and_speeds_contradict_each_other_is_named(change, said):
@@ -290,3 +296,77 @@ def test_measured_sets_are_inspected_in_their_original_form(name, select, channe
     found = inspect(log)
     assert found["streams"][channel]["samples"] > 100 and found["trials"][0]["seconds"] > 1
     assert "nothing held out" in text(found)
+
+
+def paused(timeout, pause=2.0):
+    """A drive at a steady speed in which commands pause and the base stops by its time-out (none where it is inf)."""
+    sent = np.arange(0.0, 16.0, 0.1)
+    sent = sent[(sent <= 6.0) | (sent >= 6.0 + pause)]
+    command = Command(sent, np.where(sent < 14.0, 0.5, 0.0) * (sent > 1.0), 0.0 * sent)
+    held = with_timeout(command, timeout) if np.isfinite(timeout) else command
+    return replace(trial_of(held), command=command)
+
+
+@pytest.mark.parametrize("timeout", [0.3, 0.8])
+def test_a_base_that_stops_by_its_time_out_while_commands_pause_is_named_with_the_time(timeout):
+    (found,) = sanity(log_of(paused(timeout)))
+    assert "its base has a time-out" in found
+    assert float(re.search(r"command_timeout = ([\d.]+)", found)[1]) == pytest.approx(timeout, abs=0.06)
+
+
+def test_a_base_that_drives_on_while_commands_pause_is_fine():
+    assert sanity(log_of(paused(np.inf))) == []
+
+
+def test_the_time_of_one_stream_in_other_units_is_named_with_its_file(tmp_path):
+    shutil.copytree(CHAIR, tmp_path / "log")
+    path = tmp_path / "log" / "trials" / "turn_1" / "odometry.csv"
+    header, *rows = path.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    path.write_text("\n".join([header, *(",".join([f"{1000 * float(t):.1f}", *rest]) for t, *rest in cells)]))
+    with pytest.raises(ValueError, match=r"turn_1/odometry.csv: t steps by 50 .* in milliseconds. Divide t by 1000"):
+        load_log(tmp_path / "log")
+
+
+def test_parameters_that_a_log_cannot_show_are_not_searched_and_the_report_says_which():
+    log = load_log(CHAIR)
+    space = make_space(preset_params(log.spec, "physical"), log.spec)
+    blind = replace(log, trials=tuple(replace(one, ground_truth=None) for one in log.trials))
+    bound = thin.without_hidden(space, blind, ("slip_traction.mu",))
+    assert "slip_traction.slip_speed" not in bound.names and "slip_traction.mu" in bound.names
+    (note,) = thin.notes(bound)
+    assert "no outside pose" in note and "slip_traction.slip_speed" in note
+    assert thin.without_hidden(space, log).names == space.names and thin.notes(space) == []
+    straight = log.select(lambda one: one.name.startswith("straight"))
+    assert "body.yaw_inertia" not in thin.without_hidden(space, straight).names
+
+
+def test_a_log_in_which_nothing_moves_is_refused():
+    still = trial_of(Command(np.arange(0.0, 9.0, 0.1), np.zeros(90), np.zeros(90)))
+    with pytest.raises(ValueError, match="commanded to move for 0.0 s in all, which determines nothing"):
+        thin.check_moves(log_of(still))
+    thin.check_moves(log_of(trial_of(smooth_command())))
+
+
+def test_a_first_glance_passes_all_drives_with_the_same_commands():
+    base = steps(20.0)[: 950]
+    t = 0.02 * np.arange(len(base))
+    one = trial_of(Command(t, base, 0.5 * base[::-1]))
+    late = trial_of(Command(t + 1.3, base, 0.5 * base[::-1]))
+    other = trial_of(Command(t, -base, 0.5 * base[::-1]))
+    first, second, third = (replicates.glance(replicates.course_of(trial)) for trial in (one, late, other))
+    assert replicates.may_be_alike(first, second) and not replicates.may_be_alike(first, third)
+
+
+def test_the_next_drives_show_what_a_log_lacks_with_ramps_within_the_space():
+    straight = log_of(trial_of(Command(np.arange(0.0, 9.0, 0.1), np.full(90, 0.3), np.zeros(90))))
+    blind = blind_spots(straight, {one.name: excitation(one) for one in straight.trials})
+    drives = next_drives(straight, blind, (3.0, 3.0), 0.4)
+    assert len(drives) == 3 and drives[0].why == "no turn" and np.ptp(drives[0].command.omega) > 0.2
+    for drive in drives:
+        command, dt = drive.command, np.diff(drive.command.t)
+        assert max(abs(command.v).max(), abs(command.omega).max()) <= 0.8 and abs(command.v).max() <= 0.4
+        assert (abs(np.diff(command.v)) <= 0.5 * dt + 1e-9).all() and (abs(np.diff(command.omega)) <= dt + 1e-9).all()
+        assert command.v[-1] == command.omega[-1] == command.v[0] == 0.0 and max(drive.size) < 3.0 * np.sqrt(2)
+    assert next_drives(straight, blind, (0.5, 0.5), 0.4) == [] or all(
+        max(one.size) < 0.5 for one in next_drives(straight, blind, (0.5, 0.5), 0.4))

@@ -15,6 +15,8 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
+from sysid.pages.loop_page import not_determined
+from sysid.pages.loop_report import in_range, unit_of
 from sysid.verdict import null_refits
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import disagreement, foretold
@@ -36,6 +38,24 @@ def test_a_day_that_does_not_excite_an_effect_says_little_of_how_it_wanders():
     assert np.sqrt(_pooled(columns, blind).covariance[0][0, 0]) < 2 * usual
     loud = [*alike[:6], [(np.array([5.0]), np.array([[100.0]]))]]  # here it is 50 times its noise
     assert np.sqrt(_pooled(columns, loud).covariance[0][0, 0]) > 4 * usual
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("parameter", "value", "ends", "interval", "is_open", "said"), [
+    ("acceleration_limit.linear", 0.6, [311592.0, 0.22], [0.22, 5.0], [False, True], " above 0.22 m/s^2"),
+    ("acceleration_limit.linear", 0.6, [np.inf, 0.22], [0.22, 5.0], [False, True], " above 0.22 m/s^2"),
+    ("acceleration_limit.slowing", 1.0, [-24.0, 1.3], [0.2, 1.3], [True, False], " below 1.3"),
+    ("acceleration_limit.slowing", 1.0, [0.1, 9.0], [0.2, 5.0], [True, True], ""),
+    ("acceleration_limit.linear", 0.6, [0.5, 0.7], [0.5, 0.7], [False, False], None),
+    ("acceleration_limit.linear", 6.0, [5.5, 6.5], [5.5, 6.5], [False, False], None),
+    ("acceleration_limit.linear", 6.0, [5.5, np.inf], [5.5, 6.0], [False, True], " above 5.5 m/s^2"),
+])
+def test_an_interval_lies_within_the_physical_range_and_says_what_is_not_determined(
+        parameter, value, ends, interval, is_open, said):
+    found = in_range(parameter, value, ends)
+    assert found == {"interval": interval, "open": is_open}
+    words = not_determined({parameter: {**found, "unit": unit_of(parameter)}})
+    assert words == ([] if said is None else [f"the drives do not determine {parameter}{said}"])
 
 
 def joint_fit(sizes, trials=3, bins=400):

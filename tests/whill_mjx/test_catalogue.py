@@ -179,7 +179,9 @@ def test_forward_mode_derivatives_of_every_effect_agree_with_central_differences
             def one(memory, given):
                 value, motion = given
                 if where == "world":
-                    return effect.world(memory, nominal_world(model))
+                    moving = replace(nominal_world(model), speed=motion.velocity[0], drift=jnp.zeros(()),
+                                     yaw_rate=motion.angular_velocity[2])
+                    return effect.world(memory, moving)
                 rest = (motion,) if where == "force" else (value, motion)
                 return getattr(effect, where)(memory, *rest)
 

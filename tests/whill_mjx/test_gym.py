@@ -1,19 +1,30 @@
-"""The Gymnasium adapter."""
+"""The Gymnasium adapters: one vehicle, and many."""
 
 from __future__ import annotations
 
+import copy
+import pickle
 import warnings
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
+from whill_mjx import kinds
 from whill_mjx.gym import WhillEnv
+from whill_mjx.gym_vector import WhillVectorEnv
+from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
+
+SHORT = ObstacleCourse(max_steps=4)
+SMALL = {"task": SHORT, "height": 8, "width": 8}
+STILL = np.array([0.0, 0.0], np.float32)
 
 
 @pytest.fixture(scope="module")
 def env():
-    return WhillEnv(task="obstacle_course", render_mode="rgb_array")
+    return WhillEnv(**SMALL, render_mode="rgb_array")
 
 
 def test_gymnasiums_own_checker_is_satisfied(env):
@@ -36,16 +47,138 @@ def test_seeds_decide_the_world_and_info_tells_the_pose(env):
     np.testing.assert_array_equal(env.render(), obs)
 
 
-def test_misuse_is_explained():
-    fresh = WhillEnv()
+def test_misuse_is_explained(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    fresh = WhillEnv(**SMALL)
     assert fresh.render() is None
     with pytest.raises(RuntimeError, match="reset"):
         fresh.step(np.zeros(2))
-    with pytest.raises(ValueError, match="rgb_array"):
+    with pytest.raises(ValueError, match="display.*rgb_array"):
         WhillEnv(render_mode="human")
+    with pytest.raises(ValueError, match="rgb_array"):
+        WhillEnv(render_mode="ansi")
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        WhillVectorEnv(0)
 
 
 def test_actions_of_a_wrong_shape_are_refused(env):
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"\(3,\)"):
         env.step(np.zeros(3))
+
+
+def test_every_known_task_has_an_id_and_ids_make_environments():
+    assert all(f"Whill{name.title().replace('_', '')}-v0" in gymnasium.registry for name in TASKS)
+    made = gymnasium.make("whill_mjx.gym:WhillCorridor-v0", layout="fixed", height=8, width=8)
+    assert made.unwrapped.env.task.name == "corridor" and made.observation_space.shape == (8, 8, 3)
+    many = gymnasium.make_vec("WhillCorridor-v0", num_envs=3, layout="fixed", height=8, width=8)
+    assert isinstance(many.unwrapped, WhillVectorEnv) and many.observation_space.shape == (3, 8, 8, 3)
+
+
+def test_environments_of_one_kind_share_what_is_compiled(env):
+    other = WhillEnv(**SMALL)
+    env.reset(seed=0)
+    assert other._kind is env._kind
+    sizes = env._kind.reset._cache_size()
+    other.reset(seed=0)
+    assert env._kind.reset._cache_size() == sizes
+    env.step(STILL)
+    other.step(STILL)
+    other.step(STILL)  # from a state of a step, not of a reset
+    assert env._kind.step._cache_size() == 1
+    assert WhillEnv(task="obstacle_course", height=8, width=8)._kind is not env._kind
+
+
+def test_a_pickled_or_copied_environment_goes_on_where_it_was(env):
+    env.reset(seed=5)
+    env.step(np.array([1.0, 0.5]))
+    others = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    wanted = env.step(np.array([1.0, -0.5]))
+    for other in others:
+        found = other.step(np.array([1.0, -0.5]))
+        np.testing.assert_array_equal(found[0], wanted[0])
+        assert found[1:] == wanted[1:]
+        assert other.np_random.integers(2**31) == copy.deepcopy(env.np_random).integers(2**31)
+
+
+def test_options_change_the_episode_and_unknown_ones_are_refused(env):
+    env.reset(seed=1)
+    _, info = env.reset(seed=1, options={"start_y": 0.25})
+    assert info["y"] == pytest.approx(0.25, abs=1e-3)
+    for wrong, words in (({"start_z": 1.0}, "no option 'start_z'.*known: .*start_y"), ({"light": "dim"}, "finite")):
+        with pytest.raises(ValueError, match=words):
+            env.reset(options=wrong)
+
+
+def test_a_vector_begins_in_the_worlds_of_single_environments(env):
+    many = WhillVectorEnv(2, **SMALL)
+    obs, _ = many.reset(seed=7)
+    single = [env.reset(seed=7 + index)[0] for index in range(2)]
+    np.testing.assert_array_equal(obs, np.stack(single))
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_each_mode_begins_anew_as_gymnasium_defines_it(mode):
+    many = WhillVectorEnv(2, **SMALL, autoreset_mode=mode)
+    assert many.metadata["autoreset_mode"] == mode
+    many.reset(seed=0)
+    drive = np.array([[1.0, 0.0], [0.2, 0.0]], np.float32)
+    for _ in range(3):
+        _, _, _, truncated, info = many.step(drive)
+        assert not truncated.any()
+    before = info["x"]
+    obs, reward, terminated, truncated, info = many.step(drive)
+    assert truncated.all() and not terminated.any() and reward.shape == (2,)
+    if mode == AutoresetMode.SAME_STEP:
+        assert info["x"] == pytest.approx([0.0, 0.0], abs=1e-3)
+        assert info["_final_obs"].all() and info["final_obs"][0].shape == obs[0].shape
+        assert info["final_info"]["x"][0] > before[0]
+        return
+    assert (info["x"] > before).all()
+    if mode == AutoresetMode.NEXT_STEP:
+        _, reward, _, truncated, info = many.step(drive)
+        assert not truncated.any() and not reward.any() and info["x"] == pytest.approx([0.0, 0.0], abs=1e-3)
+        return
+    with pytest.raises(RuntimeError, match="reset_mask"):
+        many.step(drive)
+    _, info = many.reset(options={"reset_mask": np.array([True, False])})
+    assert info["x"][0] == pytest.approx(0.0, abs=1e-3) and info["x"][1] > 0.01
+    assert info["_x"].tolist() == [True, False]
+    with pytest.raises(ValueError, match="reset_mask has shape"):
+        many.reset(options={"reset_mask": np.array([True])})
+
+
+def test_sensors_make_a_dict_and_its_spaces_hold_what_is_shown():
+    env = WhillEnv(task=SHORT, observations=("goal", "lidar", "odometry", "commands"), render_mode="rgb_array",
+                   height=8, width=8)  # fmt: skip
+    obs, _ = env.reset(seed=0)
+    assert set(obs) == {"goal", "lidar", "odometry", "commands"} and env.observation_space.contains(obs)
+    obs = env.step(np.array([1.0, 0.0]))[0]
+    assert env.observation_space.contains(obs) and env.render().shape == (8, 8, 3)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+def test_forked_workers_are_refused_at_once_with_the_remedy(env):
+    env.reset(seed=0)
+    workers = AsyncVectorEnv([lambda: WhillEnv(**SMALL)] * 2, context="fork")
+    try:
+        with pytest.raises(RuntimeError, match='context="spawn"'):
+            workers.reset(seed=0)
+    finally:
+        workers.close(terminate=True)
+
+
+def test_a_video_is_recorded(tmp_path):
+    pytest.importorskip("moviepy")
+    made = gymnasium.make("WhillCorridor-v0", layout="fixed", height=8, width=8, render_mode="rgb_array")
+    recorded = gymnasium.wrappers.RecordVideo(made, str(tmp_path), video_length=2, disable_logger=True)
+    recorded.reset(seed=0)
+    for _ in range(3):
+        recorded.step(STILL)
+    recorded.close()
+    assert list(tmp_path.glob("*.mp4"))
+
+
+def test_options_are_those_that_an_episode_can_begin_with():
+    assert "start_yaw_deg" in kinds.OPTIONS and "latency" not in kinds.OPTIONS

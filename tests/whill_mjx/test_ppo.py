@@ -41,7 +41,7 @@ def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
     for side, columns in ((-1.0, slice(0, 4)), (1.0, slice(4, 8))):
         image = np.zeros((8, 8, 3), np.uint8)
         image[:, columns] = 255
-        _, action = step(policy_carry(TINY, 8, 8), image)
+        _, action = step(policy_carry(TINY, (8, 8, 3)), image)
         assert float(action[0]) * side > 0.5
 
 
@@ -85,7 +85,7 @@ def test_frames_are_stacked_and_an_episode_begins_with_black_ones():
 def test_the_exported_step_sees_what_the_network_was_trained_on():
     params = Network(TINY, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 6), jnp.uint8))
     images = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8)
-    carry, frames = policy_carry(TINY, 8, 8), jnp.zeros((1, 8, 8, 6), jnp.uint8)
+    carry, frames = policy_carry(TINY, (8, 8, 3)), jnp.zeros((1, 8, 8, 6), jnp.uint8)
     for count, image in enumerate(images):
         carry, action = policy_step(TINY, params, carry, image)
         frames = push(frames, image[None], jnp.array([count == 0]))
@@ -103,9 +103,9 @@ def test_the_exported_network_acts_like_the_trained_one(tmp_path):
     def step(carry, image):
         return policy_step(TINY, params, carry, image)
 
-    export_policy(tmp_path / "policy", step, policy_carry(TINY, 8, 8), params, contract, check_steps=5)
+    export_policy(tmp_path / "policy", step, policy_carry(TINY, (8, 8, 3)), params, contract, check_steps=5)
     policy = load_policy(tmp_path / "policy")
-    ours, theirs = policy_carry(TINY, 8, 8), policy.start()
+    ours, theirs = policy_carry(TINY, (8, 8, 3)), policy.start()
     for image in np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8):
         (ours, action), (theirs, same) = step(ours, image), policy.step(theirs, image)
         np.testing.assert_allclose(action, same, atol=1e-5)

@@ -9,8 +9,8 @@ import pytest
 
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
-from whill_mjx.learning import privileged
 from whill_mjx.learning.setup import TRUTH, functional_env, mirror_of
+from whill_mjx.sensors import privileged
 from whill_mjx.world.scene import box, footprint, no_boxes, stack_boxes
 
 ENV, PARAMS = make_env("obstacle_course", "whill_cr", height=16, width=16)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sysid.replay.models import with_effects
 from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.presets import preset, preset_params
+from whill_mjx.vehicle.specs import HUSKY, SPECS, CameraMount
 from whill_mjx.vehicle.types import VehicleParams, parameters_of
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
@@ -149,3 +156,66 @@ def test_the_file_says_what_its_intervals_are(tmp_path):
     path = save_vehicle(tmp_path / "vehicle.toml", spec, params, {"body.mass": (50.0, 55.0)}, origin)
     assert path.read_text().startswith("# Each interval [low, high] is the 90% confidence interval")
     assert load_vehicle(path)[2] == origin
+
+
+SHORT = """
+schema = 1
+kind = "micromobility-vehicle"
+[spec]
+name = "burger"
+wheel_radius = 0.033
+track = 0.16
+wheelbase = 0.1
+mass = 1.0
+body_length = 0.138
+body_width = 0.178
+body_height = 0.192
+[spec.camera]
+x = 0.03
+y = 0.01
+z = 0.1
+pitch = 0.2
+yaw = 0.5
+"""
+
+
+def test_a_file_without_a_model_drives_by_the_base_model_for_its_size(tmp_path):
+    path = tmp_path / "burger.toml"
+    path.write_text(SHORT)
+    spec, params, _ = load_vehicle(path)
+    assert spec.camera.yaw == 0.5 and spec.camera.y == 0.01
+    jax.tree.map(np.testing.assert_array_equal, params, preset_params(spec, "physical"))
+    path.write_text(SHORT.replace("[spec]", 'base = "paper"\n[spec]'))
+    assert load_vehicle(path)[1].effects[0].name == "pid_drive"
+    assert load_intervals(path) == {}
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    (SHORT + "[body.mass]\nvalue = 1.0\nunit = 'kg'\n", "has body; it must have both body and effects"),
+    (SHORT.replace("[spec]", 'base = "wooden"\n[spec]'), "base is 'wooden'; it must be one of 'paper', 'physical'"),
+    (SHORT.replace("yaw = 0.5", "yaw = 50"), r"spec.camera.yaw is 50"),
+])  # fmt: skip
+def test_a_short_file_with_a_mistake_is_one_line(text, said, tmp_path):
+    path = tmp_path / "burger.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=said):
+        load_vehicle(path)
+
+
+def test_a_turned_mount_looks_where_it_says():
+    spec = dataclasses.replace(HUSKY, camera=CameraMount(x=0.4, y=0.1, z=0.3, pitch=0.2, yaw=0.5, roll=0.3))
+    model = build_model(spec)
+    qpos = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    position, rotation = camera_pose(model, qpos)
+    right, down, forward = np.asarray(rotation).T
+    np.testing.assert_allclose(position, [0.4, 0.1, 0.3], atol=1e-6)
+    np.testing.assert_allclose(np.arcsin(-forward[2]), 0.2, atol=1e-5)
+    np.testing.assert_allclose(np.arctan2(forward[1], forward[0]), 0.5, atol=1e-5)
+    np.testing.assert_allclose(np.arcsin(-right[2] / np.cos(0.2)), 0.3, atol=1e-5)  # the right side is lower
+    np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-5)
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=lambda spec: spec.name)
+def test_every_camera_sits_on_its_vehicle(spec):
+    assert abs(spec.camera.x) <= spec.body_length / 2 + 0.05
+    assert spec.camera.z + spec.wheel_radius <= spec.body_height + 0.2

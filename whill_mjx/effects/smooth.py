@@ -27,6 +27,11 @@ def soft_sign(value: jax.Array, width: float) -> jax.Array:
     return jnp.tanh(value / width)
 
 
+def smooth_size(value: jax.Array | float) -> jax.Array:
+    """|value|, smooth within `REST_SPEED` of 0, where it is 0."""
+    return jnp.sqrt(jnp.square(value) + REST_SPEED**2) - REST_SPEED
+
+
 def scale_drive(drive: Drive, factor: jax.Array) -> Drive:
     """Force and torque of the drive times `factor`, () or (2,); a vehicle's drive uses one of them."""
     return replace(drive, force=drive.force * factor, torque=drive.torque * factor,

@@ -9,14 +9,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.env import Env, State
-from whill_mjx.tasks.tasks import goal_position
 from whill_mjx.vehicle.dynamics import place
 from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose, rotation_from_quaternion
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.scene import Scene
-
-WALLS = 3
-"""The first boxes of either task are its walls; those after them are obstacles."""
 
 
 @struct.dataclass
@@ -52,18 +48,19 @@ def begin_under(condition: Condition, env: Env, params: VehicleParams, state: St
     """State of an episode that begins, with start, obstacles and light of the condition."""
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     x, y = x + condition.start_x, y + condition.start_y
-    scene = _lit(condition, _with_obstacles(condition, state.scene))
+    scene = _lit(condition, _with_obstacles(condition, state.scene, env.task.walls))
     return dataclasses.replace(
         state,
         vehicle=place(env.model, params, x, y, yaw + jnp.deg2rad(condition.start_yaw_deg)),
         scene=scene,
-        goal_distance=jnp.linalg.norm(goal_position(scene) - jnp.stack([x, y])),
+        goal_distance=jnp.linalg.norm(env.task.goal(scene) - jnp.stack([x, y])),
     )
 
 
-def _with_obstacles(condition: Condition, scene: Scene) -> Scene:
+def _with_obstacles(condition: Condition, scene: Scene, walls: int) -> Scene:
+    """Scene with the boxes behind the first `walls` moved."""
     centre = scene.boxes.centre
-    obstacle = (jnp.arange(centre.shape[0]) >= WALLS)[:, None]
+    obstacle = (jnp.arange(centre.shape[0]) >= walls)[:, None]
     wanted = jnp.stack([condition.obstacle_x, condition.obstacle_y, jnp.nan * jnp.ones(())])
     moved = jnp.where(jnp.isnan(wanted), centre, wanted) + jnp.array([0.0, 1.0, 0.0]) * condition.obstacle_shift_y
     boxes = dataclasses.replace(scene.boxes, centre=jnp.where(obstacle, moved, centre))
@@ -94,7 +91,7 @@ def seen_under(condition: Condition, env: Env, state: State) -> State:
     turn = quaternion_from_angles(
         jnp.zeros(()), jnp.deg2rad(condition.camera_pitch_deg), jnp.deg2rad(condition.camera_yaw_deg)
     )
-    at = jnp.array([mount.x, 0.0, mount.z])
+    at = jnp.array([mount.x, mount.y, mount.z])
     shift = jnp.stack([condition.camera_x, condition.camera_y, condition.camera_z])
     # Turned about the camera, which then is displaced: chassis' = chassis * move(at + shift) * turn * move(-at).
     offset = at + shift - rotation_from_quaternion(turn) @ at

@@ -26,7 +26,8 @@ class Driver:
     begin: Callable[[State, jax.Array], Any]
     """(state, key) -> memory."""
     act: Callable[[Any, State, jax.Array, jax.Array], tuple[Any, jax.Array]]
-    """(memory, true state, image (H, W, 3) uint8, key) -> memory, action (2,) in [-1, 1]."""
+    """(memory, true state, image (H, W, 3) uint8 or the sensors' values by name, key) -> memory, action (2,) in
+    [-1, 1]."""
     period: int = 1
     """Control periods from one decision to the next; the action is held in between."""
     sees: bool = True

@@ -168,6 +168,11 @@ class Course:
         return self._compiled[name]
 
 
+def shares_of(episodes: Episodes) -> tuple[str, ...]:
+    """Names of all endings: SHARES, and those that the task adds."""
+    return (*SHARES, *sorted(set(episodes.ends) - {*SHARES, "time_s", "episode_return"}))
+
+
 def episode_figures(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, np.ndarray]:
     """Figures (N,) of each episode, named as in SHARES, MEANS and OF_SUCCESSES; NaN where one does not apply."""
     dt, rows = episodes.control_dt, np.arange(episodes.trace.shape[1])[None]
@@ -187,7 +192,7 @@ def episode_figures(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, np.
 
     success = episodes.ends["success"] > 0.5
     return {
-        **{name: episodes.ends[name].astype(float) for name in SHARES},
+        **{name: episodes.ends[name].astype(float) for name in shares_of(episodes)},
         "return": episodes.ends["episode_return"].astype(float),
         "time_to_goal_s": np.where(success, episodes.ends["time_s"], np.nan),
         "min_clearance_m": np.where(driven, episodes.channel("clearance"), np.inf).min(1),
@@ -205,7 +210,7 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
     """Figures of a set of episodes, each with its 95 % interval: Wilson's for shares, the bootstrap for means."""
     figures = episode_figures(episodes, near_m)
     summary: dict[str, Any] = {"episodes": episodes.count, "near_m": near_m}
-    for name in SHARES:
+    for name in shares_of(episodes):
         happened = int((figures[name] > 0.5).sum())
         low, high = wilson_interval(happened, episodes.count)
         summary[name] = happened / episodes.count

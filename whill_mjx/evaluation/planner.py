@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.env import Env, State
-from whill_mjx.tasks.tasks import Task, goal_position, reward_terms
+from whill_mjx.tasks.base import Task
+from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
 from whill_mjx.world.scene import Scene, collides, footprint
 
@@ -106,7 +107,9 @@ def _search(
     Also its predicted return ().
     """
     start = _start(env, state)
-    score = jax.vmap(lambda actions: predicted_return(config, env, state.scene, start, state.command, actions))
+    score = jax.vmap(
+        lambda actions: predicted_return(config, env, state.scene, start, state.command, actions, state.step_count)
+    )
 
     def one_round(carry, round_key):
         mean, deviation = carry
@@ -122,39 +125,61 @@ def _search(
 
 
 def predicted_return(
-    config: PlannerConfig, env: Env, scene: Scene, start: jax.Array, before: jax.Array, actions: jax.Array
-) -> jax.Array:
+    config: PlannerConfig, env: Env, scene: Scene, start: jax.Array, before: jax.Array, actions: jax.Array,
+    step_count: jax.Array | int = 0,
+) -> jax.Array:  # fmt: skip
     """() return of a profile (knots, 2) in the planner's own model, less the cost of passing too close.
 
-    `start` (5,) is x, y, yaw, v, omega; `before` (2,) the speed and yaw rate commanded last.
+    `start` (5,) is x, y, yaw, v, omega; `before` (2,) the speed and yaw rate commanded last;
+    `step_count` () control periods have passed.
     """
     task, dt = env.task, config.horizon_s / config.steps
-    goal = goal_position(scene)
+    goal = task.goal(scene)
     periods = dt / env.model.config.control_dt  # control periods per step of this model
     profile = _resample(config, actions)  # (steps, 2)
     low, high = jnp.array([task.v_min, -task.omega_max]), jnp.array([task.v_max, task.omega_max])
     commands = low + (profile + 1.0) / 2.0 * (high - low)
-    changes = jnp.diff(commands[:, 1], prepend=before[1])
-    poses = predicted_poses(config, env, start, before, commands, dt)
+    poses, speeds = predicted_motion(config, env, start, before, commands, dt)
     distance = jnp.linalg.norm(goal - poses[:, :2], axis=1)
     farther = jnp.concatenate([jnp.linalg.norm(goal - start[:2])[None], distance[:-1]])
-    collided = _touches(config, env, scene, poses, margin=0.0)
+    earlier = jnp.concatenate([before[None], commands[:-1]])
     near = _touches(config, env, scene, poses, config.margin)
-    reached = distance <= task.goal_radius
-    terms = reward_terms(task, farther - distance, changes, reached, collided)
-    terms["time"] = terms["time"] * periods
+    time_s = step_count * jnp.array(env.model.config.control_dt, float) + dt * jnp.arange(1, config.steps + 1)
+
+    def look(pose, twist, command, earlier, distance, farther, time_s):
+        body = footprint(env.model.spec, pose[0], pose[1], pose[2])
+        collided = collides(body, scene.boxes)
+        reached = (distance <= task.goal_radius) & ~collided
+        never = jnp.zeros((), bool)
+        moment = Moment(
+            scene, pose, twist, body, command, earlier, distance, farther, collided, reached, never, time_s
+        )
+        ends = jnp.stack([jnp.asarray(holds, bool) for holds in task.endings(moment).values()])
+        return {name: jnp.asarray(value, float) for name, value in task.rewards(moment).items()}, jnp.any(ends)
+
+    terms, ends = jax.vmap(look)(poses, speeds, commands, earlier, distance, farther, time_s)
+    for name in task.per_period:
+        if name in terms:
+            terms[name] = terms[name] * periods
     rewards = sum(terms.values()) - periods * (config.hurry + config.margin_cost * near)
-    ended = jnp.cumsum(collided | reached) - (collided | reached) > 0  # after the end
+    ended = jnp.cumsum(ends) - ends > 0  # after the end
     return jnp.sum(jnp.where(ended, 0.0, rewards))
 
 
 def predicted_poses(
     config: PlannerConfig, env: Env, start: jax.Array, before: jax.Array, commands: jax.Array, dt: float
 ) -> jax.Array:
-    """Poses (T, 3) x, y, yaw after each of commands (T, 2), held for dt [s], in the planner's own model.
+    """Poses (T, 3) of `predicted_motion`."""
+    return predicted_motion(config, env, start, before, commands, dt)[0]
 
-    A unicycle: speed and yaw rate follow a ramp towards the command with a first-order lag. `start` and `before` are
-    those of `predicted_return`.
+
+def predicted_motion(
+    config: PlannerConfig, env: Env, start: jax.Array, before: jax.Array, commands: jax.Array, dt: float
+) -> tuple[jax.Array, jax.Array]:
+    """Poses (T, 3) x, y, yaw and speeds (T, 2) v, omega after each of commands (T, 2), held for dt [s].
+
+    The planner's own model is a unicycle: speed and yaw rate follow a ramp towards the command with a first-order lag.
+    `start` and `before` are those of `predicted_return`.
     """
     limit = jnp.array([config.acceleration, 2.0 * config.acceleration / env.model.spec.track])
     lag = jnp.array(config.lag)
@@ -168,7 +193,7 @@ def predicted_poses(
         travelled, turned = (speed + after) / 2 * dt
         x, y = x + travelled * jnp.cos(yaw + turned / 2), y + travelled * jnp.sin(yaw + turned / 2)
         pose = jnp.stack([x, y, yaw + turned])
-        return (pose, after, ramped + change), pose
+        return (pose, after, ramped + change), (pose, after)
 
     # The ramp is ahead of the vehicle by its lag, or has come to the command.
     ramped = start[3:] + jnp.clip(before - start[3:], -limit * lag, limit * lag)

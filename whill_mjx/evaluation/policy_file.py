@@ -16,7 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bridge.policy import EXPORT_AGAIN, CheckedPolicy, Contract, PolicyFileError, make_session, read_policy
+from bridge.policy import (
+    AGENT_KIND,
+    EXPORT_AGAIN,
+    KIND,
+    AgentContract,
+    CheckedPolicy,
+    PolicyFileError,
+    make_session,
+    read_policy,
+)
 from whill_mjx.effects.base import apply_chain
 from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.vehicle.dynamics import nominal_world, place
@@ -37,8 +46,10 @@ class PolicyFile:
     low: tuple[float, float]
     """Command at action -1: v [m/s], omega [rad/s]."""
     high: tuple[float, float]
-    height: int
-    width: int
+    height: int | None
+    """Rows of the camera image; None where the policy observes sensors by name."""
+    width: int | None
+    """Columns of the camera image, or None."""
     rate_hz: float
     action_repeat: int
     sha256: str
@@ -46,8 +57,10 @@ class PolicyFile:
     vehicle: Path | None
     """Vehicle file it was trained with, if it is inside."""
     carry: dict[str, jax.ShapeDtypeStruct]
-    step: Callable[[dict[str, jax.Array], jax.Array], tuple[dict[str, jax.Array], jax.Array]]
-    """(carry, image (H, W, 3) uint8) -> carry, action (2,); traceable, and so is its vmap."""
+    step: Callable[[dict[str, jax.Array], Any], tuple[dict[str, jax.Array], jax.Array]]
+    """(carry, image (H, W, 3) uint8 or observations by name) -> carry, action (2,); traceable, and so is its vmap."""
+    observation: dict[str, tuple[int, ...]] | None = None
+    """Shapes of the observations by name; None: the camera image alone."""
     unpacked: tempfile.TemporaryDirectory | None = None
     """Folder of the vehicle file of a zip; it lives as long as this record."""
 
@@ -71,22 +84,32 @@ def load_policy(path: str | Path, runtime: str = "jax") -> PolicyFile:
     path = Path(path)
     if runtime not in RUNTIMES:
         raise ValueError(f"unknown runtime {runtime!r}; use one of {RUNTIMES}.")
-    checked = read_policy(path)
+    checked = read_policy(path, (KIND, AGENT_KIND))
     contract = checked.contract
-    assert isinstance(contract, Contract)
+    agent = isinstance(contract, AgentContract)
+    commands = contract.commands if isinstance(contract, AgentContract) else contract
+    shapes = contract.observation if isinstance(contract, AgentContract) else None
+    if commands is None or (agent and not isinstance(shapes, dict)):
+        raise PolicyFileError(f"{path}/policy.json: the agent drives no vehicle: it has no limits of v and omega. "
+                              f"{EXPORT_AGAIN}.")
     carry = {entry.name: jax.ShapeDtypeStruct(entry.shape, np.dtype(entry.dtype)) for entry in contract.carry}
     session = make_session(checked)
     run = _jax_network(checked) if runtime == "jax" else _host_network(session, contract, carry)
 
-    def step(state: dict[str, jax.Array], image: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        action, *values = run(image, *(state[name] for name in carry))
+    def step(state: dict[str, jax.Array], obs: Any) -> tuple[dict[str, jax.Array], jax.Array]:
+        if agent:
+            given = {**obs, **{f"carry_{name}": state[name] for name in carry}}
+            action, *values = run(*(given[name] for name in contract.inputs))
+        else:
+            action, *values = run(obs, *(state[name] for name in carry))
         after = {name: value.astype(carry[name].dtype) for name, value in zip(carry, values, strict=True)}
         return after, action
 
     vehicle, unpacked = vehicle_file(path, checked)
     return PolicyFile(
-        path=path, task=contract.task, low=contract.low, high=contract.high, height=contract.height,
-        width=contract.width, rate_hz=contract.rate_hz, action_repeat=contract.action_repeat,
+        path=path, task=contract.task, low=commands.low, high=commands.high,
+        height=getattr(contract, "height", None), width=getattr(contract, "width", None), rate_hz=commands.rate_hz,
+        action_repeat=commands.action_repeat, observation=shapes if isinstance(shapes, dict) else None,
         sha256=checked.files["policy.onnx"], vehicle=vehicle, carry=carry, step=step, unpacked=unpacked,
     )  # fmt: skip
 
@@ -149,7 +172,7 @@ def _jax_network(checked: CheckedPolicy) -> Callable:
     return network
 
 
-def _host_network(session: Any, contract: Contract, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
+def _host_network(session: Any, contract: Any, carry: dict[str, jax.ShapeDtypeStruct]) -> Callable:
     """The network in onnxruntime, called from JAX."""
     shapes = (jax.ShapeDtypeStruct((2,), jnp.float32), *carry.values())
 

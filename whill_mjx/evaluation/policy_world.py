@@ -14,7 +14,7 @@ from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.reading import read_json
-from whill_mjx.tasks.tasks import TASKS
+from whill_mjx.tasks.tasks import find_task
 
 POLICY = "policy"
 """Folder of the policy within that of its training."""
@@ -54,8 +54,10 @@ def read_world(path: str | Path) -> PolicyWorld:
     checked = read_policy(folder)
     contract = checked.contract
     assert isinstance(contract, Contract)
-    if contract.task not in TASKS:
-        raise OptionError(f"{folder}: unknown task {contract.task!r} (known: {', '.join(TASKS)}). Give --task.")
+    try:
+        find_task(contract.task)
+    except ValueError as error:
+        raise OptionError(f"{folder}: {error} Give --task.") from error
     limits = {"v_min": contract.low[0], "v_max": contract.high[0], "omega_max": contract.high[1],
               "action_repeat": contract.action_repeat}  # fmt: skip
     vehicle, unpacked = vehicle_file(folder, checked)
@@ -77,6 +79,11 @@ def trained_fields(policy: Path, task: str) -> dict[str, Any]:
     preset = check_table(str(run), RUN, content, others=True)["preset"]
     saved = check_table(str(run), PRESET, preset, "preset", others=True)["task"]
     rows = {field.name: field for field in TASK}
-    known = {field.name for field in dataclasses.fields(TASKS[task])}
-    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else value
+    known = {field.name for field in dataclasses.fields(find_task(task))}
+    return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else _hashable(value)
             for name, value in saved.items() if name in known}
+
+
+def _hashable(value: Any) -> Any:
+    """A JSON value as a field of a task: lists become tuples."""
+    return tuple(_hashable(one) for one in value) if isinstance(value, list) else value

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.env import END_METRICS, Env, State, observe, reset_state, step_state
+from whill_mjx.env import Env, State, end_names, observe, reset_state, sense, step_state
 from whill_mjx.evaluation.conditions import Condition, begin_under, nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
@@ -72,47 +72,52 @@ def rollout(
     if changed:
         states = jax.vmap(lambda c, p, state: begin_under(c, env, p, state))(condition, params, states)
     drive_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
+    names = end_names(env, jax.tree.map(lambda leaf: leaf[0], states))
     if memory is None:
         memory = jax.vmap(driver.begin)(states, drive_keys)
 
-    def picture(one: Condition, state: State) -> jax.Array:
-        return observe(env, seen_under(one, env, state) if changed else state)
+    def look(one: Condition, p: VehicleParams, state: State) -> tuple[State, Any]:
+        return sense(env, p, state, seen_under(one, env, state) if changed else state)
 
-    take = jax.vmap(picture)
-    blind = jnp.zeros((count, env.height, env.width, 3), jnp.uint8)
-    first = take(condition, states) if driver.sees or frames else blind
+    def take(states: State) -> tuple[State, Any]:
+        return jax.vmap(look)(condition, params, states)
+
+    _, shapes = jax.eval_shape(take, states)
+    blind = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+    first = take(states)[1] if driver.sees or frames else blind
+    filmed = frames and bool(env.sensors)  # the camera, whatever the driver observes
     late = jnp.clip(jnp.round(condition.latency).astype(jnp.int32), 0, max_latency)
 
-    def see(step: jax.Array, states: State, past: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Pictures that the drivers are shown, and the ring of past ones (L, N, H, W, 3)."""
+    def see(step: jax.Array, states: State, past: Any) -> tuple[State, Any, Any]:
+        """States, what the drivers are shown (N, ...), and the ring of what was to be seen (L, N, ...)."""
         if sight == "blank" or not (driver.sees or frames):
-            return blind, past
+            return states, blind, past
         if sight == "freeze":
-            return first, past
-        now = take(condition, states)
+            return states, first, past
+        states, now = take(states)
         if max_latency == 0:
-            return now, past
-        past = past.at[step % (max_latency + 1)].set(now)
+            return states, now, past
+        past = jax.tree.map(lambda ring, new: ring.at[step % (max_latency + 1)].set(new), past, now)
         shown = jnp.maximum(step - late, 0) % (max_latency + 1)  # before anything has arrived: the first picture
-        return past[shown, jnp.arange(count)], past
+        return states, jax.tree.map(lambda ring: ring[shown, jnp.arange(count)], past), past
 
-    def decide(step: jax.Array, states: State, memory: Any, past: jax.Array) -> tuple[Any, jax.Array, jax.Array, Any]:
-        image, past = see(step, states, past)
+    def decide(step: jax.Array, states: State, memory: Any, past: Any) -> tuple[State, Any, jax.Array, Any, Any]:
+        states, image, past = see(step, states, past)
         step_keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(drive_keys)
         memory, action = jax.vmap(driver.act)(memory, states, image, step_keys)
-        return memory, jnp.clip(action, -1.0, 1.0), image, past
+        return states, memory, jnp.clip(action, -1.0, 1.0), image, past
 
-    def hold(step: jax.Array, states: State, memory: Any, past: jax.Array, action: jax.Array, image: jax.Array):
+    def hold(step: jax.Array, states: State, memory: Any, past: Any, action: jax.Array, image: Any):
         if max_latency:  # pictures arrive between the decisions too
-            image, past = see(step, states, past)
-        return memory, action, image, past
+            states, image, past = see(step, states, past)
+        return states, memory, action, image, past
 
     def advance(loop: dict[str, Any]) -> dict[str, Any]:
         step, states, memory, past = loop["step"], loop["states"], loop["memory"], loop["past"]
         if driver.period == 1:
-            memory, action, image, past = decide(step, states, memory, past)
+            states, memory, action, image, past = decide(step, states, memory, past)
         else:
-            memory, action, image, past = jax.lax.cond(
+            states, memory, action, image, past = jax.lax.cond(
                 step % driver.period == 0,
                 lambda: decide(step, states, memory, past),
                 lambda: hold(step, states, memory, past, loop["action"], loop["image"]),
@@ -120,11 +125,12 @@ def rollout(
         after, outcome = jax.vmap(lambda p, state, a: step_state(env, p, state, a))(params, states, action)
         row = jax.vmap(lambda state, a: _row(env, state, a))(after, action)
         row = jnp.where(states.done[:, None], loop["last"], row)
-        pictures = loop["frames"].at[:, step].set(image) if frames else loop["frames"]
+        shown = jax.vmap(lambda state: observe(env, state))(states) if filmed else image
+        pictures = loop["frames"].at[:, step].set(shown) if frames else loop["frames"]
         return {
             "step": step + 1, "states": after, "memory": memory, "past": past, "action": action, "image": image,
             "last": row, "trace": loop["trace"].at[:, step + 1].set(row), "frames": pictures,
-            "ends": {name: loop["ends"][name] + outcome.metrics[name] for name in END_METRICS},
+            "ends": {name: loop["ends"][name] + outcome.metrics[name] for name in names},
         }  # fmt: skip
 
     start = jax.vmap(lambda state: _row(env, state, jnp.zeros(2)))(states)
@@ -132,20 +138,21 @@ def rollout(
         "step": jnp.zeros((), jnp.int32),
         "states": states,
         "memory": memory,
-        "past": jnp.broadcast_to(first, (max_latency + 1, *first.shape)) if max_latency else jnp.zeros(()),
+        "past": jax.tree.map(lambda x: jnp.broadcast_to(x, (max_latency + 1, *x.shape)), first) if max_latency else (),
         "action": jnp.zeros((count, 2)),
         "image": blind if sight == "blank" else first,
         "last": start,
         "trace": jnp.broadcast_to(start[:, None], (count, steps + 1, len(CHANNELS))),
-        "frames": jnp.zeros((count, steps + 1 if frames else 0, *blind.shape[1:]), jnp.uint8),
-        "ends": {name: jnp.zeros(count) for name in END_METRICS},
+        "frames": jnp.zeros((count, steps + 1 if frames else 0, env.height, env.width, 3), jnp.uint8),
+        "ends": {name: jnp.zeros(count) for name in names},
     }
     end = jax.lax.while_loop(lambda loop: (loop["step"] < steps) & ~jnp.all(loop["states"].done), advance, loop)
     rows = jnp.arange(steps + 1)[None, :, None]
     trace = jnp.where(rows <= end["step"], end["trace"], end["last"][:, None])
     pictures = end["frames"]
     if frames:
-        pictures = jnp.where(rows[..., None, None] < end["step"], pictures, end["image"][:, None])
+        last = jax.vmap(lambda state: observe(env, state))(end["states"]) if filmed else end["image"]
+        pictures = jnp.where(rows[..., None, None] < end["step"], pictures, last[:, None])
     return Rollout(trace, end["ends"], end["states"].scene, pictures)
 
 

@@ -17,26 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.evaluation.conditions import NAMES, Condition, nominal
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures
 from whill_mjx.evaluation.intervals import wilson_interval
-from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
+from whill_mjx.world.randomize import check_parameter, with_parameter
 
 CONDITIONS = tuple(name for name in NAMES if name != "latency") + ("latency_s",)
-_CAMERA = "camera_pitch_deg=-6:6:5 camera_z=-0.1:0.1:5"
-_COMMON = (
-    "start_y=-0.4:0.4:5 start_yaw_deg=-20:20:5",
-    "light=0.4:1.6:5 latency_s=0,0.1,0.2,0.3",
-    _CAMERA,
-    "body.mass=0.75x,1x,1.25x,1.5x command_delay.delay=0,0.1,0.2,0.3",
-)
-STANDARD = {
-    "corridor": ("obstacle_x=2,3 obstacle_y=-0.4:0.4:5", *_COMMON),
-    "obstacle_course": ("obstacle_shift_y=-0.3:0.3:7", *_COMMON),
-}
-"""What is looked at for each task if nothing else is asked for; the first row is the paper's, where it has one."""
 PATHS_KEPT = 40
 
 
@@ -123,42 +110,11 @@ def _parse_axis(text: str) -> Axis:
 
 
 def _check_name(name: str) -> None:
-    holder, dot, field = name.partition(".")
-    if not dot:
-        if name not in CONDITIONS:
-            raise ValueError(f"unknown axis {name!r} (known: {', '.join(CONDITIONS)}, vehicle, EFFECT.PARAMETER and "
-                             "body.PARAMETER).")
-        return
-    if holder != "body" and holder not in EFFECTS:
-        raise ValueError(f"axis {name!r}: no effect {holder!r} (known: body, {', '.join(sorted(EFFECTS))}).")
-    known = parameters_of(Body if holder == "body" else EFFECTS[holder])
-    if field not in known:
-        raise ValueError(f"axis {name!r}: {holder} has no parameter {field!r} (known: {', '.join(known)}).")
-
-
-def with_parameter(params: VehicleParams, name: str, value: jax.Array, relative: bool) -> VehicleParams:
-    """The parameters of one vehicle with one value changed; an effect that it does not have is added.
-
-    Args:
-        params: of one instance.
-        name: `EFFECT.PARAMETER` or `body.PARAMETER`.
-        value: () new value, or factor on the old one.
-        relative: whether it is a factor.
-    """
-    holder, _, field = name.partition(".")
-
-    def changed(owner: Any) -> Any:
-        new = getattr(owner, field) * value if relative else value
-        return dataclasses.replace(owner, **{field: jnp.asarray(new, jnp.result_type(float))})
-
-    if holder == "body":
-        return dataclasses.replace(params, body=changed(params.body))
-    effects = params.effects
-    if not any(effect.name == holder for effect in effects):
-        effects = (*effects, make_effect(holder))
-    return dataclasses.replace(params, effects=tuple(
-        changed(effect) if effect.name == holder else effect for effect in effects
-    ))
+    if "." not in name and name not in CONDITIONS:
+        raise ValueError(f"unknown axis {name!r} (known: {', '.join(CONDITIONS)}, vehicle, EFFECT.PARAMETER and "
+                         "body.PARAMETER).")
+    if "." in name:
+        check_parameter(f"axis {name!r}", name)
 
 
 def run_sweep(

@@ -84,6 +84,8 @@ POSITIVE = Range(0, above=True)
 SHARE = Range(0, 1)
 SEED = Range(0, 2_000_000_000)
 """Seeds are added to others in 32 bits."""
+PHYSICS_DT = Range(1e-4, 0.05)
+"""Physics steps [s] at which the drive's controller and the wheels' slip are stable."""
 
 
 def check_range(option: str, value: Any, allowed: Range, default: Any = None) -> None:
@@ -143,13 +145,24 @@ def run(
         args: words instead of those of the command line.
         shares: whether a command with these options may use `share_results`; JAX must not have started before.
     """
-    listen()
-    _State.working, _State.stopped = True, stopped
-    try:
+    with guarded(stopped):
         chosen = _parsed(options, description, positional, args)
         check_options(chosen)
         (share_results if shares(chosen) else keep_results_apart)()
         main(chosen)
+
+
+@contextmanager
+def guarded(stopped: str = STOPPED) -> Iterator[None]:
+    """End the process with one line and its exit code where the block goes wrong, or a signal comes.
+
+    Args:
+        stopped: the line after a signal, which says how to go on.
+    """
+    listen()
+    _State.working, _State.stopped = True, stopped
+    try:
+        yield
         sys.stdout.flush()
     except KeyboardInterrupt:
         leave(stopped)

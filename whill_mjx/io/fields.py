@@ -165,8 +165,11 @@ def _optional(*fields: Field) -> tuple[Field, ...]:
 
 CAMERA = _optional(
     Field("x", "m", -10.0, 10.0),
+    Field("y", "m", -10.0, 10.0),
     Field("z", "m", -10.0, 10.0),
+    Field("roll", "rad", -3.2, 3.2),
     Field("pitch", "rad", -1.6, 1.6),
+    Field("yaw", "rad", -3.2, 3.2),
     Field("fov_y", "rad", 0.01, 3.1),
 )
 """[spec.camera] of a vehicle file."""
@@ -203,11 +206,12 @@ VEHICLE = (
     Field("schema", kind="whole", choices=(1,)),
     Field("kind", kind="text", choices=("micromobility-vehicle",), remedy="Give a vehicle file."),
     Field("spec", kind="table"),
-    Field("body", kind="table"),
-    Field("effects", kind="list"),
+    Field("base", kind="text", choices=("paper", "physical"), needed=False),
+    Field("body", kind="table", needed=False),
+    Field("effects", kind="list", needed=False),
     Field("provenance", kind="table", needed=False),
 )
-"""A vehicle file."""
+"""A vehicle file; without `body` and `effects` these are a base model's for the spec."""
 
 EFFECT = (Field("name", kind="text"), Field("parameters", kind="table"))
 """One of [[effects]] of a vehicle file."""
@@ -259,11 +263,16 @@ DATASET = (
     *_optional(*SIZES),
     Field("command_limits", "m/s, rad/s", 1e-3, SPEED, kind="numbers", count=2, needed=False,
           remedy="Write [v, omega], both positive."),
+    Field("command_timeout", "s", 0.01, 60.0, needed=False,
+          remedy="It is how long the base drives on where no command comes; leave it out where it never stops."),
     Field("reference_point", kind="text", choices=("drive axle centre", "vehicle centre"), needed=False,
           remedy="Move the measured poses to one of them before writing the log."),
     Field("odometry", kind="text", needed=False),
     Field("ground_truth", kind="text", needed=False),
     Field("held_out", kind="texts", needed=False),
+    Field("input", kind="text", choices=("commands", "wheels"), needed=False,
+          remedy="Write \"wheels\" where command.csv holds measured wheel speeds, else leave it out."),
+    Field("columns", kind="texts", needed=False),
 )
 """dataset.toml of a driving log."""
 
@@ -284,8 +293,8 @@ MAP = (
     Field("origin", "m, m, rad", -1e6, 1e6, kind="numbers", count=3, remedy="It must be [x, y, yaw]."),
     Field("occupied_thresh", "-", 0.0, 1.0),
     Field("free_thresh", "-", 0.0, 1.0),
-    Field("negate", kind="whole", choices=(0, 1), remedy="Write a finite number, 0 or 1."),
-    Field("mode", kind="text", choices=("trinary", "scale"), needed=False, remedy="Save it as trinary."),
+    Field("negate", kind="whole", choices=(0, 1), remedy="Write 0, 1, false or true."),
+    Field("mode", kind="text", choices=("trinary", "scale", "raw"), needed=False),
 )
 """YAML file of a map, as map_server reads it."""
 

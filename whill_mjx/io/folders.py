@@ -134,8 +134,6 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
     Raises:
         FolderRefused: it is no folder, cannot be written, is held by another process, or belongs to others.
     """
-    from filelock import FileLock, Timeout
-
     if out.exists() and not out.is_dir():
         raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
     check_place("--out", out, least_free)
@@ -146,18 +144,31 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
             raise FolderRefused(f"--out {out}: holds {taken[0]} of something else, which is not replaced. "
                                 "Choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
+    with lock_folder(out):
+        yield Claim(out, kind, read_identity(out, kind))
+
+
+@contextmanager
+def lock_folder(out: Path, option: str = "--out") -> Iterator[None]:
+    """Keep others from writing to a folder until the block ends, and remove what a killed process left half-written.
+
+    Raises:
+        FolderRefused: another process writes there.
+    """
+    from filelock import FileLock, Timeout
+
     lock = FileLock(out / LOCK_FILE, timeout=0)
     try:
         lock.acquire()
     except Timeout:
-        raise FolderRefused(f"--out {out}: {_owner(out)} writes there. Wait for its end or choose another --out."
+        raise FolderRefused(f"{option} {out}: {_owner(out)} writes there. Wait for its end or choose another one."
                             ) from None  # fmt: skip
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(timespec="seconds")}
         (out / LOCK_FILE).write_text(json.dumps(me) + "\n")
         for leftover in out.glob(".*.tmp*"):
             leftover.unlink(missing_ok=True)
-        yield Claim(out, kind, read_identity(out, kind))
+        yield
     finally:
         lock.release()
 

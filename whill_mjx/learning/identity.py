@@ -13,6 +13,7 @@ import numpy as np
 
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import plain
+from whill_mjx.tasks.tasks import source_of
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -21,7 +22,10 @@ OUTPUTS = ("config.json", "best", "best.json", "policy_best", "policy_last", "dr
            "reward_curve.png", "drives.png", "failures.png", "camera.mp4", "failures.mp4", "prediction.gif",
            "index.html", "tensorboard")  # fmt: skip
 """Names that a training writes besides the results that all commands share."""
-SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries")
+LATER = ("y", "roll", "yaw")
+"""Fields of the camera that older vehicles do not have; at zero they change nothing."""
+SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries",
+            "looks", "spread", "vary")
 """Fields of a preset that change the result of both learners; evaluations choose the best parameters."""
 
 
@@ -41,15 +45,18 @@ def identity_of(preset: Preset, learner: str, seed: int, vehicle: str, data: str
         settings |= {"ppo": chosen["ppo"], "total_steps": chosen["total_steps"]}  # its learning rate spans the run
     else:
         settings["dreamer"] = chosen["learner"]
-    name = getattr(preset.task, "name", "")
-    return {"learner": learner, "seed": seed, "task": name, "vehicle": vehicle, "data": data, **dict(_flat(settings))}
+    known = {"learner": learner, "seed": seed, "task": preset.task.name, "vehicle": vehicle, "data": data}
+    source = source_of(preset.task)
+    return known | ({"task_file": source} if source else {}) | dict(_flat(settings))
 
 
 def vehicle_label(spec: VehicleSpec, params: VehicleParams) -> str:
     """Name of a vehicle with a checksum of its spec, effects and parameters, whatever else its file says."""
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
     values = {jax.tree_util.keystr(path): float(np.float32(leaf)) for path, leaf in leaves}
-    content = [dataclasses.asdict(spec), [effect.name for effect in params.effects], values]
+    about = dataclasses.asdict(spec)
+    about["camera"] = {name: value for name, value in about["camera"].items() if value or name not in LATER}
+    content = [about, [effect.name for effect in params.effects], values]
     return f"{spec.name} {hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]}"
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+
+from dreamer import spaces
 
 
 @dataclass(frozen=True)
@@ -68,19 +71,36 @@ class PpoConfig:
 
 
 class Network(nn.Module):
-    """Mean of the action, and value, of stacked frames (..., H, W, 3 * stack) uint8."""
+    """Mean of the action, and value, of stacked frames (..., H, W, C * stack) uint8.
+
+    Where an environment shows vectors too, or only them, the input is a dict of "frames" and "vector" (..., D), either
+    of which may be absent; vectors are squeezed by symlog.
+    """
 
     config: PpoConfig
     actions: int
 
     @nn.compact
-    def __call__(self, frames: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def __call__(self, frames: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+        orthogonal = nn.initializers.orthogonal
+        if not isinstance(frames, Mapping):
+            return self._heads(self._see(frames))
+        parts = [self._see(frames["frames"])] if "frames" in frames else []
+        if "vector" in frames:
+            vector = symlog(frames["vector"])
+            parts.append(nn.tanh(nn.Dense(self.config.width, kernel_init=orthogonal(2**0.5))(vector)))
+        return self._heads(jnp.concatenate(parts, -1))
+
+    def _see(self, frames: jax.Array) -> jax.Array:
         orthogonal = nn.initializers.orthogonal
         x = frames.astype(jnp.float32) / 255.0 - 0.5
         for channels, kernel, stride in zip(self.config.channels, (8, 4, 3), (4, 2, 1), strict=True):
             convolution = nn.Conv(channels, (kernel, kernel), (stride, stride), kernel_init=orthogonal(2**0.5))
             x = nn.relu(convolution(x))
-        x = x.reshape((*x.shape[:-3], -1))
+        return x.reshape((*x.shape[:-3], -1))
+
+    def _heads(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        orthogonal = nn.initializers.orthogonal
         x = nn.relu(nn.Dense(self.config.width, kernel_init=orthogonal(2**0.5))(x))
         mean = nn.Dense(self.actions, kernel_init=orthogonal(0.01))(x)
         value = nn.Dense(1, kernel_init=orthogonal(1.0))(x)[..., 0]
@@ -88,7 +108,12 @@ class Network(nn.Module):
         return mean, log_std, value
 
 
-def forward(config: PpoConfig, params: Any, frames: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def symlog(x: jax.Array) -> jax.Array:
+    """sign(x) log(1 + |x|): small numbers as they are, large ones squeezed."""
+    return jnp.sign(x) * jnp.log1p(jnp.abs(x))
+
+
+def forward(config: PpoConfig, params: Any, frames: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mean (..., A), log standard deviation (A,) and value (...,) for stacked frames (..., H, W, 3 * stack) uint8."""
     result: Any = Network(config, params["params"]["log_std"].shape[0]).apply(params, frames)
     return result
@@ -116,7 +141,7 @@ class PpoState:
     opt: Any
     env_state: Any
     step: Any  # frames waiting for an action, as the environment gave them
-    frames: jax.Array  # (N, H, W, 3 * stack) uint8
+    frames: Any  # (N, H, W, C * stack) uint8, or a dict of these and vectors
     scale: ReturnScale
     key: jax.Array
     updates: jax.Array  # () iterations done
@@ -126,7 +151,7 @@ class PpoState:
 class Rollout:
     """T steps of N instances."""
 
-    frames: jax.Array  # (T, N, H, W, 3 * stack) uint8
+    frames: Any  # (T, N, H, W, C * stack) uint8, or a dict of these and vectors
     action: jax.Array  # (T, N, A)
     log_prob: jax.Array  # (T, N)
     value: jax.Array  # (T, N)
@@ -136,10 +161,27 @@ class Rollout:
     used: jax.Array  # (T, N) bool: the action was not ignored by a reset
 
 
-def push(frames: jax.Array, obs: jax.Array, first: jax.Array) -> jax.Array:
-    """Stacked frames (N, H, W, 3 * stack) with `obs` (N, H, W, 3) as the newest; before a first frame all is black."""
-    kept = jnp.where(first[:, None, None, None], jnp.uint8(0), frames[..., 3:])
+def push(frames: Any, obs: Any, first: jax.Array) -> Any:
+    """Stacked frames (N, H, W, C * stack) with `obs` (N, H, W, C) as the newest; before a first frame all is black.
+
+    Of a dict of observations the images are stacked, joined along their channels, and the vectors are the newest.
+    """
+    if isinstance(obs, Mapping):
+        image, vector = spaces.image_of(obs), spaces.vector_of(obs)
+        pushed = {} if image is None else {"frames": push(frames["frames"], image, first)}
+        return pushed if vector is None else {**pushed, "vector": vector}
+    kept = jnp.where(first[:, None, None, None], jnp.uint8(0), frames[..., obs.shape[-1] :])
     return jnp.concatenate([kept, obs], axis=-1)
+
+
+def empty_frames(config: PpoConfig, obs_shape: Any, batch: tuple[int, ...], stack: int) -> Any:
+    """What `push` begins with: `stack` black images, and vectors of zeros."""
+    if not isinstance(obs_shape, Mapping):
+        height, width, channels = obs_shape
+        return jnp.zeros((*batch, height, width, channels * stack), jnp.uint8)
+    pixels, size = spaces.image_shape(obs_shape), spaces.vector_size(obs_shape)
+    empty = {"frames": empty_frames(config, pixels, batch, stack)} if pixels else {}
+    return {**empty, "vector": jnp.zeros((*batch, size))} if size else empty
 
 
 def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) -> PpoState:
@@ -151,8 +193,7 @@ def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) ->
     check_minibatches(config, env.num_envs)
     env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
     env_state, step = env.reset(env_key)
-    height, width, channels = env.obs_shape
-    empty = jnp.zeros((env.num_envs, height, width, channels * config.stack), jnp.uint8)
+    empty = empty_frames(config, env.obs_shape, (env.num_envs,), config.stack)
     params = Network(config, env.action_dim).init(net_key, empty)
     zero = jnp.zeros(())
     scale = ReturnScale(jnp.zeros(env.num_envs), zero, zero, zero)
@@ -296,24 +337,33 @@ def log_probability(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> j
 
 
 def policy_step(
-    config: PpoConfig, params: Any, carry: dict[str, jax.Array], image: jax.Array
+    config: PpoConfig, params: Any, carry: dict[str, jax.Array], image: Any
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """One control step of ONE instance, deterministic: the function that is exported.
 
     Args:
         config: sizes.
         params: of the network.
-        carry: frames (H, W, 3 * (stack - 1)) uint8, the newest last; zeros start an episode.
-        image: (H, W, 3) uint8.
+        carry: frames (H, W, C * (stack - 1)) uint8, the newest last; zeros start an episode.
+        image: (H, W, C) uint8, or a dict of images and vectors.
 
     Returns:
         The new carry and the action (A,) in [-1, 1].
     """
-    frames = jnp.concatenate([carry["frames"], image], axis=-1)
-    mean, _, _ = forward(config, params, frames[None])
-    return {"frames": frames[..., 3:]}, jnp.clip(mean[0], -1.0, 1.0)
+    pixels, vector = spaces.image_of(image), spaces.vector_of(image)
+    seen, after = {}, {}
+    if pixels is not None:
+        seen["frames"] = jnp.concatenate([carry["frames"], pixels], axis=-1)
+        after["frames"] = seen["frames"][..., pixels.shape[-1] :]
+    if vector is not None:
+        seen["vector"] = vector
+    batched = {name: value[None] for name, value in seen.items()}
+    mean, _, _ = forward(config, params, batched if isinstance(image, Mapping) else batched["frames"])
+    return after, jnp.clip(mean[0], -1.0, 1.0)
 
 
-def policy_carry(config: PpoConfig, height: int, width: int) -> dict[str, jax.Array]:
-    """Zero carry of `policy_step`."""
-    return {"frames": jnp.zeros((height, width, 3 * (config.stack - 1)), jnp.uint8)}
+def policy_carry(config: PpoConfig, obs_shape: Any) -> dict[str, jax.Array]:
+    """Zero carry of `policy_step` for what an environment shows; of vectors alone nothing is kept."""
+    shape = obs_shape if isinstance(obs_shape, Mapping) else {"camera": obs_shape}
+    empty = empty_frames(config, shape, (), config.stack - 1)
+    return {"frames": empty["frames"]} if "frames" in empty else {}

@@ -5,31 +5,35 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dreamer import agent as agents
 from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
 from dreamer.types import FunctionalEnv, Mirror, Params, Transition
 from whill_mjx.batch import BatchEnv, make_batch
-from whill_mjx.env import END_METRICS, State, make_env
+from whill_mjx.env import POSE_METRICS, Env, State, make_env
 from whill_mjx.evaluation.drivers import Driver
-from whill_mjx.learning import ppo, privileged
+from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.shaping import Safety, Step, limit_action, limited_policy, penalty
-from whill_mjx.tasks.tasks import Task, make_task
+from whill_mjx.sensors import privileged
+from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
+from whill_mjx.vehicle.vehicle_file import load_intervals
+from whill_mjx.world.randomize import Variation, read_variation
 
 PAINTS = 15
 """Worlds of other looks that the mirror shows at most; any number could be drawn, but each takes memory."""
 TRUTH = "truth"
-"""Name of the observation that `whill_mjx.learning.privileged` makes; for `DreamerConfig.decode_only`."""
+"""Name of the observation that `whill_mjx.sensors.privileged` makes; for `DreamerConfig.decode_only`."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,13 @@ class Preset:
     """Share of training episodes that begin anywhere on the way (`whill_mjx.tasks.starts`); evaluations never do."""
     second_tries: float = 0.0
     """Share of the training episodes without an arrival whose world is begun again (`whill_mjx.batch`)."""
+    looks: str | None = None
+    """What changes the picture from episode to episode: "plain" nothing, "paper" what the paper randomises, "rich"
+    a furnished room (`whill_mjx.world.rich`); None leaves it to the task."""
+    spread: float = 0.0
+    """Relative spread of the vehicle's parameters from episode to episode, in training."""
+    vary: tuple[str, ...] = ()
+    """Parameters of the vehicle drawn from a range in each episode of the training, as `variations_of` reads them."""
     safety: Safety = Safety()
     """What is asked besides the task."""
     ppo: PpoConfig = PpoConfig()
@@ -57,58 +68,98 @@ class Preset:
     """End when two evaluations in a row have had this share of successes."""
 
 
-def find_preset(name: str, task: str) -> Preset:
-    """Preset by name ("paper", "wallclock", "cpu" or "smoke") for a task; ValueError names the known ones.
+PRESETS = ("paper", "transfer", "wallclock", "cpu", "smoke")
 
-    "paper" is the reference paper's setting: 16 instances, 22,000 control steps on the obstacle course and 200,000 in
-    the corridor (at ratios of 384 and 160). Its updates are few, so it learns faster at first and explores more
-    than DreamerV3's defaults; it also learns from the mirrored world and predicts what the simulator knows. A quarter
-    of its instances act without noise; an average of its parameters drives. On the course it looks 5 s ahead, not 33,
-    trusts its critic less, and begins half of its training episodes anywhere on the way: from the paper's start and
-    with noise alone, two seeds in five learned a fixed layout. Its drives are short, so twice as many sequences of half
-    the length make a batch, in less time. In the corridor, whose box may look like the floor behind it, what the
-    simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen in four paints.
-    "wallclock" spends environment steps to save time: thousands of instances, few updates per step, and
-    an end when nearly all held-out episodes succeed. "cpu" is an easier course for 2 cores: forward speeds only, one
-    gate, a decision every 0.5 s, a small network on 8x8 patches. "smoke" only shows that everything runs.
+
+def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset:
+    """Preset by name ("paper", "transfer", "wallclock", "cpu" or "smoke") for a task, which brings its own budget.
+
+    "paper" is the reference paper's setting: 16 instances and few steps. Its updates are few, so it learns faster at
+    first and explores more than DreamerV3's defaults; it also learns from the mirrored world and predicts what the
+    simulator knows. A quarter of its instances act without noise; an average of its parameters drives. On the course it
+    looks 5 s ahead, not 33, trusts its critic less, and begins half of its training episodes anywhere on the way: from
+    the paper's start and with noise alone, two seeds in five learned a fixed layout. Its drives are short, so twice as
+    many sequences of half the length make a batch, in less time. In the corridor, whose box may look like the floor
+    behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
+    in four paints.
+    "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, for a
+    policy that drives where nobody trained.
+    "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
+    cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
+    shows that everything runs.
+
+    Args:
+        name: of the preset.
+        task: name of a task, or a task.
+        steps: environment steps where the task has no budget for this preset; "smoke" needs none.
+
+    Raises:
+        ValueError: unknown preset or task, a budget with a wrong setting, or no budget and no steps.
     """
-    easy: dict[str, Any] = {"v_min": 0.0, "gates": 1} if task == "obstacle_course" else {}
+    if name not in PRESETS:
+        known = "'paper', 'transfer', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
+        raise ValueError(f"unknown preset {name!r}; use {known}.")
+    chosen = make_task(task) if isinstance(task, str) else task
+    budget = chosen.budgets.get(name, chosen.budgets.get("paper") if name == "transfer" else None)
+    if budget is None and name == "smoke":
+        budget = Budget(400, eval_every=200)
+    if budget is None and steps is None:
+        has = f"it has some for {', '.join(chosen.budgets)}" if chosen.budgets else "it has none at all"
+        raise ValueError(f"task {chosen.name!r} has no budget for the preset {name!r} ({has}). Give --steps, or add "
+                         f"{name!r} to its budgets.")
+    budget = budget or Budget(steps or 0)
+    chosen = _changed(chosen, budget.fields, f"task {chosen.name!r}: budget {name!r}")
     match name:
-        case "paper":
-            on_course = task == "obstacle_course"
-            steps, ratio = (22_000, 384) if on_course else (200_000, 160)
+        case "paper" | "transfer":
             learner = learner_preset(
-                "size12m", train_ratio=float(ratio), lr=1.5e-4, lr_decay=steps * ratio // 1024, entropy_scale=1e-3,
-                replay_capacity=250_000, average_rate=0.002, greedy_share=0.25, decode_only=(TRUTH,),
+                "size12m", lr=1.5e-4, entropy_scale=1e-3, replay_capacity=250_000, average_rate=0.002,
+                greedy_share=0.25, decode_only=(TRUTH,),
             )  # fmt: skip
-            own: dict[str, Any] = dict(vector_scale=5.0, mirror=3)
-            if on_course:
-                own = dict(horizon=50.0, return_lambda=0.98, imag_horizon=25, mirror=1, batch_size=32, batch_length=32)
-            return Preset(
-                make_task(task), dataclasses.replace(learner, **own), steps, eval_every=1000 if on_course else 20_000,
-                eval_episodes=200, exploring_starts=0.5 if on_course else 0.0, second_tries=0.0 if on_course else 0.5,
-            )  # fmt: skip
+            preset = Preset(chosen, learner, budget.steps, eval_episodes=200)
+            if name == "transfer":
+                preset = dataclasses.replace(preset, looks="rich", spread=0.1)
         case "wallclock":
             learner = learner_preset(
                 "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
                 horizon=100.0, return_lambda=0.98, decode_only=(TRUTH,),
             )  # fmt: skip
-            return Preset(
-                make_task(task), learner, 8_000_000, instances=2048, eval_every=500_000, eval_episodes=1000,
-                exploring_starts=0.5, ppo=PpoConfig(rollout=32, minibatches=16), stop_success=0.99,
-            )  # fmt: skip
+            wide = PpoConfig(rollout=32, minibatches=16)
+            preset = Preset(chosen, learner, budget.steps, instances=2048, eval_episodes=1000, ppo=wide)
         case "cpu":
-            course = make_task(task, action_repeat=5, **easy)
             small = PpoConfig(rollout=32, minibatches=4, width=128, channels=(16, 32, 32))
-            return Preset(course, learner_preset("cpu", lr=6e-4, mean_pull=0.01), 8_000, instances=8, ppo=small)
+            learner = learner_preset("cpu", lr=6e-4, mean_pull=0.01)
+            slow = dataclasses.replace(chosen, **{"action_repeat": 5, **budget.fields})
+            preset = Preset(slow, learner, budget.steps, instances=8, ppo=small)
         case "smoke":
-            course = make_task(task, action_repeat=5, **easy)
             tiny = learner_preset("cpu", deter=64, hidden=32, units=32, stoch=8, patch_units=16, batch_size=4)
             tiny = dataclasses.replace(tiny, batch_length=8, learning_starts=64, train_ratio=4.0, imag_horizon=4)
             small = PpoConfig(rollout=16, minibatches=2, epochs=1, width=32, channels=(8, 8, 8))
-            return Preset(course, tiny, 400, instances=4, eval_every=200, eval_episodes=8, ppo=small)
-    known = "'paper', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
-    raise ValueError(f"unknown preset {name!r}; use {known}.")
+            slow = dataclasses.replace(chosen, **{"action_repeat": 5, **budget.fields})
+            preset = Preset(slow, tiny, budget.steps, instances=4, eval_episodes=8, ppo=small)
+    learner = _changed(preset.learner, budget.learner, f"task {chosen.name!r}: budget {name!r}")
+    if name in ("paper", "transfer"):  # the falling rate spans the run
+        updates = int(budget.steps * learner.train_ratio) // learner.replayed_per_update
+        learner = dataclasses.replace(learner, lr_decay=max(learner.warmup + 1, updates))
+    return dataclasses.replace(
+        preset,
+        learner=learner,
+        ppo=_changed(preset.ppo, budget.ppo, f"task {chosen.name!r}: budget {name!r}"),
+        eval_every=budget.eval_every or max(1, budget.steps // 20),
+        eval_episodes=budget.eval_episodes or preset.eval_episodes,
+        instances=budget.instances or preset.instances,
+        exploring_starts=budget.exploring_starts,
+        second_tries=budget.second_tries,
+        stop_success=budget.stop_success,
+    )
+
+
+def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
+    """A record with some fields changed; ValueError names the known ones."""
+    known = {field.name for field in dataclasses.fields(holder)}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise ValueError(f"{where}: there is no {unknown[0]!r} to change (known: {', '.join(sorted(known))}).")
+    return dataclasses.replace(holder, **changes)
 
 
 def with_layout(preset: Preset, layout: str) -> Preset:
@@ -180,7 +231,7 @@ def _alike(value: Any, default: Any) -> bool:
 
 def to_transition(step: TimeStep) -> Transition:
     """A time step as the learner reads it."""
-    metrics = {name: step.metrics[name] for name in END_METRICS}
+    metrics = {name: value for name, value in step.metrics.items() if name not in POSE_METRICS}
     ended = step.terminated | step.truncated
     return Transition(step.obs, step.reward, step.first, ended, step.terminated, metrics)
 
@@ -205,7 +256,8 @@ def functional_env(
         if not targets:
             return transition
         known = jax.vmap(lambda one: privileged.truth(batch.env, one))(state.env)
-        return dataclasses.replace(transition, obs={"camera": step.obs, TRUTH: known})
+        seen: Any = step.obs if batch.env.sensors else {"camera": step.obs}
+        return dataclasses.replace(transition, obs={**seen, TRUTH: known})
 
     def reset(key: jax.Array) -> tuple[Any, Transition]:
         state, step = batch.reset(key)
@@ -224,20 +276,52 @@ def functional_env(
             step = dataclasses.replace(step, reward=step.reward - jnp.where(step.first, 0.0, lost))
         return state, emit(state, step)
 
-    image = (batch.env.height, batch.env.width, 3)
-    shape = {"camera": image, TRUTH: (privileged.SIZE,)} if targets else image
+    shape = obs_shape_of(batch.env)
+    if targets:
+        seen = shape if isinstance(shape, dict) else {"camera": shape}
+        shape = {**seen, TRUTH: (privileged.SIZE,)}
     return FunctionalEnv(
         num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=mirror_of(batch)
     )
 
 
-def mirror_of(batch: BatchEnv) -> Mirror:
+def obs_shape_of(env: Env) -> Any:
+    """Shapes of what a learner sees: (H, W, 3) of the image, or those of the sensors by name.
+
+    Raises:
+        ValueError: a sensor shows what no learner reads.
+    """
+    if not env.sensors:
+        return (env.height, env.width, 3)
+    shapes = {}
+    for name, sensor in env.sensors:
+        reading = sensor.reading(env)
+        rank = 3 if np.dtype(reading.dtype) == np.uint8 else 1
+        if len(reading.shape) != rank or name == TRUTH:
+            raise ValueError(f"observation {name!r}: learners read bytes (H, W, C) and vectors (D,), not "
+                             f"{np.dtype(reading.dtype)} {reading.shape}. Change the sensor (Depth has as_bytes).")
+        shapes[name] = reading.shape
+    return shapes
+
+
+def mirror_of(batch: BatchEnv) -> Mirror | None:
     """Left and right exchanged. A vehicle that pulls to one side breaks the symmetry by as much as it pulls.
 
     Where looks are drawn at random, each of its worlds has its own, every second one with left and right as they are:
-    what is learned from one drive is seen in several.
+    what is learned from one drive is seen in several. Sensors are mirrored in one world; None where one of them cannot
+    be.
     """
-    paints = batch.env.random_looks or batch.env.photometric
+    sensors = dict(batch.env.sensors)
+    if sensors:
+        if any(sensor.mirrored is None for sensor in sensors.values()):
+            return None
+        mirrors: dict[str, Any] = {name: sensor.mirrored for name, sensor in sensors.items()}
+        mirrors[TRUTH] = privileged.mirrored
+        return Mirror(
+            lambda state, obs, worlds: {name: mirrors[name](value)[None] for name, value in obs.items()},
+            lambda action, worlds: (action * jnp.array([1.0, -1.0]))[None],
+        )
+    paints = batch.env.repaints
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
         """Every second of the worlds (K, ...) as it is."""
@@ -262,28 +346,50 @@ def mirror_of(batch: BatchEnv) -> Mirror:
 
 def make_training_env(
     task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0, second_tries: float = 0.0,
+    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None, vary: Sequence[str] = (),
 ) -> BatchEnv:  # fmt: skip
     """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
-    env, params = make_env(task, vehicle, exploring_starts=exploring_starts)
-    return make_batch(env, params, instances, spread, devices, second_tries)
+    env, params = make_env(task, vehicle, exploring_starts=exploring_starts, looks=looks)
+    return make_batch(env, params, instances, spread, devices, second_tries, variations_of(vary, vehicle))
+
+
+def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Variation, ...]:
+    """What is drawn in each episode: NAME=LOW:HIGH of one parameter, or "fit" for all intervals of the vehicle file.
+
+    Raises:
+        ValueError: a text that is neither, or a vehicle without intervals.
+    """
+    found: list[Variation] = []
+    for text in texts:
+        if text != "fit":
+            found.append(read_variation(text))
+            continue
+        intervals = load_intervals(vehicle) if vehicle is not None and Path(vehicle).is_file() else {}
+        if not intervals:
+            raise ValueError(f"vary 'fit': {vehicle} has no intervals. Give a file that sysid.fit wrote, or ranges "
+                             "such as body.mass=0.9x:1.1x.")
+        found += [Variation(name, low, high) for name, (low, high) in intervals.items()]
+    return tuple(found)
 
 
 def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[Step, dict[str, Any]]:
     """The trained agent as the step of one instance, limits included, and its first carry."""
     learner = preset.learner
     params = jax.tree.map(jnp.asarray, params)
+    carry = agents.policy_carry(learner, 2)
+    if preset.looks == "rich":
+        carry[agents.SURPRISE] = jnp.zeros(1)
     return limited_policy(
         preset.task, preset.safety, lambda carry, image: agents.policy_step(learner, params, carry, image),
-        agents.policy_carry(learner, 2), control_dt * preset.task.action_repeat,
+        carry, control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 
-def ppo_policy(preset: Preset, params: Any, control_dt: float, size: tuple[int, int]) -> tuple[Step, dict[str, Any]]:
-    """The same of the model-free baseline, for images of `size` (H, W)."""
+def ppo_policy(preset: Preset, params: Any, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+    """The same of the model-free baseline, for what `env` shows."""
     return limited_policy(
         preset.task, preset.safety, lambda carry, image: ppo.policy_step(preset.ppo, params, carry, image),
-        ppo.policy_carry(preset.ppo, *size), control_dt * preset.task.action_repeat,
+        ppo.policy_carry(preset.ppo, obs_shape_of(env)), control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 
@@ -291,6 +397,6 @@ def step_driver(step: Step, carry: dict[str, Any], period: int, name: str = "pol
     """A policy step as a driver of evaluations."""
 
     def act(memory: Any, state: State, image: jax.Array, key: jax.Array) -> tuple[Any, jax.Array]:
-        return step(memory, image)
+        return step(memory, image)  # or the values of the sensors by name
 
     return Driver(name, lambda state, key: carry, act, period)

@@ -84,7 +84,7 @@ def penalty(safety: Safety, clearance: jax.Array, change: jax.Array, seconds: fl
     return safety.clearance_gain * seconds * short + safety.change_gain * jnp.sum(jnp.abs(change))
 
 
-Step = Callable[[dict[str, jax.Array], jax.Array], tuple[dict[str, jax.Array], jax.Array]]
+Step = Callable[[dict[str, jax.Array], Any], tuple[dict[str, jax.Array], jax.Array]]
 
 
 def limited_policy(
@@ -98,7 +98,7 @@ def limited_policy(
         return step, carry
     low, high = command_range(task)
 
-    def limited(carry: dict[str, jax.Array], image: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+    def limited(carry: dict[str, jax.Array], image: Any) -> tuple[dict[str, jax.Array], jax.Array]:
         inner = {name: value for name, value in carry.items() if name != "command"}
         inner, action = step(inner, image)
         action = limit_action(task, safety, action, carry["command"], seconds)

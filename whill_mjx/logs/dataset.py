@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +81,14 @@ def write_encoder(
     write_csv(folder / "encoder.csv", ENCODER_HEADER, encoder_table(t, latency, angles))
 
 
-def write_fields(folder: Path, spec: VehicleSpec, held_out: Iterable[str] = ()) -> None:
-    """Write dataset.toml: the vehicle's nominal geometry, and the trials that are never fitted."""
+def write_fields(
+    folder: Path, spec: VehicleSpec, held_out: Iterable[str] = (), more: Mapping[str, Any] | None = None
+) -> None:
+    """Write dataset.toml: the vehicle's nominal geometry, and the trials that are never fitted.
+
+    Args:
+        more: further fields: numbers, texts or lists of texts.
+    """
     names = ", ".join(json.dumps(name) for name in held_out)  # a JSON string is a TOML string
     lines = [
         "schema = 1",
@@ -92,8 +98,15 @@ def write_fields(folder: Path, spec: VehicleSpec, held_out: Iterable[str] = ()) 
         *(f"{key} = {getattr(spec, key)}" for key in ("wheel_radius", "track", "wheelbase", "mass")),
         f"command_limits = [{max(abs(spec.v_min), spec.v_max)}, {spec.omega_max}]",
         f"held_out = [{names}]",
+        *(f"{key} = {_toml(value)}" for key, value in (more or {}).items()),
     ]
     write_text(folder / "dataset.toml", "\n".join(lines) + "\n")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return "[\n" + "".join(f"    {json.dumps(one, ensure_ascii=False)},\n" for one in value) + "]"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def write_csv(path: Path, header: str, table: np.ndarray) -> None:

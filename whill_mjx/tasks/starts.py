@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.tasks.tasks import Task, World, goal_position
+from whill_mjx.tasks.base import Task, World
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.scene import clearance, footprint
 
@@ -36,7 +36,7 @@ def anywhere(task: Task, spec: VehicleSpec, world: World, key: jax.Array) -> jax
         world: of the episode.
         key: consumed.
     """
-    goal = goal_position(world.scene)
+    goal = task.goal(world.scene)
     way = goal - world.start[:2]
     length = jnp.linalg.norm(way)
     along = way / length

@@ -18,7 +18,13 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
-from whill_mjx.vehicle.kinematics import heading, quaternion_from_angles, rotation_from_quaternion, wheel_speeds
+from whill_mjx.vehicle.kinematics import (
+    body_twist,
+    heading,
+    quaternion_from_angles,
+    rotation_from_quaternion,
+    wheel_speeds,
+)
 from whill_mjx.vehicle.model import VehicleModel, box_inertia
 from whill_mjx.vehicle.scalars import apart, scan_apart
 from whill_mjx.vehicle.specs import GRAVITY
@@ -116,7 +122,7 @@ def forces(
         New memory of the effects; the generalised force (8,) as MuJoCo's qfrc_applied; the motion it was computed from.
     """
     effects = params.effects
-    memory, world = apply_chain(effects, state.memory, "world", nominal_world(model))
+    memory, world = apply_chain(effects, state.memory, "world", moving_world(model, state))
     motion = measure(model, params, world, state)
     command = limited(model, command) if model.config.limited else command
     memory, command = apply_chain(effects, memory, "command", command, motion)
@@ -282,6 +288,12 @@ def nominal_world(model: VehicleModel) -> World:
                  wheel_reaction=jnp.zeros((), sag.dtype))
 
 
+def moving_world(model: VehicleModel, state: VehicleState) -> World:
+    """The nominal world, and how the chassis moves in it."""
+    v, omega = body_twist(model, state.qpos, state.qvel)
+    return dataclasses.replace(nominal_world(model), speed=v, yaw_rate=omega, drift=jnp.zeros_like(omega))
+
+
 def measure(model: VehicleModel, params: VehicleParams, world: World, state: VehicleState) -> Motion:
     """The present motion in the chassis frame, with the suspension's forces on the ground of `world`."""
     spec = model.spec
@@ -299,7 +311,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
     def along(axis: jax.Array) -> jax.Array:
         return axis[0] * point_velocity[0] + axis[1] * point_velocity[1] + axis[2] * point_velocity[2]
 
-    forward, left, normal = under.contact_axes
+    forward, left, normal = contact_axes = rolling_axes(under.contact_axes, world.drift)
     mass, inertia, com = mass_distribution(model, params, world)
     stiffness, damping = suspension(params.body.mass, carried_sag(model, world), world.damping)
     normal_speed = along(normal)
@@ -309,7 +321,7 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         mass=params.body.mass,
         heading=heading(rotation),
         ground_axes=under.axes,
-        contact_axes=under.contact_axes,
+        contact_axes=contact_axes,
         contact_points=under.contact_points,
         rotation=rotation,
         position=state.qpos[:2],
@@ -332,6 +344,13 @@ def measure(model: VehicleModel, params: VehicleParams, world: World, state: Veh
         track=spec.track,
         dt=model.config.physics_dt,
     )
+
+
+def rolling_axes(axes: jax.Array, drift: jax.Array | float) -> jax.Array:
+    """Axes (3, 3, ...) at the contacts with forward and left turned by an angle of tangent `drift`."""
+    cos = 1 / jnp.sqrt(1 + jnp.square(drift))
+    sin = cos * drift
+    return jnp.stack([cos * axes[0] + sin * axes[1], cos * axes[1] - sin * axes[0], axes[2]])
 
 
 def softplus(value: jax.Array) -> jax.Array:

@@ -73,10 +73,15 @@ def camera_pose(model: VehicleModel, qpos: jax.Array) -> tuple[jax.Array, jax.Ar
     """Position (3,) and rotation (3, 3), camera to world, of the camera; its axes are x right, y down, z forward."""
     mount = model.spec.camera
     rotation = rotation_from_quaternion(qpos[3:7])
-    position = qpos[:3] + rotation @ jnp.array([mount.x, 0.0, mount.z])
+    position = qpos[:3] + rotation @ jnp.array([mount.x, mount.y, mount.z])
     cos, sin = jnp.cos(mount.pitch), jnp.sin(mount.pitch)
     # Columns: the camera's right, down and forward axes in the chassis frame, tilted down by `pitch`.
     mounted = jnp.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]).T
     right, down, forward = mounted.T
     tilted = jnp.stack([right, cos * down - sin * forward, cos * forward + sin * down])
+    if mount.roll or mount.yaw:  # clockwise for somebody who looks along with the camera, then to the left
+        (right, down, forward), c, s = tilted, jnp.cos(mount.roll), jnp.sin(mount.roll)
+        tilted = jnp.stack([c * right + s * down, c * down - s * right, forward])
+        c, s = jnp.cos(mount.yaw), jnp.sin(mount.yaw)
+        tilted = tilted @ jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
     return position, rotation @ tilted.T

@@ -27,6 +27,12 @@ class CameraMount:
     """Tilt downwards [rad]."""
     fov_y: float = 1.2
     """Vertical field of view [rad]."""
+    y: float = 0.0
+    """To the left of the chassis origin [m]."""
+    roll: float = 0.0
+    """Clockwise turn about the line of sight, seen from behind the camera [rad]."""
+    yaw: float = 0.0
+    """Turn of the line of sight to the left [rad]."""
 
 
 @dataclass(frozen=True)
@@ -95,19 +101,23 @@ WHILL_CR = VehicleSpec(
 HUSKY = VehicleSpec(
     name="husky", wheel_radius=0.165, track=0.55, wheelbase=0.512, mass=50.0, drive="skid", wheel_inertia=0.1,
     body_length=0.99, body_width=0.67, body_height=0.39, v_min=-1.0, v_max=1.0, omega_max=2.0,
+    camera=CameraMount(x=0.40, z=0.30, pitch=0.10),
 )
 # Clearpath Warthog on wheels: radius and track from its run configuration (0.30, 1.08); 280 kg and size from the
 # data sheet.
 WARTHOG = VehicleSpec(
     name="warthog", wheel_radius=0.30, track=1.08, wheelbase=0.914, mass=280.0, drive="skid", wheel_inertia=1.5,
     body_length=1.52, body_width=1.38, body_height=0.83, v_min=-5.0, v_max=5.0, omega_max=4.0,
+    camera=CameraMount(x=0.70, z=0.65, pitch=0.15),
 )
 # iRobot Create: wheel separation 0.258 m and radius 0.033 m from the Open Interface manual; about 3.6 kg with its
 # battery.
 CREATE = VehicleSpec(
     name="create", wheel_radius=0.033, track=0.258, wheelbase=0.26, mass=3.6, wheel_inertia=2e-4,
     body_length=0.34, body_width=0.34, body_height=0.10, v_min=-0.5, v_max=0.5, omega_max=4.0,
+    camera=CameraMount(x=0.12, z=0.09, pitch=0.0),
 )
+# The cameras of the last three are assumptions: at the front of the body, a hand above it.
 SPECS = {spec.name: spec for spec in (WHILL_CR, HUSKY, WARTHOG, CREATE)}
 
 

@@ -64,6 +64,9 @@ class World:
     damping: jax.Array | float = 0.5  # () of the contacts, over the critical
     wheel_inertia: jax.Array | float = 1.0  # () spin inertia of the driven wheels over the nominal
     wheel_reaction: jax.Array | float = 0.0  # () share of it whose momentum the chassis takes up
+    speed: jax.Array | float = 0.0  # () m/s, of the chassis ahead at the start of the step
+    yaw_rate: jax.Array | float = 0.0  # () rad/s, there
+    drift: jax.Array | float = 0.0  # () tangent by which the wheels' line is turned to the left of the heading
     sprung: bool = struct.field(pytree_node=False, default=False)
     """Whether loads are those at the end of a physics step, which any springs allow, or those at its start."""
 

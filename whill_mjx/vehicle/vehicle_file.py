@@ -4,7 +4,7 @@
     kind = "micromobility-vehicle"
     [spec]                      # fields of VehicleSpec; [spec.camera] those of CameraMount
     [body.mass]                 # value, unit, and, where fitted, interval = [low, high]
-    [[effects]]
+    [[effects]]                 # without body and effects: those of the base model `base` ("physical") for the spec
     name = "pid_drive"          # canonical name; the order is the order in which the effects act
     [effects.parameters.kp]     # value, unit, interval
     [provenance]                # free: data hash, fit, held-out error; interval_confidence is that of all intervals
@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from whill_mjx.effects import EFFECTS
 from whill_mjx.io import fields
 from whill_mjx.io.reading import read_toml
-from whill_mjx.vehicle.presets import preset
+from whill_mjx.vehicle.presets import preset, preset_params
 from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
@@ -108,6 +108,8 @@ def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
     path = Path(path)
     content = _read(path)
     spec = _read_spec(path, content["spec"])
+    if "body" not in content and "effects" not in content:
+        return spec, preset_params(spec, content.get("base", "physical")), content.get("provenance", {})
     body = _read_parameters(path, "body", Body, content["body"])
     effects: dict[str, Any] = {}
     for name, table in _effect_tables(path, content):
@@ -122,7 +124,7 @@ def load_intervals(path: str | Path) -> dict[str, tuple[float, float]]:
     path = Path(path)
     content = _read(path)
     found = {}
-    for holder, table in [("body", content["body"]), *_effect_tables(path, content)]:
+    for holder, table in [("body", content.get("body", {})), *_effect_tables(path, content)]:
         for name, entry in table.items():
             whole = fields.check_table(str(path), fields.VALUE, entry, f"{holder}.{name}")
             if "interval" in whole:
@@ -159,7 +161,12 @@ def _read(path: Path) -> dict[str, Any]:
                          " Fit the vehicle again.")
     if content.get("kind") != KIND:
         raise ValueError(f"{path}: kind is {fields.shown(content.get('kind'))}, not {KIND!r}. Give a vehicle file.")
-    return fields.check_table(str(path), fields.VEHICLE, content, remedy=NEWER)
+    table = fields.check_table(str(path), fields.VEHICLE, content, remedy=NEWER)
+    parts = [name for name in ("body", "effects") if name in table]
+    if len(parts) == 1 or (parts and "base" in table):
+        raise ValueError(f"{path}: has {' and '.join(parts)}; it must have both body and effects and no base, or "
+                         "neither of the two. Correct it.")
+    return table
 
 
 def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
@@ -175,7 +182,7 @@ def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
 def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """Name and parameters of each effect of a file."""
     found = []
-    for index, table in enumerate(content["effects"]):
+    for index, table in enumerate(content.get("effects", [])):
         checked = fields.check_table(str(path), fields.EFFECT, table, f"effects[{index}]", NEWER)
         if checked["name"] not in EFFECTS:
             raise ValueError(f"{path}: unknown effect {fields.shown(checked['name'])} (known: "

@@ -46,7 +46,7 @@ def plain_finish(labels: int, lamps: int = 1) -> Finish:
 
 def label_count(scene) -> int:
     """Number of labels of a scene: sky, ground, marker, boxes, blocks, rounds."""
-    count = 3 + scene.boxes.yaw.shape[0]
+    count = 3 + scene.boxes.yaw.shape[0] + (0 if scene.ghosts is None else scene.ghosts.yaw.shape[0])
     for part in (getattr(scene.solids, "blocks", None), getattr(scene.solids, "rounds", None)):
         count += 0 if part is None else part.mask.shape[0]
     return count

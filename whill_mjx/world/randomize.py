@@ -1,13 +1,17 @@
-"""Random vehicle parameters around given ones, and random looks of a scene."""
+"""Random vehicle parameters, around given ones or in given ranges, and random looks of a scene."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 from whill_mjx.world.scene import Scene
 
 
@@ -25,6 +29,79 @@ def randomize_params(key: jax.Array, params: VehicleParams, spread: float) -> Ve
     keys = jax.random.split(key, len(leaves))
     drawn = [_scale(k, jnp.asarray(leaf), spread) for k, leaf in zip(keys, leaves, strict=True)]
     return jax.tree.unflatten(tree, drawn)
+
+
+def with_parameter(params: VehicleParams, name: str, value: jax.Array, relative: bool) -> VehicleParams:
+    """The parameters of one vehicle with one value changed; an effect that it does not have is added.
+
+    Args:
+        params: of one instance.
+        name: `EFFECT.PARAMETER` or `body.PARAMETER`.
+        value: () new value, or factor on the old one.
+        relative: whether it is a factor.
+    """
+    holder, _, field = name.partition(".")
+
+    def changed(owner: Any) -> Any:
+        new = getattr(owner, field) * value if relative else value
+        return dataclasses.replace(owner, **{field: jnp.asarray(new, jnp.result_type(float))})
+
+    if holder == "body":
+        return dataclasses.replace(params, body=changed(params.body))
+    effects = params.effects
+    if not any(effect.name == holder for effect in effects):
+        effects = (*effects, make_effect(holder))
+    return dataclasses.replace(params, effects=tuple(
+        changed(effect) if effect.name == holder else effect for effect in effects
+    ))
+
+
+def check_parameter(where: str, name: str) -> None:
+    """Raise ValueError unless `name` is EFFECT.PARAMETER or body.PARAMETER; names what is known."""
+    holder, _, field = name.partition(".")
+    if holder != "body" and holder not in EFFECTS:
+        raise ValueError(f"{where}: no effect {holder!r} (known: body, {', '.join(sorted(EFFECTS))}).")
+    known = parameters_of(Body if holder == "body" else EFFECTS[holder])
+    if field not in known:
+        raise ValueError(f"{where}: {holder} has no parameter {field!r} (known: {', '.join(known)}).")
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One parameter of the vehicle that is drawn uniformly for each episode."""
+
+    name: str
+    """EFFECT.PARAMETER or body.PARAMETER; an effect that the vehicle lacks is added."""
+    low: float
+    high: float
+    relative: bool = False
+    """The bounds are factors on the vehicle's own value."""
+
+
+def read_variation(text: str) -> Variation:
+    """Variation from NAME=LOW:HIGH, where bounds with an x are factors; ValueError says what is wrong."""
+    name, equals, values = text.partition("=")
+    low, colon, high = values.partition(":")
+    relative = low.endswith("x")
+    try:
+        if not (equals and colon) or high.endswith("x") != relative:
+            raise ValueError
+        bounds = float(low.removesuffix("x")), float(high.removesuffix("x"))
+        if not (math.isfinite(bounds[0]) and math.isfinite(bounds[1]) and bounds[0] <= bounds[1]):
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"{text!r} is no variation: write EFFECT.PARAMETER=LOW:HIGH or body.PARAMETER=0.9x:1.1x, the "
+                         "lower bound first.") from None
+    check_parameter(f"variation {text!r}", name)
+    return Variation(name, *bounds, relative)
+
+
+def vary_params(key: jax.Array, params: VehicleParams, variations: tuple[Variation, ...]) -> VehicleParams:
+    """Parameters of one instance with each variation drawn from its range."""
+    for index, one in enumerate(variations):
+        value = jax.random.uniform(jax.random.fold_in(key, index), minval=one.low, maxval=one.high)
+        params = with_parameter(params, one.name, value, one.relative)
+    return params
 
 
 def _scale(key: jax.Array, leaf: jax.Array, spread: float) -> jax.Array:

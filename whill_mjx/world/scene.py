@@ -5,6 +5,8 @@ World frame: x forward along the course, y left, z up, ground at z = 0. Lengths 
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -60,6 +62,9 @@ class Scene:
     looks: Looks
     solids: Solids | None = None  # seen, but nothing collides with them
     finish: Finish | None = None  # textures, lamps and fog
+    ghosts: Boxes | None = None  # upright boxes that are seen, but nothing collides with them
+    hidden: jax.Array | None = None  # (P,) bool: boxes that are hit but not seen, for something else shows them
+    rich: Any = None  # materials, lights and film of `whill_mjx.world.rich`; they replace colours, looks and finish
 
 
 def default_looks() -> Looks:

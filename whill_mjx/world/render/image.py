@@ -17,10 +17,10 @@ from flax import struct
 from whill_mjx.world.render import visibility
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import strip_lists, upright_bounds
-from whill_mjx.world.render.shading import Quality, View, cast, face_normal, pack_channels, pixel_colours, pixel_view
+from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
 from whill_mjx.world.render.textures import whole
-from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays
+from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal
 from whill_mjx.world.scene import Scene
 
 UNROLL = 8
@@ -114,7 +114,8 @@ def make_view(position, rotation, intrinsics: Intrinsics, scene: Scene) -> tuple
     finish = scene.finish
     if finish is not None:
         finish = dataclasses.replace(finish, texture=None, scale=None, atlas=None)  # type: ignore[arg-type]
-    return View(position, rotation, intrinsics, scene.looks, finish), finite
+    lights = None if scene.rich is None else scene.rich.lights
+    return View(position, rotation, intrinsics, scene.looks, finish, lights), finite
 
 
 def unpack_colours(word: jax.Array) -> jax.Array:
@@ -214,6 +215,9 @@ class Arrays:
 
     def row(self, code) -> list:
         return list(jnp.moveaxis(self.tables.rows[code], -1, 0))  # type: ignore[index]
+
+    def material(self, label) -> list:
+        return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

@@ -20,6 +20,7 @@ from flax import struct
 from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
+from whill_mjx.world.render.rich import NUMBERS
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
 from whill_mjx.world.render.textures import whole
@@ -82,6 +83,7 @@ class Inputs:
     bent: Any  # (K * 4 * 8,)
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
+    materials: Any = None  # (labels * NUMBERS,) of rich looks
 
 
 def render_pallas(
@@ -204,7 +206,9 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
     dark = None if tables.dark is None else tables.dark.reshape(-1)
     rows = None if lit_words(scene) or tables.rows is None else tables.rows.reshape(-1)
     bent = None if tables.bent is None else tables.bent.reshape(-1)
-    return Inputs(jnp.concatenate(flat), integers, tables.words.reshape(-1), dark, rows, bent, atlas, listed), rebuild
+    materials = None if tables.materials is None else tables.materials.reshape(-1)
+    floats, words = jnp.concatenate(flat), tables.words.reshape(-1)
+    return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials), rebuild
 
 
 def _listed(view: View, corners, sun, table, mask, shadow, sort: bool) -> Listed:
@@ -373,6 +377,9 @@ class Refs:
 
     def row(self, code) -> list:
         return [self.data.rows[code * 18 + index] for index in range(18)]
+
+    def material(self, label) -> list:
+        return [self.data.materials[label * NUMBERS + index] for index in range(NUMBERS)]
 
     def bent(self, place) -> list:
         return [self.data.bent[place * 8 + index] for index in range(8)]

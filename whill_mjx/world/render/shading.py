@@ -16,8 +16,9 @@ from flax import struct
 
 from whill_mjx.world.materials import Finish
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
+from whill_mjx.world.render.rich import shade_rich
 from whill_mjx.world.render.textures import random_cell, texture
-from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, Rays, bits_to_float, key_of, rays_of
+from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, Rays, bits_to_float, face_normal, key_of, rays_of
 from whill_mjx.world.scene import Looks
 
 SEAM = 0.35
@@ -49,6 +50,7 @@ class View:
     intrinsics: Intrinsics
     looks: Looks
     finish: Finish | None  # without its tables per label
+    lights: Any = None  # of rich looks; None without
 
 
 class Hit(NamedTuple):
@@ -109,6 +111,9 @@ class Stage(Protocol):
 
     def row(self, code) -> list:
         """Numbers of a face: see `tables.face_rows`."""
+
+    def material(self, label) -> list:
+        """Numbers of a label's material: see `render.rich`."""
 
     def bent(self, place) -> list:
         """Numbers of a face of a round, by its code less `first_bent`: see `tables.bent_rows`."""
@@ -175,6 +180,8 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
     """Colours of what the rays meet: paint, texture, light, grain, darker foot, tiles of the ground, sky and fog."""
     if not stage.lit_words or stage.first_bent is not None or quality != Quality():
         rays, hit = stage.settle((rays, hit))
+    if view.lights is not None:
+        return shade_rich(view, stage, rays, hit.code, hit.solid, hit.seen, hit.depth)
     looks, origin = view.looks, view.position
     box, seen = hit.solid, hit.seen
     depth = jnp.where(seen, hit.depth, 0.0)
@@ -221,16 +228,6 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
             ground = tile * noise * light[channel] * factors[channel]
         channels.append(jnp.where(box, thing, jnp.where(seen, ground, sky)))
     return channels if view.finish is None else _fog(view.finish, rays, seen, depth, height, channels)
-
-
-def face_normal(row, x, y, z) -> list:
-    """Unit normal of a face at a point: that of a flat face, or the direction away from a round's axis."""
-    dx, dy, dz = x - row[3], y - row[4], z - row[5]
-    height = dx * row[0] + dy * row[1] + dz * row[2]
-    height = jnp.minimum(jnp.maximum(height, -row[6]), row[6])
-    curved = row[7] > 0
-    away = ((dx - height * row[0]) * row[7], (dy - height * row[1]) * row[7], (dz - height * row[2]) * row[7])
-    return [jnp.where(curved, bent, row[axis]) for axis, bent in enumerate(away)]
 
 
 def _light(view: View, normal, point, shadow) -> list:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from whill_mjx.world.render.rich import material_table
 from whill_mjx.world.render.shading import View
 from whill_mjx.world.render.visibility import (
     GROUND,
@@ -19,7 +20,7 @@ from whill_mjx.world.render.visibility import (
     upright_shadow_table,
     upright_table,
 )
-from whill_mjx.world.scene import Boxes, Looks, Scene
+from whill_mjx.world.scene import Boxes, Looks, Scene, stack_boxes
 from whill_mjx.world.solids import Blocks, Rounds, across
 
 
@@ -56,6 +57,10 @@ class Parts:
 def parts_of(scene: Scene) -> Parts:
     """Primitives of a scene by kind; the order is that of the labels."""
     boxes, marker, solids = scene.boxes, scene.marker, scene.solids
+    if scene.hidden is not None:
+        boxes = boxes.replace(mask=boxes.mask & ~scene.hidden)  # type: ignore[attr-defined]
+    if scene.ghosts is not None:
+        boxes = stack_boxes([boxes, scene.ghosts])
     upright = Boxes(
         jnp.concatenate([marker.position[None], boxes.centre]),
         jnp.concatenate([marker.half[None], boxes.half]),
@@ -87,6 +92,7 @@ class Tables:
     upright_shadow: jax.Array | None  # (P, 11)
     block_shadow: jax.Array | None  # (K, 18)
     round_shadow: jax.Array | None  # (K, 13)
+    materials: jax.Array | None = None  # (labels, NUMBERS) of rich looks
 
 
 def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: bool = False) -> Tables:
@@ -106,12 +112,13 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
         upright_shadow_table(sun, parts.boxes) if shadows else None,
         block_shadow_table(sun, blocks) if shadows and blocks is not None else None,
         round_shadow_table(sun, rounds) if shadows and rounds is not None else None,
+        None if scene.rich is None else material_table(scene.rich.materials),
     )
 
 
 def lit_words(scene: Scene) -> bool:
     """Whether every flat face has one colour under the sun, so that its light can be looked up with its colour."""
-    return scene.finish is None
+    return scene.finish is None and scene.rich is None
 
 
 def face_words(position: jax.Array, parts: Parts, looks: Looks, lit: bool) -> tuple[jax.Array, jax.Array]:

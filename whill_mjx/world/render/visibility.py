@@ -77,6 +77,16 @@ def reciprocal(x: jax.Array) -> jax.Array:
     return guess + guess * (1.0 - x * guess)
 
 
+def face_normal(row, x, y, z) -> list:
+    """Unit normal of a face at a point: that of a flat face, or the direction away from a round's axis."""
+    dx, dy, dz = x - row[3], y - row[4], z - row[5]
+    height = dx * row[0] + dy * row[1] + dz * row[2]
+    height = jnp.minimum(jnp.maximum(height, -row[6]), row[6])
+    curved = row[7] > 0
+    away = ((dx - height * row[0]) * row[7], (dy - height * row[1]) * row[7], (dz - height * row[2]) * row[7])
+    return [jnp.where(curved, bent, row[axis]) for axis, bent in enumerate(away)]
+
+
 def into_frame(rotation: jax.Array, vector: jax.Array) -> jax.Array:
     """(..., 3) vectors of the world in frames with axes `rotation` (..., 3, 3): no matrix product, so that it fuses."""
     return sum(rotation[..., row, :] * vector[..., row, None] for row in range(3))  # type: ignore[return-value]

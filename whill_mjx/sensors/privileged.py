@@ -1,17 +1,20 @@
-"""Privileged auxiliary targets of a world model, which only the simulator knows; never inputs of the policy.
+"""What only the simulator knows: for critics and for targets of a world model, never for a policy that is to drive.
 
-The vector (D,) is in the body frame, centred on the footprint (x ahead, y to the left): goal, speeds, and the free
-distance in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's symlog resolves the near ones.
+The vector is in the body frame, centred on the footprint (x ahead, y to the left): goal, speeds, and the free distance
+in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's symlog resolves the near ones.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.env import Env, State
-from whill_mjx.tasks.tasks import goal_position
+from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.sensors.lidar import distances
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
 from whill_mjx.world.scene import Boxes, Footprint, footprint
 
@@ -22,12 +25,28 @@ SIZE = 4 + RAYS
 ANGLES = np.arange(RAYS) * 2 * np.pi / RAYS  # rad, from straight ahead to the left; mirrored, ray k is ray -k
 
 
-def truth(env: Env, state: State) -> jax.Array:
+@dataclass(frozen=True)
+class Privileged(Sensor):
+    """(52,) goal x, y, forward speed, yaw rate, free distances in 48 directions; in units of 0.1 m and 0.1 rad."""
+
+    name: ClassVar[str] = "privileged"
+
+    def reading(self, env: Any) -> Reading:
+        return Reading((SIZE,))
+
+    def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
+        return memory, truth(view.env, view.state)
+
+    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
+        return mirrored(value)
+
+
+def truth(env: Any, state: Any) -> jax.Array:
     """(SIZE,) float32: goal x, y, forward speed, yaw rate, free distances; of one instance."""
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
     body = footprint(env.model.spec, x, y, yaw)
-    dx, dy = goal_position(state.scene) - jnp.stack([body.x, body.y])
+    dx, dy = env.task.goal(state.scene) - jnp.stack([body.x, body.y])
     ahead, aside = dx * jnp.cos(yaw) + dy * jnp.sin(yaw), dy * jnp.cos(yaw) - dx * jnp.sin(yaw)
     near = jnp.stack([ahead, aside, v, omega]) / UNIT
     return jnp.concatenate([near, free_distances(body, state.scene.boxes) / UNIT]).astype(jnp.float32)
@@ -35,17 +54,7 @@ def truth(env: Env, state: State) -> jax.Array:
 
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
     """(RAYS,) m from the footprint's centre to the first box in each direction of ANGLES, at most RANGE."""
-    turn = body.yaw + ANGLES[:, None] - boxes.yaw  # (RAYS, P): direction in each box's frame
-    dx, dy = body.x - boxes.centre[:, 0], body.y - boxes.centre[:, 1]
-    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
-    start = jnp.stack([dx * c + dy * s, dy * c - dx * s])[:, None]  # (2, 1, P)
-    way = jnp.stack([jnp.cos(turn), jnp.sin(turn)])  # (2, RAYS, P)
-    way = jnp.where(jnp.abs(way) < 1e-6, 1e-6, way)
-    half = jnp.stack([boxes.half[:, 0], boxes.half[:, 1]])[:, None]
-    ends = jnp.stack([(-half - start) / way, (half - start) / way])  # (2, 2, RAYS, P)
-    enter, leave = ends.min(0).max(0), ends.max(0).min(0)
-    met = (leave >= jnp.maximum(enter, 0.0)) & boxes.mask & (boxes.centre[:, 2] - boxes.half[:, 2] < body.height)
-    return jnp.min(jnp.where(met, jnp.maximum(enter, 0.0), RANGE), -1, initial=RANGE)
+    return distances(body.x, body.y, body.yaw + ANGLES, boxes, RANGE, 0.0, body.height)
 
 
 def mirrored(values: jax.Array) -> jax.Array:

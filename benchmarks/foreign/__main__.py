@@ -1,0 +1,56 @@
+"""Drive a policy in foreign corridors: `python -m benchmarks.foreign --policy NAME=FOLDER --drives 200 --out FILE`.
+
+Needs MUJOCO_GL=egl or osmesa where there is no display. Drives are spread over processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+from benchmarks.foreign.drivers import CONTROLS
+from benchmarks.foreign.room import VARIANTS
+from benchmarks.foreign.run import Job, drive_all
+
+
+def main() -> None:
+    """Drive, print and write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.foreign", description=__doc__)
+    parser.add_argument("--policy", nargs="*", default=[], metavar="NAME=FOLDER", help="policy files")
+    parser.add_argument("--controls", nargs="*", default=[], choices=CONTROLS, help="of the first policy")
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=VARIANTS)
+    parser.add_argument("--drives", type=int, default=200, help="of each policy in each variant")
+    parser.add_argument("--first-seed", type=int, default=5000)
+    parser.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--out", type=Path, default=Path("foreign.json"))
+    options = parser.parse_args()
+    named = [text.split("=", 1) for text in options.policy]
+    jobs: list[Job] = []
+    for variant in options.variants:
+        for seed in range(options.first_seed, options.first_seed + options.drives):
+            jobs += [(variant, seed, name, source, "policy") for name, source in named]
+            for control in options.controls:
+                sighted = control in ("blank", "frozen")
+                name, source = named[0] if sighted else (control, "")
+                jobs.append((variant, seed, name if sighted else control, source, control))
+    results = drive_all(jobs, options.processes, options.out)
+    for line in table(results):
+        print(line)
+
+
+def table(results: list[dict[str, Any]]) -> list[str]:
+    """One line for every driver and variant."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for one in results:
+        groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
+    lines = []
+    for (policy, driver, variant), ends in sorted(groups.items()):
+        shares = ", ".join(f"{end} {ends.count(end) / len(ends):.1%}" for end in ("arrived", "collided", "timeout"))
+        lines.append(f"{policy:12s} {driver:9s} {variant:10s} {len(ends):4d} drives: {shares}")
+    return lines
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Who drives in the foreign room: a policy file, and the controls beside which its figure stands."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.foreign.drive import Pose
+from benchmarks.foreign.room import AHEAD, BEGIN, END, GOAL, WIDTH, Room
+
+CONTROLS = ("planner", "straight", "blank", "frozen")
+"""A planner that knows the truth, straight ahead, and the policy with black images or its first one kept."""
+SPEED, TURN = 0.3, 0.6  # m/s, rad/s
+RADIUS = 0.32
+"""Of the circles that hold the chair in the planner's search [m]."""
+
+
+class Planner:
+    """Follows a path that it searched with the truth: A* over place and heading, then pure pursuit."""
+
+    def __init__(self, room: Room) -> None:
+        x, y, half_x, half_y, yaw = room.carton
+        boxes = [(x, y, half_x, half_y, yaw), *((*thing, 0.0) for thing in room.things)]
+        self.boxes = np.array(boxes)
+        self.path = self._search(room.start)
+
+    def command(self, pose: Pose) -> tuple[float, float]:
+        """v [m/s], omega [rad/s]."""
+        gaps = np.hypot(self.path[:, 0] - pose.x, self.path[:, 1] - pose.y)
+        nearest = int(np.argmin(gaps))
+        ahead = self.path[min(nearest + 3, len(self.path) - 1)]
+        error = math.atan2(ahead[1] - pose.y, ahead[0] - pose.x) - pose.yaw
+        error = math.atan2(math.sin(error), math.cos(error))
+        return SPEED * max(0.0, math.cos(2 * max(-0.78, min(0.78, error)))), max(-TURN, min(TURN, 2.0 * error))
+
+    def _room_left(self, x, y, yaw) -> float:
+        """Least distance [m] of three circles along the chair's body from walls and boxes, less their radius."""
+        left = math.inf
+        for along in (AHEAD - 0.2, AHEAD, AHEAD + 0.2):
+            cx, cy = x + along * math.cos(yaw), y + along * math.sin(yaw)
+            left = min(left, WIDTH / 2 - abs(cy), END - cx, cx - BEGIN)
+            dx, dy = cx - self.boxes[:, 0], cy - self.boxes[:, 1]
+            cos, sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
+            out_x = np.maximum(np.abs(dx * cos + dy * sin) - self.boxes[:, 2], 0.0)
+            out_y = np.maximum(np.abs(dy * cos - dx * sin) - self.boxes[:, 3], 0.0)
+            left = min(left, float(np.hypot(out_x, out_y).min()))
+        return left - RADIUS
+
+    def _search(self, start: tuple[float, float, float]) -> np.ndarray:
+        """(K, 3) poses from the start to the goal's circle, 0.1 m apart."""
+        heap = [(0.0, 0.0, start, None)]
+        came: dict[tuple[int, int, int], Any] = {}
+        while heap:
+            _, cost, pose, before = heapq.heappop(heap)
+            cell = (round(pose[0] / 0.1), round(pose[1] / 0.1), round(pose[2] / 0.15))
+            if cell in came:
+                continue
+            came[cell] = (pose, before)
+            if math.hypot(pose[0] - GOAL[0], pose[1] - GOAL[1]) < 0.9:
+                path = [pose]
+                while before is not None:
+                    pose, before = came[before]
+                    path.append(pose)
+                return np.array(path[::-1])
+            for forward, turn in ((0.1, 0.0), (0.1, 0.15), (0.1, -0.15), (0.0, 0.15), (0.0, -0.15)):
+                yaw = pose[2] + turn
+                after = (pose[0] + forward * math.cos(yaw), pose[1] + forward * math.sin(yaw), yaw)
+                left = self._room_left(*after)
+                if left < 0.02 or abs(yaw) > 1.5:
+                    continue
+                spent = cost + forward + 0.3 * abs(turn) + 0.2 * max(0.0, 0.2 - left) + (0.05 if not forward else 0.0)
+                heapq.heappush(heap, (spent + math.hypot(after[0] - GOAL[0], after[1] - GOAL[1]), spent, after, cell))
+        return np.array([start, (GOAL[0], GOAL[1], 0.0)])
+
+
+class Sighted:
+    """A policy file, with the images as they are, blank, or the first one kept; with its stop for the unknown."""
+
+    def __init__(self, policy: Any, see: str = "policy", stop: bool = False) -> None:
+        self.policy, self.see, self.first = policy, see, None
+        self.stop = stop
+        policy.reset()
+
+    def command(self, image: np.ndarray) -> tuple[float, float]:
+        """v [m/s], omega [rad/s]."""
+        if self.see == "blank":
+            image = np.zeros_like(image)
+        elif self.see == "frozen":
+            self.first = image if self.first is None else self.first
+            image = self.first
+        v, omega = self.policy.step(image)
+        return float(v), float(omega)
+
+
+def load(path: str | Path) -> Any:
+    """The policy of a file."""
+    from bridge.policy import Policy
+
+    return Policy.load(path)

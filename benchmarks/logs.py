@@ -1,0 +1,231 @@
+"""Whether faults of time and frames in driving logs are named, and how long a log of an hour takes.
+
+    python -m benchmarks.logs               # 200 faulty and 200 healthy logs, and an hour of driving
+    python -m benchmarks.logs --parts faults --count 60 --seed 7
+
+Writes benchmarks/results/logs.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import figure, record
+from benchmarks.log_faults import FAULTS, ROOT, Drive, Fault, Robot, healthy
+
+CLAIM = "Faults of time and frames in driving logs are named, healthy logs are not, and an hour of driving is read fast"
+WRONG = re.compile("sign is reversed|check its unit")
+"""What no fault here is."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One log with a fault, and what was said of it."""
+
+    fault: Fault
+    size: int
+    """0 is the largest."""
+    said: tuple[str, ...]
+
+    @property
+    def named(self) -> bool:
+        """Whether the fault is named, and nothing else is said that is not so."""
+        return any(re.search(self.fault.says, one) for one in self.said) and not any(map(WRONG.search, self.said))
+
+
+def write_log(folder: Path, robot: Robot, drives: list[Drive]) -> None:
+    """Write drives of a robot as a dataset."""
+    from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
+
+    headers = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER}
+    write_text(folder / "dataset.toml", 'schema = 1\nvehicle = "a robot"\nwheel_radius = 0.1\n'
+                                        f'track = {robot.track:.3f}\ndrive = "{robot.drive}"\n')
+    for number, drive in enumerate(drives):
+        for name, table in drive.items():
+            write_csv(folder / f"trials/drive_{chr(97 + number)}/{name}.csv", headers[name], table)
+
+
+def said_of_log(robot: Robot, drives: list[Drive]) -> tuple[str, ...]:
+    """What `sysid.inspect` says of a dataset with these drives."""
+    from sysid.logs.coverage import sanity
+    from sysid.logs.log import load_log
+
+    with TemporaryDirectory() as folder:
+        write_log(Path(folder), robot, drives)
+        try:
+            return tuple(sanity(load_log(folder)))
+        except ValueError as error:
+            return (str(error),)
+
+
+def said_of_bag(sent: list[Drive], got: list[Drive]) -> tuple[str, ...]:
+    """What `sysid.convert` says of recordings with the times `sent` in the headers, received at the times `got`."""
+    from sysid.logs.rosbag import Bag, BagStream, clock_notes, in_order, stream_times
+
+    said: list[str] = []
+    for one, other in zip(sent, got, strict=True):
+        streams = {}
+        for name, table in one.items():
+            received = other[name][:, 0] + 1.7e9
+            stamped = np.full(len(table), np.nan) if name == "command" else table[:, 0] + 1.7e9 - 0.01
+            order = np.argsort(received, kind="stable")  # as readers return messages
+            streams[name] = BagStream(f"/{name}", "", received[order], stamped[order], table[order, 1:])
+        bag = Bag(Path("bag"), streams)
+        try:
+            bag = in_order(bag, "receive")
+            stream_times(bag, "receive")
+            said += clock_notes(bag, "receive")
+        except ValueError as error:
+            said.append(str(error))
+    return tuple(said)
+
+
+def run_case(fault: Fault, size: int, seed: int) -> Case:
+    """Make a log with the fault, and ask what is wrong with it."""
+    random = np.random.default_rng(seed)
+    robot = healthy(random, fault.turning, whole=True)
+    faulty = fault.apply(robot.drives, fault.sizes[size], random)
+    return Case(fault, size, said_of_bag(robot.drives, faulty) if fault.receipt else said_of_log(robot, faulty))
+
+
+def fault_figures(count: int, seed: int, verbose: bool) -> dict[str, Any]:
+    """Shares of faults named and of healthy logs that something is said of."""
+    cases = []
+    for number in range(count):
+        fault, size = FAULTS[number % len(FAULTS)], number // len(FAULTS) % 3
+        cases.append(run_case(fault, size, 1000 * seed + number))
+        progress(f"faulty log {number + 1} of {count}")
+        if verbose and (size < 2) != cases[-1].named:
+            print(f"\n{number} {fault.name} at {fault.sizes[size]:g} {fault.unit}: {' | '.join(cases[-1].said)}")
+    false = []
+    for number in range(count):
+        random = np.random.default_rng(1000 * seed + 500 + number + 10**6)
+        robot = healthy(random)
+        drives = robot.drives
+        said = said_of_log(robot, drives)
+        if all("odometry" in drive for drive in drives):
+            said += said_of_bag(drives, [{name: table + np.eye(1, table.shape[1]) * 0.02 for name, table in one.items()}
+                                         for one in drives])
+        false.append(float(bool(said)))
+        progress(f"healthy log {number + 1} of {count}")
+        if verbose and said:
+            print(f"\nhealthy {number}: {' | '.join(said)}")
+    found = {"time_faults_named": figure([float(one.named) for one in cases if one.size < 2], "share"),
+             "time_faults_false": figure(false, "share")}
+    for entry in found.values():
+        entry["value"] = float(np.mean(entry["repeats"]))
+    for fault in FAULTS:
+        for size, value in enumerate(fault.sizes):
+            named = [float(one.named) for one in cases if one.fault is fault and one.size == size]
+            if named:
+                entry = figure(named, "share")
+                found[f"named_{re.sub('[^a-z]+', '_', fault.name)}_{size + 1}"] = {
+                    **entry, "value": float(np.mean(named)), "size": f"{value:g} {fault.unit}"}
+    return found
+
+
+def write_hour(path: Path, seconds: float = 3600.0) -> None:
+    """Write a bag: odometry at 50 Hz and commands at 10 Hz, of drives of 20 s with 5 s of standstill between them."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = {name: store.types[f"{name.split('/')[0]}/msg/{name.split('/')[1]}"] for name in (
+        "std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/Vector3", "geometry_msgs/Twist",
+        "geometry_msgs/Point", "geometry_msgs/Quaternion", "geometry_msgs/Pose", "geometry_msgs/PoseWithCovariance",
+        "geometry_msgs/TwistWithCovariance", "nav_msgs/Odometry")}
+    blank = np.zeros(36)
+
+    def twist(v: float, omega: float) -> Any:
+        return kinds["geometry_msgs/Twist"](linear=kinds["geometry_msgs/Vector3"](x=v, y=0.0, z=0.0),
+                                            angular=kinds["geometry_msgs/Vector3"](x=0.0, y=0.0, z=omega))
+
+    t = np.arange(0.0, seconds, 0.02)
+    going = t % 25.0 > 5.0
+    v, omega = 0.6 * going * np.sin(0.4 * t) ** 2, 0.5 * going * np.sin(0.7 * t)
+    late_v, late_omega = (np.interp(t - 0.2, t, one) for one in (v, omega))
+    yaw = np.cumsum(late_omega) * 0.02
+    x, y = np.cumsum(late_v * np.cos(yaw)) * 0.02, np.cumsum(late_v * np.sin(yaw)) * 0.02
+    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        commands = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=store)
+        odometry = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        for k, now in enumerate(t):
+            stamp = int((1.7e9 + now) * 1e9)
+            if k % 5 == 0:
+                writer.write(commands, stamp, store.serialize_cdr(twist(v[k], omega[k]), "geometry_msgs/msg/Twist"))
+            time_of = kinds["builtin_interfaces/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+            pose = kinds["geometry_msgs/Pose"](
+                position=kinds["geometry_msgs/Point"](x=x[k], y=y[k], z=0.0),
+                orientation=kinds["geometry_msgs/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw[k] / 2), w=np.cos(yaw[k] / 2)))
+            message = kinds["nav_msgs/Odometry"](
+                header=kinds["std_msgs/Header"](stamp=time_of, frame_id="odom"), child_frame_id="base_link",
+                pose=kinds["geometry_msgs/PoseWithCovariance"](pose=pose, covariance=blank),
+                twist=kinds["geometry_msgs/TwistWithCovariance"](twist=twist(late_v[k], late_omega[k]),
+                                                                 covariance=blank))
+            writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+
+
+def hour_figures(repeats: int) -> dict[str, Any]:
+    """Seconds from a bag of an hour to an inspected dataset: both commands, started as a user does."""
+    seconds, cpu = [], []
+    with TemporaryDirectory() as folder:
+        bag = Path(folder) / "hour"
+        write_hour(bag)
+        for number in range(repeats):
+            dataset = Path(folder) / f"dataset_{number}"
+            began, used = time.perf_counter(), _used()
+            for command in (["sysid.convert", str(bag), "--out", str(dataset), "--split", "standstill"],
+                            ["sysid.inspect", str(dataset)]):
+                subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True, cwd=ROOT)
+            seconds.append(time.perf_counter() - began)
+            cpu.append(_used() - used)
+            progress(f"an hour of driving, repeat {number + 1} of {repeats}: {seconds[-1]:.1f} s")
+    return {"bag_hour_s": figure(seconds, "s, convert and inspect"),
+            "bag_hour_cpu_s": figure(cpu, "s of processor time, convert and inspect")}
+
+
+def _used() -> float:
+    """Processor time of the processes that were started and have ended [s]."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def progress(text: str) -> None:
+    """Show how far the work is, on a terminal."""
+    if sys.stderr.isatty():
+        print(f"\r{text}", end="", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.logs", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--parts", nargs="+", default=["faults", "hour"], choices=["faults", "hour"])
+    parser.add_argument("--count", type=int, default=200, help="faulty logs, and healthy ones")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=3, help="of the hour")
+    parser.add_argument("--dry", action="store_true", help="print what goes wrong, record nothing")
+    options = parser.parse_args()
+    figures: dict[str, Any] = {}
+    if "faults" in options.parts:
+        figures |= fault_figures(options.count, options.seed, options.dry)
+    if "hour" in options.parts:
+        figures |= hour_figures(options.repeats)
+    for name, one in figures.items():
+        print(f"{name}: {one['value']:.3g} {one['unit']} {one.get('size', '')}")
+    if not options.dry:
+        print(record("logs", CLAIM, figures))
+
+
+if __name__ == "__main__":
+    main()

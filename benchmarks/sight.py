@@ -1,0 +1,148 @@
+"""Sight that transfers: `python -m benchmarks.sight`. Figures of rich looks and of the foreign corridor.
+
+Parts: "frames" times images with rich looks, "steps" control steps of an environment that shows them, "foreign" gathers
+what `python -m benchmarks.foreign --out FILE` wrote (`--drives FILE ...`), "training" the time of trainings
+(`--runs NAME=FOLDER ...`).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from benchmarks.harness import figure, record, time_calls
+from whill_mjx.batch import BatchEnv, make_batch
+from whill_mjx.env import RICH, Env, State, make_env, reset_state
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.world.render import pinhole, render
+from whill_mjx.world.render.pallas import render_pallas
+
+CLAIM = "A policy trained with rich looks drives where nobody trained: another simulator, renderer and furniture"
+DIFFERENT = 64
+"""Worlds drawn; more are copies of these."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the benchmark."""
+
+    parts: tuple[str, ...] = ("frames", "steps")
+    """Parts to measure: frames, steps, foreign."""
+    worlds: int = 0
+    """Worlds per call; 0 takes 16,384 on an accelerator and 64 on a CPU."""
+    repeats: int = 5
+    """Timed repeats."""
+    drives: tuple[Path, ...] = ()
+    """Files that `benchmarks.foreign` wrote."""
+    device: str = ""
+    """Device on which those drives ran."""
+
+
+def many_states(env: Env, params: Any, worlds: int) -> State:
+    """States at the start of `worlds` episodes, of DIFFERENT worlds."""
+    keys = jax.random.split(jax.random.key(0), min(DIFFERENT, worlds))
+    states = jax.jit(jax.vmap(lambda key: reset_state(env, params, key)))(keys)
+    copies = -(-worlds // keys.shape[0])
+    return jax.tree.map(lambda leaf: jnp.tile(leaf, (copies, *[1] * (leaf.ndim - 1)))[:worlds], states)
+
+
+def frames(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
+    """Images per second, by the jnp renderer and, on NVIDIA GPUs, by the kernel."""
+    env, params = make_env("corridor", looks="rich")
+    states = many_states(env, params, worlds)
+    lens = pinhole(env.model.spec.camera.fov_y)
+
+    def picture(draw):
+        return lambda state: draw(*camera_pose(env.model, state.vehicle.qpos), lens, state.scene, quality=RICH)
+
+    ways = {"rich_jnp_frames_per_s": render}
+    if jax.devices()[0].platform == "gpu":
+        ways = {"rich_frames_per_s": render_pallas, **ways}
+    found = {}
+    for name, draw in ways.items():
+        try:
+            call = jax.jit(jax.vmap(picture(draw)))
+            seconds = time_calls(partial(call, states), options.repeats)
+        except Exception as error:
+            print(f"{name}: {type(error).__name__}: {str(error)[:300]}")
+            continue
+        found[name] = figure([worlds / one for one in seconds], "frames/s, 64x64 RGB")
+        print(f"{name}: {found[name]['value']:.3g}")
+    return found
+
+
+def _ten_steps(batch: BatchEnv, actions: jax.Array, state: Any) -> tuple[Any, jax.Array]:
+    """The state after ten steps, and a number of every image, so that none is left out."""
+
+    def one(state, _):
+        state, step = batch.step(state, actions)
+        return state, jnp.sum(step.obs.astype(jnp.int32))
+
+    return jax.lax.scan(one, state, None, length=10)
+
+
+def steps(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
+    """Control steps per second, images included."""
+    found = {}
+    for looks in ("rich", "paper"):
+        env, params = make_env("corridor", looks=looks)
+        batch = make_batch(env, params, worlds)
+        state, _ = jax.jit(batch.reset)(jax.random.key(0))
+        actions = jnp.zeros((worlds, 2))
+
+        ten = jax.jit(partial(_ten_steps, batch, actions))
+        seconds = time_calls(partial(ten, state), options.repeats)
+        name = f"{looks}_control_steps_per_s"
+        found[name] = figure([10 * worlds / one for one in seconds], "1/s")
+        print(f"{name}: {found[name]['value']:.3g}")
+    return found
+
+
+def foreign(options: Options) -> dict[str, dict[str, Any]]:
+    """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians."""
+    drives = [one for path in options.drives for one in json.loads(path.read_text())["drives"]]
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for one in drives:
+        groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
+    found: dict[str, dict[str, Any]] = {}
+    medians: dict[tuple[str, str], list[float]] = {}
+    for (policy, driver, variant), ends in sorted(groups.items()):
+        for end in ("arrived", "collided"):
+            share = ends.count(end) / len(ends)
+            name = "_".join(["foreign", policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
+            found[name] = {"value": share, "unit": "share", "device": options.device, "drives": len(ends)}
+            if policy.startswith("transfer") and driver == "policy":
+                medians.setdefault((variant, end), []).append(share)
+    for (variant, end), shares in medians.items():
+        if end == "arrived":
+            found[f"foreign_{variant}"] = figure(shares, "share", options.device)
+    worst = [medians[key] for key in medians if key[1] == "collided"]
+    if worst:
+        found["foreign_collided_worst"] = figure(max(worst, key=lambda shares: float(np.median(shares))), "share",
+                                                 options.device)  # fmt: skip
+    return found
+
+
+def main(options: Options) -> None:
+    """Measure the parts, print and record."""
+    worlds = options.worlds or (64 if jax.devices()[0].platform == "cpu" else 16_384)
+    found: dict[str, dict[str, Any]] = {}
+    if "frames" in options.parts:
+        found |= frames(options, worlds)
+    if "steps" in options.parts:
+        found |= steps(options, worlds)
+    if "foreign" in options.parts:
+        found |= foreign(options)
+    record("sight", CLAIM, found)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

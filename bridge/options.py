@@ -1,0 +1,58 @@
+"""Command lines of this package: a mistake ends with one line and exit code 2, and numbers have ranges."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+
+class Parser(argparse.ArgumentParser):
+    """An `argparse.ArgumentParser` whose complaint is one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong and end with code 2."""
+        print(f"{self.prog}: {' '.join(message.split()).rstrip('.')}. See --help.", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def in_range(
+    low: float = -math.inf, high: float = math.inf, kind: type[int] | type[float] = float, infinite: bool = False
+) -> Callable[[str], float]:
+    """A type for `add_argument`: a number from `low` to `high`, finite unless `infinite` is set.
+
+    Args:
+        kind: int for whole numbers.
+    """
+
+    def read(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {'whole ' if kind is int else ''}number") from None
+        if not low <= value <= high or not (infinite or math.isfinite(value)):
+            ends = [("at least", low), ("at most", high)]
+            rule = " and ".join(f"{word} {end:g}" for word, end in ends if math.isfinite(end))
+            raise argparse.ArgumentTypeError(f"{text} must be {rule or 'finite'}")
+        return value
+
+    return read
+
+
+def result_file(text: str) -> Path:
+    """A type for `add_argument`: a file that is written in the end, in a folder that exists."""
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} is a folder. Give the name of a file")
+    if not os.access(path.absolute().parent, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"{text}: its folder is missing or cannot be written. Choose another place")
+    return path
+
+
+def whole(low: int = 1, high: int = 1_000_000_000) -> Callable[[str], float]:
+    """A type for `add_argument`: a whole number from `low` to `high`."""
+    return in_range(low, high, int)

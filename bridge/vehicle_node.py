@@ -1,0 +1,259 @@
+"""What every node that commands the vehicle shares: command topic, guard, stops from outside, arming and status.
+
+A controller decides (`Decider`); the node carries its commands to the base and everything that may stop the vehicle to
+its supervisor. A 100 Hz watch stops the vehicle within 10 ms of any limit.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+from typing import Any, Protocol
+
+from bridge import inputs, ros
+from bridge.bases import BASES
+from bridge.commands import CommandTopic, Ear, Endpoint
+from bridge.guard import BEAT_PERIOD, GuardLink
+from bridge.options import in_range, whole
+from bridge.safety import Command, State, Supervisor
+from bridge.whill import ChairGate, ChairState
+
+WATCH_PERIOD = 0.01
+LOOK_PERIOD = 0.2
+"""Seconds between two looks at the graph."""
+STATUS_PERIOD = 1.0
+CLOCK_STEP = 0.1
+"""Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
+NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
+NOT_ACTIVE = "not activated"
+GUARD_STOPPED = "the guard stopped the vehicle"
+
+
+class Decider(Protocol):
+    """What decides on the commands; pure, with injected time."""
+
+    @property
+    def supervisor(self) -> Supervisor:
+        """The safety state of the drive."""
+
+    def on_tick(self, now: float) -> Command | None:
+        """Return a command where one is due at this steady time [s]."""
+
+    def farewell(self) -> bool:
+        """Return whether the vehicle needs zeros before the node ends."""
+
+
+class VehicleNode:
+    """Connects one decider to the ROS graph."""
+
+    def __init__(self, node: Any, decider: Decider, options: argparse.Namespace) -> None:
+        """Join the graph; call `start` when the rest of the node is made. `options` has those of `add_options`."""
+        from std_msgs.msg import Empty, String
+
+        self.node, self.decider, self.options = node, decider, options
+        self.supervisor = decider.supervisor
+        self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
+        self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
+                               self._start_guard if options.guard == "own" else None)
+        self._inputs = inputs.SafetyInputs(self.supervisor, options)
+        self._ear = Ear()
+        self._string = String
+        self._status = node.create_publisher(String, ros.STATUS_TOPIC, ros.reliable())
+        self._heartbeat = node.create_publisher(String, ros.HEARTBEAT_TOPIC, ros.reliable())
+        self._said_driving = False
+        self._started = time.monotonic()
+        self._looked = self._said = -math.inf
+        self._clock_offset = time.time() - self._started
+        self._reported: tuple[str, ...] = ()
+        self._commanders: list[str] = []
+        self._listeners: list[Endpoint] = []
+        self._guard_stops = 0
+        node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
+        ros.subscribe_own(node, String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
+        self._inputs.subscribe(node, self._on_input)
+        self._chair = ChairGate(self.supervisor) if options.whill_state else None
+        if self._chair is not None:
+            node.create_subscription(ros.chair_state_type(), options.whill_state, self._on_chair, ros.best_effort(10))
+        self._jump = self._watch_clock()
+        self._diagnose = ros.diagnostics(node)
+
+    def start(self) -> None:
+        """Begin to watch; the vehicle stands until its base was found."""
+        self.supervisor.block(NO_BASE, True)
+        self._on_watch()
+        ros.steady_timer(self.node, WATCH_PERIOD, self._on_watch)
+        ros.steady_timer(self.node, BEAT_PERIOD, self._on_beat)
+
+    def causes(self) -> list[str]:
+        """Return what is wrong now, each with its remedy."""
+        return []
+
+    def has_time(self, now: float) -> bool:
+        """Return whether looking at the graph would delay nothing now."""
+        return True
+
+    def details(self) -> dict[str, Any]:
+        """Return what the status says beyond what all nodes say."""
+        return {}
+
+    def close(self) -> None:
+        """Leave the vehicle standing, the base to its rider, and no guard behind."""
+        stop = self.decider.farewell()
+        self._beat(driving=False)
+        if stop:
+            self.commands.publish_stops()
+        self.guard.close()
+
+    def _on_active_change(self, active: bool) -> None:
+        self.supervisor.block(NOT_ACTIVE, not active)
+        self._publish(self.decider.on_tick(time.monotonic()))
+
+    def _watch_clock(self) -> Any:
+        """Report jumps of the node's clock to the supervisor."""
+        from rclpy.clock import JumpThreshold
+        from rclpy.duration import Duration
+
+        jump = JumpThreshold(min_forward=Duration(seconds=0.5), min_backward=Duration(seconds=-0.01),
+                             on_clock_change=True)
+        return self.node.get_clock().create_jump_callback(jump, post_callback=lambda _: self.supervisor.clock_jump())
+
+    def _start_guard(self) -> Any:
+        """Start a guard that outlives this process, its terminal included, by some seconds."""
+        arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
+                     "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
+        return subprocess.Popen([sys.executable, "-m", "bridge.guard", *arguments, "--ros-args", "-r",
+                                 f"__ns:={self.node.get_namespace()}"], start_new_session=True,
+                                cwd=Path(__file__).resolve().parents[1])  # so that -m finds this very package
+
+    def _on_watch(self) -> None:
+        now = time.monotonic()
+        offset = time.time() - now
+        if abs(offset - self._clock_offset) > CLOCK_STEP:
+            self.supervisor.clock_jump()
+        self._clock_offset = offset
+        self._inputs.watch(now)
+        if self._chair is not None:
+            self._chair.watch(now)
+        self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
+        if self._ear.foreign_zero():
+            self.supervisor.foreign_command(now)
+        self._publish(self.decider.on_tick(now))
+        if self.has_time(now):
+            self._keep_house(now)
+
+    def _keep_house(self, now: float) -> None:
+        """Look at the graph and report, where it is time."""
+        if now - self._looked >= LOOK_PERIOD:
+            self._looked = now
+            self._on_look()
+        elif now - self._said >= STATUS_PERIOD:
+            self._on_status()
+
+    def _on_command(self, v: float, omega: float) -> None:
+        if self._ear.heard(v, omega):
+            self.supervisor.foreign_command(time.monotonic())
+
+    def _on_guard(self, message: Any) -> None:
+        now = time.monotonic()
+        self.guard.heard(now, message.data)
+        self._ear.guard_reports(self.guard.zeros)
+        if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
+            self.supervisor.fault(GUARD_STOPPED)
+        self._guard_stops = self.guard.stops
+
+    def _on_input(self, now: float) -> None:
+        self._publish(self.decider.on_tick(now))
+
+    def _on_chair(self, state: Any) -> None:
+        now = time.monotonic()
+        if self._chair is not None:
+            self._chair.take(now, ChairState.of(state))
+        self._publish(self.decider.on_tick(now))
+
+    def _on_rearm(self, _: Any) -> None:
+        if not self.supervisor.arm():
+            why = ", ".join(self.supervisor.holds) or self.supervisor.reason
+            self.node.get_logger().error(f"not armed: {why} still holds")
+
+    def _on_beat(self) -> None:
+        self._beat(self.supervisor.may_drive)
+
+    def _beat(self, driving: bool) -> None:
+        self._said_driving = driving
+        beat = {"session": self.guard.session, "driving": driving}
+        self._heartbeat.publish(self._string(data=json.dumps(beat)))
+
+    def _on_look(self) -> None:
+        """Look at the graph: who listens, who else commands; keep the guard running."""
+        self.guard.keep(time.monotonic())
+        self.commands.look()
+        self._listeners = self.commands.listeners()
+        fitting = [end for end in self._listeners if end.type.endswith("/" + self.commands.kind)]
+        self.supervisor.block(NO_BASE, not (self.commands.kind and fitting))
+        before, self._commanders = self._commanders, self.commands.commanders()
+        # seen twice: at first a node's name, the guard's too, is not known yet
+        others = bool(before and self._commanders) and not self.options.allow_other_commanders
+        self.supervisor.block(COMMANDERS, others)
+        if (self.supervisor.state.value, self.supervisor.reason) != self._reported[:2]:
+            self._on_status()
+
+    def _on_status(self) -> None:
+        self._said = time.monotonic()
+        supervisor = self.supervisor
+        state, reason, found = supervisor.state, supervisor.reason, self.causes()
+        status: dict[str, Any] = {"state": state.value, "driving": state is State.DRIVING, "reason": reason,
+                                  "holds": supervisor.holds, "causes": found, "counts": dict(supervisor.counts),
+                                  **self.details()}
+        self._status.publish(self._string(data=json.dumps(status)))
+        text = ". ".join([f"{state.value}: {reason}" if reason else state.value, *found])
+        self._diagnose(state is State.DRIVING and not found, text, status["counts"])
+        report = (state.value, reason, *found)
+        if report != self._reported:
+            log = self.node.get_logger()
+            log.warning(text) if reason or found else log.info(text)
+        self._reported = report
+
+    def _publish(self, command: Command | None) -> None:
+        if command is not None:
+            if self.supervisor.may_drive and not self._said_driving:
+                self._on_beat()  # before the first motion: if this process dies now, the guard must know of it
+            self._ear.sent(command.v, command.omega)
+            self.commands.publish(command.v, command.omega)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the base, the command topic, the guard and the stops from outside."""
+    parser.add_argument("--base", choices=sorted(BASES), default="whill",
+                        help="what is below the command topic: its range, and whether it needs zeros held after a stop")
+    parser.add_argument("--whill-state", default="", metavar="TOPIC",
+                        help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
+                             f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
+    parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
+                        help="[m/s]; default: those of policy and base")
+    parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
+    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
+                        help="auto: as the base listens")
+    parser.add_argument("--guard", choices=("own", "other"), default="own",
+                        help="own: start a guard process; other: wait for one, such as a guard of another computer")
+    parser.add_argument("--allow-other-commanders", action="store_true",
+                        help="drive although another node could send commands; when it does, it drives")
+    parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
+                        help="SCHED_FIFO priority, like 20")
+    inputs.add_options(parser)
+
+
+def limits(low: tuple[float, float], high: tuple[float, float], options: argparse.Namespace
+           ) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the smallest and largest command: these, narrowed by base and command line, zero always included."""
+    base = BASES[options.base]
+    lows = [max(min(a, 0.0), b) for a, b in zip(low, base.low, strict=True)]
+    highs = [min(max(a, 0.0), b) for a, b in zip(high, base.high, strict=True)]
+    for i, narrower in enumerate((options.v_limits, options.omega_limits)):
+        if narrower:
+            lows[i], highs[i] = max(lows[i], narrower[0]), min(highs[i], narrower[1])
+    return (lows[0], lows[1]), (highs[0], highs[1])

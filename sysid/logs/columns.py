@@ -1,0 +1,387 @@
+"""What the columns of somebody else's CSV files hold: stream, quantity and unit, by their names and by their numbers.
+
+A role is STREAM.QUANTITY, such as command.v or ground_truth.yaw; "time" is that of all streams of a file. Names are
+those of ROS exports (`pose.pose.position.x`), of plotting programs (`/odom/twist/twist/linear/x`) and of people
+(`cmd_v [km/h]`). A unit comes from the name where it is there, else from the numbers: a speed must be the rate of its
+pose, a measured speed must be about the commanded one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+STREAMS = ("command", "odometry", "ground_truth", "wheels")
+QUANTITIES = {
+    "command": ("v", "omega", "left", "right"), "odometry": ("x", "y", "yaw", "qx", "qy", "qz", "qw", "v", "omega"),
+    "ground_truth": ("x", "y", "yaw", "qx", "qy", "qz", "qw"),
+    "wheels": ("left", "right", "left_angle", "right_angle"),
+}
+ROLES = ("time", *(f"{stream}.{one}" for stream in STREAMS for one in QUANTITIES[stream]))
+UNITS = {  # kind -> unit -> SI
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "in": 0.0254},
+    "angle": {"rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "rev": 2 * np.pi},
+    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mm/s": 1e-3, "cm/s": 1e-2, "mph": 0.44704, "ft/s": 0.3048},
+    "rate": {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3, "rpm": 2 * np.pi / 60},
+    "none": {"-": 1.0},
+}
+SPELLED = {
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
+    "usec": "us", "micros": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns", "nanos": "ns",
+    "degree": "deg", "degrees": "deg", "radians": "rad", "radian": "rad", "mps": "m/s", "ms-1": "m/s", "kmh": "km/h",
+    "kph": "km/h", "kmph": "km/h", "mmps": "mm/s", "cmps": "cm/s", "radps": "rad/s", "rads": "rad/s", "dps": "deg/s",
+    "degps": "deg/s", "degs": "deg/s", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "m s": "m/s",
+    "km h": "km/h", "mm s": "mm/s", "cm s": "cm/s", "rad s": "rad/s", "deg s": "deg/s", "°": "deg", "°/s": "deg/s",
+}
+STREAM_WORDS = {
+    "command": ("cmd", "command", "commands", "commanded", "desired", "des", "ref", "reference", "setpoint", "target",
+                "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested"),
+    "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc",
+                 "fb", "reported"),
+    "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
+                     "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
+}
+QUANTITY_WORDS = {
+    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi"), "qx": ("qx",), "qy": ("qy",), "qz": ("qz",),
+    "qw": ("qw",), "omega": ("omega", "yawrate", "w", "wz", "angular", "ang", "turnrate", "rot", "gyro", "gyroz",
+                             "angularvel", "angvel", "turn"),
+    "v": ("v", "vx", "speed", "velocity", "linear", "lin", "vel", "forward", "linvel", "linearvel", "throttle"),
+    "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
+}
+TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime")
+NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
+              "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
+ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
+NEAR = 0.02  # of any unit from 0, at which an odometry begins
+
+
+@dataclass(frozen=True)
+class Column:
+    """What one column holds."""
+
+    role: str
+    file: str
+    """Stem of the file."""
+    name: str
+    unit: str
+    why: str
+    """How role and unit were found; empty where somebody said so."""
+    sure: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.role}={self.file}/{self.name}:{self.unit}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """One text file of numbers; nan where a cell is empty."""
+
+    stem: str
+    columns: dict[str, np.ndarray]  # name -> (T,)
+
+
+def kind_of(role: str) -> str:
+    """What a role measures: a key of UNITS."""
+    quantity = role.rpartition(".")[2]
+    if quantity in ("qx", "qy", "qz", "qw"):
+        return "none"
+    return {"time": "time", "x": "length", "y": "length", "yaw": "angle", "v": "speed", "left": "rate", "right": "rate",
+            "left_angle": "angle", "right_angle": "angle"}.get(quantity, "rate")
+
+
+def read_decision(text: str, tables: Sequence[Table]) -> Column:
+    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it.
+
+    Raises:
+        ValueError: naming the text, the rule and the remedy.
+    """
+    role, equals, rest = text.partition("=")
+    role, rest = role.strip(), rest.strip()
+    if not equals or role not in ROLES:
+        raise ValueError(f"--columns {text}: must be ROLE=COLUMN:UNIT, with a role of {', '.join(ROLES)}.")
+    for table in tables:
+        for name in sorted(table.columns, key=len, reverse=True):
+            for written in (f"{table.stem}/{name}", name):
+                unit = rest[len(written) :].strip()
+                if rest.startswith(written) and (not unit or unit.startswith(":")):
+                    kind = UNITS["speed"] | UNITS["rate"] if role in ("wheels.left", "wheels.right", "command.left",
+                                                                      "command.right") else UNITS[kind_of(role)]
+                    unit = _unit(unit[1:].strip()) if unit else ""
+                    if unit and unit not in kind:
+                        raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {', '.join(kind)}).")
+                    return Column(role, table.stem, name, unit or next(iter(kind)), "", True)
+    known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
+    raise ValueError(f"--columns {text}: no such column (found {known[:400]}). Correct its name.")
+
+
+def guess(tables: Sequence[Table], said: Sequence[Column] = ()) -> list[Column]:
+    """What the columns of the files of one drive hold, as far as names and numbers show it.
+
+    Args:
+        said: what is known already; it is kept.
+    """
+    found = list(said)
+    taken = {(one.file, one.name) for one in said}
+    for table in tables:
+        roles = {one.role for one in found if one.role != "time"}
+        candidates = [column for name in table.columns if (table.stem, name) not in taken
+                      and (column := _by_name(table, name)) is not None]
+        for column in sorted(candidates, key=lambda one: not one.sure):
+            rival = column.role == "time" and any(one.role == "time" and one.file == table.stem for one in found)
+            if not rival and column.role not in roles:
+                found.append(column)
+                roles.add(column.role if column.role != "time" else "")
+    arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
+    found = _origin_counts(found, arrays)
+    found = [one if one.why == "" else _time_unit(one, arrays[one.file, one.name]) if one.role == "time" else one
+             for one in found]
+    return _units_by_numbers(found, arrays)
+
+
+def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
+    """Poses of which no name says whether they are odometry's are so where they begin at the origin, as odometry does;
+    elsewhere nobody can know."""
+    roles = {one.role for one in found}
+    words = set(STREAM_WORDS["odometry"])
+    nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw") and one.why
+                and not _stream_said(one.name, "odometry") and not set(_words(one.file)) & words]
+    if not nameless or {"odometry.v", "odometry.omega"} & roles:
+        return found
+    starts = [arrays[one.file, one.name] for one in nameless]
+    away = any(abs(known[0]) > NEAR for values in starts if len(known := values[np.isfinite(values)]))
+    return [replace(one, sure=not away) if one in nameless else one for one in found]
+
+
+def _by_name(table: Table, name: str) -> Column | None:
+    """Role and unit of a column by its name and its file's."""
+    plain, unit = _split_unit(name)
+    words = _words(plain)
+    joined = "".join(words)
+    turns = re.search(r"(angular|gyro|rate|orientation|quat\w*|rotation)z$", joined)
+    if not words or NOT_PLANAR & set(words[-2:]) and not turns:
+        return None
+    stamp_part = words[-1] in ("secs", "sec", "nsecs", "nsec", "nanosec")
+    if (set(words) & set(TIME_WORDS) and not set(words[-1:]) & {"x", "y", "z", "w"} or stamp_part
+            or words == ["rosbagtimestamp"]):
+        if words[-1] in ("nsecs", "nsec", "nanosec") and "+" not in name and {"header", "stamp"} & set(words):
+            return None  # the rest of a second; joined with secs when read
+        return Column("time", table.stem, name, unit, "its name")
+    told = {one for known in STREAM_WORDS.values() for one in known}
+    quantity = _quantity([word for word in words if word not in told] or words)
+    if quantity is None:
+        return None
+    stream, sure = _stream(words, _words(table.stem), quantity, table)
+    if stream is None or quantity not in QUANTITIES[stream]:
+        return None
+    return Column(f"{stream}.{quantity}", table.stem, name, unit, "its name", sure)
+
+
+def _quantity(words: list[str]) -> str | None:
+    text = " ".join(words)
+    sides = {"left": {"left", "l", "lw", "wl"}, "right": {"right", "r", "rw", "wr"}}
+    side = next((one for one, known in sides.items() if known & set(words)), "")
+    if side and re.search(r"^\w+$|wheel|motor|joint|\bw\b|vel|speed|rpm|enc|angle|pos|\blw\b|\brw\b|omega|cmd", text):
+        angle = re.search(r"angle|pos|position|enc(oder)?$|ticks", text) and not re.search(r"vel|speed|rpm", text)
+        return f"{side}_angle" if angle else side
+    last = words[-1]
+    if re.search(r"(orientation|quat\w*|rotation|^q) [wxyz]$", text):
+        return f"q{last}"
+    if last in "xyz" and re.search(r"angular|gyro|rate|^w |omega", text):
+        return "omega" if last == "z" else None
+    if last in "xyz" and re.search(r"linear|vel|speed|twist", text):
+        return "v" if last == "x" else None
+    joined = "".join(words)
+    for quantity, known in QUANTITY_WORDS.items():
+        if last in known or joined in known or any(joined.endswith(one) for one in known if len(one) > 4):
+            rate = quantity in ("yaw", "v") and re.search(r"yaw ?rate|yaw (vel|speed|rate)|ang", text)
+            return "omega" if rate else quantity
+    for quantity, known in QUANTITY_WORDS.items():
+        if set(words) & {one for one in known if len(one) > 1}:
+            return quantity
+    if last in ("vel", "rate") and "yaw" in words:
+        return "omega"
+    return None
+
+
+def _stream(words: list[str], file: list[str], quantity: str, table: Table) -> tuple[str | None, bool]:
+    """Stream of a quantity, and whether its name or its file's says so."""
+    wheel = quantity in QUANTITIES["wheels"]
+    for place in (words, file):
+        for stream, known in STREAM_WORDS.items():
+            if set(place) & set(known):
+                if wheel:
+                    return ("command" if stream == "command" and not quantity.endswith("angle") else "wheels"), True
+                return stream, True
+        text = " ".join(place)
+        if "twist twist" in text or "pose pose" in text:
+            return "odometry", True
+        if "cmd" in "".join(place):
+            return "command", True
+    if wheel:
+        return "wheels", True
+    if quantity in ("qx", "qy", "qz", "qw") or quantity in ("x", "y", "yaw") and {"pose", "position"} & set(words):
+        return "ground_truth", False
+    if {"linear", "angular"} & set(words):
+        return "command", False  # a Twist by itself
+    return "odometry", any(_stream_said(name, "command") for name in table.columns)
+
+
+def _stream_said(name: str, stream: str) -> bool:
+    return bool(set(_words(_split_unit(name)[0])) & set(STREAM_WORDS[stream]))
+
+
+def _words(name: str) -> list[str]:
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
+    return [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word and word not in ("field", "data", "msg")]
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """Name without its unit, and the unit; empty where none is written."""
+    if match := re.search(r"[\[(<]\s*([^\])>]+)\s*[\])>]\s*$", name):
+        return name[: match.start()], _unit(match[1])
+    if match := re.search(r"[_ .]((?:k?m|mm|cm|rad|deg)[_ ]?(?:p|per|/)[_ ]?(?:s|h|sec)|kmh|kph|mps|mmps|rpm|degrees|"
+                          r"radians|degs|dps|rads|deg|rad|mm|cm|ms|us|ns|msec|usec|nanos|millis|secs|sec|seconds)$",
+                          name, re.IGNORECASE):
+        unit = re.sub(r"[_ ]?(p|per|/)[_ ]?", "/", match[1].lower()) if re.search(r"p|/", match[1].lower()) and \
+            match[1].lower() not in SPELLED and match[1].lower() != "rpm" else match[1]
+        return name[: match.start()], _unit(unit.replace("/sec", "/s"))
+    return name, ""
+
+
+def _unit(text: str) -> str:
+    text = text.strip().lower().replace("²", "2")
+    return SPELLED.get(text, text)
+
+
+def _time_unit(column: Column, values: np.ndarray) -> Column:
+    if column.unit in UNITS["time"] and not (column.unit == "s" and np.nanmedian(np.abs(values)) > 1e11):
+        return column
+    known = values[np.isfinite(values)]
+    step = float(np.median(np.diff(np.unique(known)))) if len(known) > 2 else 1.0
+    first = float(np.abs(known[0])) if len(known) else 0.0
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):  # since 1970
+        if first > least:
+            return replace(column, unit=unit, why="it counts since 1970")
+    for unit, longest in (("s", 4.0), ("ms", 4e3), ("us", 4e6)):
+        if step < longest:
+            return replace(column, unit=unit, why=f"it steps by {step:.3g}")
+    return replace(column, unit="ns", why=f"it steps by {step:.3g}")
+
+
+def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
+    """Columns with the units that their numbers agree with, in the order in which one shows the next."""
+    clocks = {one.file: one for one in found if one.role == "time"}
+    headings: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    known: dict[str, Column] = {one.role: one for one in found if one.role != "time"}
+
+    def signal(role: str) -> tuple[np.ndarray, np.ndarray] | None:
+        one = known.get(role)
+        if one is None or one.file not in clocks or one.unit not in UNITS[kind_of(role)]:
+            return None
+        clock = clocks[one.file]
+        t = arrays[clock.file, clock.name] * UNITS["time"][clock.unit]
+        values = arrays[one.file, one.name] * UNITS[kind_of(role)][one.unit]
+        good = np.isfinite(t) & np.isfinite(values)
+        return (t[good], values[good]) if good.sum() > 20 else None
+
+    def raw(role: str) -> tuple[np.ndarray, np.ndarray] | None:
+        one = known.get(role)
+        if one is None:
+            return None
+        kept = one.unit
+        known[role] = replace(one, unit=next(iter(UNITS[kind_of(role)])))
+        answer = signal(role)
+        known[role] = replace(one, unit=kept)
+        return answer
+
+    def settle(role: str, reference: tuple[np.ndarray, np.ndarray] | None, why: str, loose: float = ALIKE) -> None:
+        one, mine = known.get(role), raw(role)
+        if one is None or one.unit in UNITS[kind_of(role)] or mine is None:
+            return
+        unit = _size_of(mine, reference, UNITS[kind_of(role)], loose)
+        if unit is not None:
+            known[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
+
+    for stream in ("ground_truth", "odometry"):  # angles by their wrap or their range
+        role = f"{stream}.yaw"
+        if (one := known.get(role)) and one.unit not in UNITS["angle"] and (mine := raw(role)):
+            known[role] = replace(one, unit="deg" if np.ptp(mine[1]) > 30 else "rad", why=f"{one.why}; its range")
+        for axis in ("x", "y"):
+            if (one := known.get(f"{stream}.{axis}")) and one.unit not in UNITS["length"] and (mine := raw(one.role)):
+                speed = np.nanmax(np.abs(_rate(*mine)[1])) if len(mine[0]) > 20 else 0.0
+                known[one.role] = replace(one, unit="mm" if speed > 50 else "m", why=f"{one.why}; its rate",
+                                          sure=one.sure)
+        for quantity in ("qx", "qy", "qz", "qw"):
+            if one := known.get(f"{stream}.{quantity}"):
+                known[one.role] = replace(one, unit="-")
+    for stream in ("ground_truth", "odometry"):
+        parts = [signal(f"{stream}.{one}") for one in ("qw", "qx", "qy", "qz")]
+        if all(part is not None for part in parts) and len({len(part[0]) for part in parts if part}) == 1:
+            w, x, y, z = (part[1] for part in parts if part)
+            t = next(part[0] for part in parts if part)
+            headings[stream] = t, np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+        elif yaw := signal(f"{stream}.yaw"):
+            headings[stream] = yaw[0], np.unwrap(yaw[1])
+    ways = {stream: _way(signal(f"{stream}.x"), signal(f"{stream}.y")) for stream in ("odometry", "ground_truth")}
+    turns = {stream: _rate(*headings[stream]) if stream in headings else None
+             for stream in ("odometry", "ground_truth")}
+    settle("odometry.v", _first(ways["odometry"], ways["ground_truth"]), "as the pose moves")
+    settle("odometry.omega", _first(turns["odometry"], turns["ground_truth"]), "as the pose turns")
+    for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
+        measured = _first(signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
+        settle(f"command.{role}", measured, why, 0.5)
+    settled = []
+    for one in found:
+        one = known.get(one.role, one) if one.role != "time" else one
+        wheel = one.role.rpartition(".")[2] in ("left", "right")
+        kind = UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(one.role)]
+        if one.unit not in kind:  # nothing shows it: SI, if that is at all possible
+            values = arrays[one.file, one.name]
+            usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
+            largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
+            first = next(iter(UNITS[kind_of(one.role)]))
+            one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest)
+        settled.append(one)
+    return settled
+
+
+def _first(*signals: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:
+    return next((one for one in signals if one is not None), None)
+
+
+def _size_of(
+    mine: tuple[np.ndarray, np.ndarray], reference: tuple[np.ndarray, np.ndarray] | None, units: Mapping[str, float],
+    loose: float,
+) -> str | None:
+    """The unit in which a signal is as large as a reference; None where they are not alike or no unit fits."""
+    if reference is None:
+        return None
+    t = np.arange(max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]), 0.05)
+    if len(t) < 40:
+        return None
+    ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
+    if max(ours.max(), theirs.max()) < 1e-6 or ours.max() < 1e-9 or theirs.max() < 1e-3:
+        return None
+    ratio = float(np.percentile(theirs, 90) / max(np.percentile(ours, 90), 1e-12))
+    unit = min(units, key=lambda one: abs(np.log(ratio / units[one])))
+    return unit if abs(np.log(ratio / units[unit])) < np.log(1 + loose) + 0.05 else None
+
+
+def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rate of a signal (T,) over 0.2 s, at 20 Hz."""
+    grid = np.arange(t[0] + 0.1, t[-1] - 0.1, 0.05)
+    if len(grid) < 2:
+        return t[:1], np.zeros(1)
+    return grid, (np.interp(grid + 0.1, t, values) - np.interp(grid - 0.1, t, values)) / 0.2
+
+
+def _way(x: tuple[np.ndarray, np.ndarray] | None, y: tuple[np.ndarray, np.ndarray] | None
+         ) -> tuple[np.ndarray, np.ndarray] | None:
+    if x is None or y is None or len(x[0]) != len(y[0]):
+        return None
+    (t, vx), (_, vy) = _rate(*x), _rate(*y)
+    return t, np.hypot(vx, vy)

@@ -1,0 +1,344 @@
+"""Drives out of somebody else's CSV and TUM files: which columns they have, joined by time, in SI units."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision
+from whill_mjx.io.reading import CSV_BYTES, read_text
+
+SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
+TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+LEAST = 10  # rows of a stream
+DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+NAMED = 12  # columns that an error lists
+
+
+@dataclass(frozen=True)
+class TextDrive:
+    """One drive out of text files."""
+
+    name: str
+    tables: dict[str, np.ndarray]
+    """"command", "odometry", "ground_truth": t [s] and the columns of docs/log_format.md."""
+    columns: tuple[Column, ...]
+    notes: tuple[str, ...]
+    measured_input: bool
+    """Whether the commands are measured wheel speeds."""
+
+
+def text_files(source: Path) -> list[list[Path]]:
+    """The text files of each drive at a path: a file, a folder of them, or a folder of such folders."""
+    if source.is_file():
+        return [[source]] if source.suffix.lower() in SUFFIXES else []
+    files = _texts(source)
+    if not files:
+        return [found for folder in sorted(source.iterdir()) if folder.is_dir() and (found := _texts(folder))]
+    return [files]
+
+
+def read_drives(
+    source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
+) -> list[TextDrive]:
+    """The drives of a CSV file, a TUM file or a folder of them.
+
+    Args:
+        said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
+        geometry: wheel radius and track [m], of wheel speeds.
+        wheels: take measured wheel speeds as the input, and leave commands out.
+
+    Raises:
+        ValueError: in one line, what is not clear, what was guessed and what to give.
+    """
+    drives: list[TextDrive] = []
+    agreed: list[str] = list(said)
+    for files in text_files(source):
+        tables = [read_table(path) for path in files]
+        groups = [[table] for table in tables] if len(tables) > 1 and _each_whole(tables) else [tables]
+        for group in groups:
+            alone = len(group) == 1 and (source.is_file() or len(groups) > 1)
+            name = group[0].stem if alone else files[0].absolute().parent.name
+            columns, agreed = _decide(source, group, agreed)
+            columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
+            drives.append(_join(name, source, group, columns, geometry))
+    return drives
+
+
+def read_table(path: Path) -> Table:
+    """The numbers of a text file by column; comments and blank lines are left out, empty cells are nan."""
+    text = read_text(path, CSV_BYTES, "no such file.")
+    lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
+    header: list[str] | None = None
+    data = [(number, line) for number, line in lines if not line.lstrip().startswith(("#", "%"))]
+    comments = [line.lstrip("#% \t") for _, line in lines if line.lstrip().startswith(("#", "%"))]
+    if not data:
+        raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
+    split = _splitter(data[0][1])
+    if path.read_bytes()[:1] == b"%" and comments and len(_cells(comments[0], split)) == len(_cells(data[0][1], split)):
+        header = _cells(comments[0], split)  # of `rostopic echo -p`
+    elif not _is_numbers([cell.replace(",", ".") for cell in _cells(data[0][1], split)]):
+        header, data = _cells(data[0][1], split), data[1:]
+    elif comments and len(_cells(comments[-1], split)) == len(_cells(data[0][1], split)):
+        header = _cells(comments[-1], split)
+    rows = [_cells(line, split) for _, line in data]
+    if split in ("\t", ";", None) and rows and not any("." in cell for cell in rows[0]):
+        rows = [[cell.replace(",", ".") for cell in row] for row in rows]  # decimal commas
+    width = len(header) if header is not None else len(rows[0]) if rows else 0
+    if rows and len(rows[-1]) != width:
+        rows = rows[:-1]  # a recorder that was stopped
+    for (number, _), row in zip(data, rows, strict=False):
+        if len(row) != width:
+            raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save it again.")
+    if len(rows) < LEAST:
+        raise ValueError(f"{path}: {len(rows)} rows; at least {LEAST} are needed. Give the whole recording.")
+    numbers = {}
+    if header is None:
+        header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
+    for k, name in enumerate(header):
+        values = np.array([_number(row[k]) for row in rows])
+        if np.isfinite(values).sum() > 2 and name.strip() and name.strip() not in numbers:
+            numbers[name.strip()] = values
+    return Table(path.stem, _with_whole_stamps(numbers))
+
+
+def _texts(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()
+                  and not path.name.lower().startswith(("readme", "license", ".")))
+
+
+def _splitter(line: str) -> str | None:
+    """Separator of a line's cells; None for spaces."""
+    return next((one for one in ("\t", ";", ",") if one in line), None)
+
+
+def _cells(line: str, split: str | None) -> list[str]:
+    return [cell.strip().strip('"').strip() for cell in (line.split(split) if split else line.split())]
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
+def _is_numbers(cells: Sequence[str]) -> bool:
+    return all(not cell or np.isfinite(_number(cell)) or cell.lower() in ("nan", "inf") for cell in cells)
+
+
+def _with_whole_stamps(numbers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns of which seconds and nanoseconds of one stamp are joined as SECS+NSECS."""
+    for name in list(numbers):
+        match = re.fullmatch(r"(.*?)(secs|sec)", name)
+        for rest in ("nsecs", "nsec", "nanosec", "nanosecs"):
+            other = f"{match[1]}{rest}" if match else ""
+            if match and other in numbers:
+                joined = numbers.pop(name) + 1e-9 * numbers.pop(other)
+                numbers = {f"{name}+{rest}": joined, **numbers}
+    return numbers
+
+
+def _each_whole(tables: Sequence[Table]) -> bool:
+    """Whether each of several files is a drive of its own: with an input and a measurement."""
+    def streams(table: Table) -> set[str]:
+        return {one.role.partition(".")[0] for one in guess([table])} - {"time"}
+
+    return all(len(streams(table)) > 1 for table in tables)
+
+
+def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple[list[Column], list[str]]:
+    """What the columns hold: as said, as guessed from names and numbers, and as answered on a terminal."""
+    told = [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
+    columns = guess(tables, told)
+    problem = _problem(tables, columns)
+    if problem and sys.stdin.isatty() and sys.stdout.isatty():
+        print(f"{source}: {problem}\nGuessed:")
+        for one in columns:
+            print(f"  {one}" + (f"   ({one.why})" if one.why else ""))
+        print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
+        answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
+        told += [read_decision(text, tables) for text in answer.split()]
+        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, told)]
+        problem, said = _problem(tables, columns), [str(one) for one in columns]
+    if problem:
+        names = [f"{table.stem}/{name}" for table in tables for name in table.columns]
+        listed = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+        guessed = " ".join(f"'{one}'" for one in columns) or "nothing"
+        raise ValueError(f"{source}: {problem} Its columns are {listed}; guessed: {guessed}. Give --columns with what "
+                         "differs and what is missing, each as ROLE=COLUMN:UNIT; see docs/sysid_tools.md.")
+    return columns, list(said)
+
+
+def _is_here(text: str, tables: Sequence[Table]) -> bool:
+    """Whether a decision is of one of these files; one without a known column is, so that it is refused."""
+    rest = text.partition("=")[2].strip()
+    if any(rest.startswith((f"{table.stem}/{name}", name)) for table in tables for name in table.columns):
+        return True
+    return all("/" not in rest or rest.split("/")[0] == table.stem for table in tables)
+
+
+def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """What is not clear; empty where a drive can be made."""
+    roles = {one.role for one in columns}
+    used = {one.file for one in columns if one.role != "time"}
+    timeless = sorted(used - {one.file for one in columns if one.role == "time"})
+    if timeless:
+        return f"no column of {timeless[0]} is surely its time."
+    inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
+    measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
+        roles, "odometry", "x", "y")
+    if not inputs and not measured:
+        return "no column is surely a command, a wheel speed or a pose."
+    if {"odometry.v", "odometry.omega"} & roles and not _has(roles, "odometry", "x", "y") and not _has(
+            roles, "odometry", "v", "omega"):
+        return "the odometry has only one of v and omega."
+    if not inputs and not _has(roles, "odometry", "v", "omega"):
+        return "there are neither commands (v, omega) nor wheel speeds."
+    if not measured and not (_wheels(roles) and _has(roles, "command", "v", "omega")):
+        return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
+    if unsure := [one for one in columns if not one.sure]:
+        return f"it is not clear what {', '.join(f'{one.file}/{one.name}' for one in unsure)} " + (
+            "is." if len(unsure) == 1 else "are.")
+    return ""
+
+
+def _has(roles: set[str], stream: str, *quantities: str) -> bool:
+    return all(f"{stream}.{one}" in roles for one in quantities)
+
+
+def _wheels(roles: set[str]) -> bool:
+    return _has(roles, "wheels", "left", "right") or _has(roles, "wheels", "left_angle", "right_angle")
+
+
+def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Column],
+          geometry: tuple[float, float]) -> TextDrive:
+    """The streams of one drive on one clock."""
+    streams = {stream: found for stream in QUANTITIES if (found := _stream(stream, tables, columns))}
+    notes = []
+    made: dict[str, np.ndarray] = {}
+    if "command" in streams:
+        made["command"] = _as_twist(streams["command"], columns, "command", geometry)
+    wheels = _as_twist(_with_rates(streams["wheels"]), columns, "wheels", geometry) if "wheels" in streams else None
+    odometry = streams.get("odometry")
+    if odometry is not None:
+        made["odometry"], note = _as_odometry(odometry, wheels)
+        notes += [note] if note else []
+    elif wheels is not None and "command" in made:
+        made["odometry"] = _dead_reckoned(wheels)
+        notes.append("odometry is dead reckoned from the wheel speeds")
+    measured_input = "command" not in made
+    if measured_input:
+        rates = wheels if wheels is not None else made["odometry"][:, [0, 4, 5]]
+        made["command"] = rates
+        notes.append("no commands: the measured wheel speeds are the input"
+                     if wheels is not None else "no commands: the odometry's speeds are the input")
+        made.pop("odometry", None)
+    if "ground_truth" in streams:
+        truth = streams["ground_truth"]
+        if "yaw" in truth:
+            made["ground_truth"] = np.column_stack([truth["t"], truth["x"], truth["y"], truth["yaw"]])
+        else:
+            notes.append("the outside pose has no heading and is left out")
+    if not {"odometry", "ground_truth"} & set(made):
+        raise ValueError(f"{source}: {name} has {'wheel speeds' if measured_input else 'commands'} and nothing to "
+                         "compare their motion with. Add an outside pose, or commands beside the wheel speeds.")
+    begin, end = max(one[0, 0] for one in made.values()), min(one[-1, 0] for one in made.values())
+    if begin >= end:
+        spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
+        raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
+    return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)
+
+
+def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> dict[str, np.ndarray]:
+    """Rows of a stream in SI units in order of time, by quantity and "t"; those with an empty cell are left out."""
+    mine = [one for one in columns if one.role.startswith(f"{stream}.")]
+    if not mine:
+        return {}
+    files = {one.file for one in mine}
+    file = max(files, key=lambda name: sum(one.file == name for one in mine))  # a stream is in one file
+    mine = [one for one in mine if one.file == file]
+    table = next(one for one in tables if one.stem == file)
+    clock = next(one for one in columns if one.role == "time" and one.file == file)
+    wheel = {**UNITS["speed"], **UNITS["rate"]}
+    found = {"t": table.columns[clock.name] * UNITS["time"][clock.unit]}
+    for one in mine:
+        size = (wheel if one.role.endswith(("left", "right")) else UNITS[kind_of(one.role)])[one.unit]
+        found[one.role.partition(".")[2]] = table.columns[one.name] * size
+    whole = np.isfinite(list(found.values())).all(axis=0)
+    order = np.argsort(found["t"][whole], kind="stable")
+    found = {key: values[whole][order] for key, values in found.items()}
+    later = np.append(True, np.diff(found["t"]) > 1e-6) if len(found["t"]) else np.zeros(0, bool)
+    found = {key: values[later] for key, values in found.items()}
+    if len(found["t"]) < 2:
+        raise ValueError(f"{file}: {stream} has {len(found['t'])} rows without an empty cell; at least 2 are needed.")
+    if {"qx", "qy", "qz", "qw"} <= set(found):
+        from sysid.logs.rosbag import yaw_of
+
+        found["yaw"] = np.array([yaw_of(*one) for one in zip(
+            found["qw"], found["qx"], found["qy"], found["qz"], strict=True)])
+    if "yaw" in found:
+        found["yaw"] = np.unwrap(found["yaw"])
+    return found
+
+
+def _with_rates(wheels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Wheel speeds, from angles where only these were measured."""
+    if "left" in wheels:
+        return wheels
+    t = wheels["t"]
+    return {"t": t, **{side: np.gradient(np.unwrap(wheels[f"{side}_angle"]), t) for side in ("left", "right")}}
+
+
+def _as_twist(rates: dict[str, np.ndarray], columns: Sequence[Column], stream: str,
+              geometry: tuple[float, float]) -> np.ndarray:
+    """(T, 3) of t, v and omega of a command, or of the speeds of two wheels."""
+    if "left" not in rates:
+        return np.column_stack([rates["t"], rates["v"], rates.get("omega", 0 * rates["t"])])
+    unit = next((one.unit for one in columns if one.role == f"{stream}.left"), "rad/s")
+    size = 1.0 if unit in UNITS["speed"] else geometry[0]
+    left, right = size * rates["left"], size * rates["right"]
+    return np.column_stack([rates["t"], (left + right) / 2, (right - left) / geometry[1]])
+
+
+def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> tuple[np.ndarray, str]:
+    """(T, 6) rows of an odometry, and a note on what was computed."""
+    t = odometry["t"]
+    note = ""
+    if not {"x", "y", "yaw"} <= set(odometry):
+        if not {"v", "omega"} <= set(odometry):
+            raise ValueError("the odometry has no heading. Name its yaw or its quaternion with --columns.")
+        return _dead_reckoned(np.column_stack([t, odometry["v"], odometry["omega"]])), (
+            "the odometry has speeds only: its pose is dead reckoned from them")
+    x, y, yaw = odometry["x"], odometry["y"], odometry["yaw"]
+    if {"v", "omega"} <= set(odometry):
+        v, omega = odometry["v"], odometry["omega"]
+    elif wheels is not None:
+        v, omega = (np.interp(t, wheels[:, 0], wheels[:, k]) for k in (1, 2))
+    else:
+        half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
+        low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
+        dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
+        v, omega = (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+        note = f"the odometry has poses only: v and omega are their differences over {DIFFERENCED:g} s"
+    return np.column_stack([t, x, y, yaw, v, omega]), note
+
+
+def _dead_reckoned(rates: np.ndarray) -> np.ndarray:
+    """(T, 6) odometry of speeds (T, 3)."""
+    return np.column_stack([rates[:, 0], *integrate_speeds(*rates.T), rates[:, 1:]])
+
+
+def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
+    dt = np.diff(t)
+    turn = (omega[1:] + omega[:-1]) / 2 * dt
+    yaw = np.concatenate([[0.0], np.cumsum(turn)])
+    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
+    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
+            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)

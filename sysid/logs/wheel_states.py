@@ -1,0 +1,93 @@
+"""Motion of two driven wheels out of what drivers publish of them: joint states, and the state of a WHILL Model CR2.
+
+The chair's state (whill_msgs/ModelCr2State) has motor angles in rad that wrap at pi, speeds in km/h that are low-pass
+filtered, a right motor that counts down while the chair drives forward, and no header. It comes at 2 to 20 Hz; at 2 Hz
+a wheel makes half a turn between two of them, and the speeds say which whole turn it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+CHAIR_STATE = "ModelCr2State"
+CHAIR_DEFINITION = """int32 battery_power
+float32 battery_current
+float32 right_motor_angle
+float32 left_motor_angle
+float32 right_motor_speed
+float32 left_motor_speed
+int32 power_on
+int32 speed_mode_indicator
+int32 error
+"""
+JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"
+"""That newer drivers add."""
+KMH = 1 / 3.6  # m/s
+COARSE = 0.15  # s between states, above which speeds are too coarse to identify a drive from
+
+
+def chair_row(state: Any) -> tuple[float, float, float, float]:
+    """Left and right motor angle [rad] and speed [m/s] of a chair's state, both growing forwards."""
+    return (float(state.left_motor_angle), -float(state.right_motor_angle), float(state.left_motor_speed) * KMH,
+            -float(state.right_motor_speed) * KMH)
+
+
+def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
+    """Odometry (T, 5), x, y, yaw, v and omega, of a chair's states.
+
+    Args:
+        t: times of receipt (T,) [s], increasing.
+        rows: `chair_row` of each (T, 4).
+        wheel_radius, track: nominal [m].
+    """
+    dt = np.diff(t)[:, None]
+    expected = (rows[1:, 2:] + rows[:-1, 2:]) / 2 * dt / wheel_radius
+    turned = expected + np.remainder(np.diff(rows[:, :2], axis=0) - expected + np.pi, 2 * np.pi) - np.pi
+    return _odometry(t, np.vstack([np.zeros(2), np.cumsum(turned, axis=0)]), wheel_radius, track)
+
+
+def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
+    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], rates nan where the
+    driver leaves them out."""
+    rates = rows[:, 2:]
+    if not np.isfinite(rates).all():
+        rates = np.gradient(np.unwrap(rows[:, :2], axis=0), t, axis=0)
+    return np.column_stack([wheel_radius * rates.mean(axis=1), wheel_radius * (rates[:, 1] - rates[:, 0]) / track])
+
+
+def joint_row(state: Any) -> tuple[float, float, float, float]:
+    """Left and right angle and rate of a JointState's wheels, by the names of its joints; infinite where it has none.
+
+    Several wheels of one side count as their mean.
+    """
+    sides = wheel_joints(state.name)
+    if sides is None:
+        return (float("inf"),) * 4
+
+    def mean(values: Sequence[float], side: int) -> float:
+        return float(np.mean([values[k] for k in sides[side]])) if len(values) == len(state.name) else float("nan")
+
+    row = mean(state.position, 0), mean(state.position, 1), mean(state.velocity, 0), mean(state.velocity, 1)
+    return (row[0] if row[0] == row[0] else 0.0, row[1] if row[1] == row[1] else 0.0, row[2], row[3])
+
+
+def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]] | None:
+    """Indices of the left and of the right wheels among joints; None where there are not both."""
+    wheels = [k for k, name in enumerate(names) if "wheel" in name.lower() and "caster" not in name.lower()]
+    wheels = wheels or [k for k, name in enumerate(names) if "caster" not in name.lower()]
+    left = [k for k in wheels if "left" in names[k].lower() or names[k].lower().startswith(("l_", "fl_", "rl_"))]
+    right = [k for k in wheels if "right" in names[k].lower() or names[k].lower().startswith(("r_", "fr_", "rr_"))]
+    return (left, right) if left and right else None
+
+
+def _odometry(t: np.ndarray, angles: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
+    """Odometry (T, 5) of wheel angles (T, 2) that do not wrap."""
+    left, right = (wheel_radius * angles).T
+    way, yaw = (left + right) / 2, (right - left) / track
+    half = np.diff(yaw) / 2
+    chord = np.diff(way) * np.sinc(half / np.pi)
+    x, y = (np.append(0.0, np.cumsum(chord * turn(yaw[:-1] + half))) for turn in (np.cos, np.sin))
+    return np.column_stack([x, y, yaw, np.gradient(way, t), np.gradient(yaw, t)])

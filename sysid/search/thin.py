@@ -1,0 +1,72 @@
+"""Thin logs: parameters that a log cannot determine keep their value in a fit, and logs that determine nothing are
+refused. What `sysid.inspect` says of a log binds the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sysid.errors.space import Space
+from sysid.logs.coverage import Excitation, excitation
+from sysid.logs.log import Log, Trial
+
+LEAST_SECONDS = 2.0  # s of commanded motion that a log must have
+TURNS, DRIVES = 0.1, 0.05  # rad/s and m/s of commands below which nothing turns or drives
+UNSEEN = "the log cannot show it"
+"""Begins the reason for which a parameter keeps its value."""
+
+HIDDEN = {
+    "no outside pose": ("slip_traction.", "axle_pivot.", "lateral_damping."),
+    "no turn": ("body.yaw_inertia", "body.com_y", "yaw_scrub.", "lateral_damping.", "axle_pivot.",
+                "slip_traction.side_slip_speed", "slip_traction.mu_free", "track_width."),
+    "no straight motion": ("rolling_resistance.", "slip_traction.slip_speed", "suspension.", "body.com_x",
+                           "body.com_z"),
+}
+"""Cause -> parameters, or beginnings of their names, that it hides."""
+REMEDIES = {"no outside pose": "log motion capture, lidar or RTK", "no turn": "turn on the spot and drive circles",
+            "no straight motion": "drive straight at two speeds"}
+
+
+def causes(trials: Sequence[Trial]) -> list[str]:
+    """Which of `HIDDEN` hold for the training trials."""
+    found: list[Excitation] = [excitation(trial) for trial in trials]
+    holds = {"no outside pose": all(trial.ground_truth is None for trial in trials),
+             "no turn": not any(abs(bound) > TURNS for one in found for bound in one.omega),
+             "no straight motion": not any(abs(bound) > DRIVES for one in found for bound in one.v)}
+    return [cause for cause, true in holds.items() if true]
+
+
+def check_moves(log: Log) -> None:
+    """Refuse a log that determines nothing.
+
+    Raises:
+        ValueError: no training trial is commanded to move for a while.
+    """
+    seconds = 0.0
+    for trial in log.training:
+        command = trial.command
+        moving = (abs(command.v) > DRIVES) | (abs(command.omega) > TURNS)
+        ends = [*command.t[1:], max(trial.duration, float(command.t[-1]))]
+        seconds += float(sum(max(end - begin, 0.0) for begin, end, one in zip(
+            command.t, ends, moving, strict=True) if one))
+    if log.training and seconds < LEAST_SECONDS:
+        raise ValueError(f"log {log.name!r}: its training trials are commanded to move for {seconds:.1f} s in all, "
+                         "which determines nothing. Record longer drives; sysid.inspect says which.")
+
+
+def without_hidden(space: Space, log: Log, asked: Sequence[str] = ()) -> Space:
+    """The space without parameters that the log cannot show, but for those that were asked for by name."""
+    for cause in causes(log.training):
+        for name in space.names:
+            if name not in asked and name.startswith(HIDDEN[cause]):
+                space = space.without(name, f"{UNSEEN}: {cause}")
+    return space
+
+
+def notes(space: Space) -> list[str]:
+    """Sentences on what is not fitted since the log cannot show it."""
+    found = []
+    for cause, remedy in REMEDIES.items():
+        names = [name for name, reason in space.fixed if reason == f"{UNSEEN}: {cause}"]
+        if names:
+            found.append(f"not fitted, since the log has {cause}: {', '.join(names)}. To determine them, {remedy}")
+    return found

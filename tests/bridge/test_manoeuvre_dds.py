@@ -1,0 +1,72 @@
+"""Manoeuvres over real DDS: driven as written, recorded, stopped by whatever stops the vehicle."""
+
+import csv
+import json
+import signal
+
+import pytest
+
+
+def rows(path):
+    with open(path, encoding="utf-8", newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+@pytest.fixture
+def commands(tmp_path):
+    path = tmp_path / "ahead.csv"
+    path.write_text("t,v,omega\n0,0.4,0\n1.5,0,0\n")
+    return path
+
+
+def start(graph, commands, *options):
+    graph.start("simulate", "--simulator", "point_robot:RovingRobot", "--wait", 0)
+    graph.start("manoeuvre", commands, "--space", 6, 4, "--dataset", commands.parent / "logs", *options)
+    robot = graph.peer("operator")
+    robot.watch()
+    robot.wait_for_status(state="disarmed", holds="[]")
+    return robot
+
+
+def test_replicates_are_driven_and_recorded_each_after_its_arming(graph, commands):
+    robot = start(graph, commands, "--repeat", 2)
+    robot.arm()
+    robot.wait_for_status(reason="bring the vehicle back")
+    robot.arm()
+    assert graph.wait("manoeuvre") == 0, graph.log("manoeuvre")
+    trials = commands.parent / "logs" / "trials"
+    assert sorted(path.name for path in trials.iterdir()) == ["ahead_1", "ahead_2"]
+    for trial in trials.iterdir():
+        command, odometry = rows(trial / "command.csv"), rows(trial / "odometry.csv")
+        assert max(row["v"] for row in command) == pytest.approx(0.4) and command[0]["v"] == command[-1]["v"] == 0
+        assert odometry[-1]["x"] == pytest.approx(0.4 * 1.5, abs=0.1)
+        first = next(row["t"] for row in command if row["v"])
+        assert first > 0.5 and odometry[-1]["t"] - max(row["t"] for row in command if row["v"]) > 0.5
+    sysid_log = pytest.importorskip("sysid.logs.log")
+    assert [trial.manoeuvre for trial in sysid_log.load_log(commands.parent / "logs").trials] == ["ahead"] * 2
+
+
+def test_a_drive_that_a_person_ends_is_put_aside_and_no_trial(graph, commands):
+    commands.write_text("t,v,omega\n0,0.2,0\n8,0,0\n")
+    robot = start(graph, commands)
+    robot.arm()
+    robot.wait_until(lambda robot: robot.statuses[-1]["manoeuvre"]["elapsed"] is not None)
+    collision = robot.publisher("std_msgs/Bool", "collision_sensor")
+    from benchmarks.bridge_robot import message_type
+
+    robot.wait_until(lambda _: collision.get_subscription_count())
+    graph.wait_for("manoeuvre", "driving")
+    collision.publish(message_type("std_msgs/Bool")(data=True))
+    graph.wait_for("manoeuvre", "stopped on the way")
+    assert graph.end("manoeuvre", signal.SIGINT) == 3
+    logs = commands.parent / "logs"
+    assert not list((logs / "trials").iterdir())
+    (aside,) = (logs / "aborted").iterdir()
+    assert rows(aside / "command.csv")
+    assert json.dumps(str(aside))[1:-1] in graph.log("manoeuvre")
+
+
+def test_a_trial_that_exists_is_refused_before_anything_moves(graph, commands):
+    (commands.parent / "logs" / "trials" / "ahead_2").mkdir(parents=True)
+    graph.start("manoeuvre", commands, "--space", 6, 4, "--dataset", commands.parent / "logs", "--repeat", 2)
+    assert graph.wait("manoeuvre") == 2 and "ahead_2: exists already" in graph.log("manoeuvre")

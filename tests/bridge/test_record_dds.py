@@ -1,0 +1,59 @@
+"""The recorder beside plain ROS publishers: it loses nothing, whatever quality of service they offer."""
+
+import csv
+import time
+
+import pytest
+
+from benchmarks.bridge_robot import message_type
+
+
+def publish(peer, publisher, count, per_burst=50):
+    """Publish numbered odometry in bursts, as a pause of the recorder makes them."""
+    odometry = message_type("nav_msgs/Odometry")
+    for i in range(count):
+        message = odometry()
+        message.header.stamp.sec, message.header.stamp.nanosec = 100 + i // 100, i % 100 * 10_000_000
+        message.pose.pose.position.x = i * 0.01
+        message.pose.pose.orientation.w = 1.0
+        publisher.publish(message)
+        if i % per_burst == per_burst - 1:
+            time.sleep(0.05)
+
+
+def recorded(folder):
+    with open(folder / "odometry.csv", encoding="utf-8", newline="") as file:
+        return [round(float(row["stamp"]) * 100) - 10_000 for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("kind", ["reliable", "best_effort"])
+def test_every_message_of_a_burst_is_recorded_once(graph, tmp_path, kind):
+    from bridge import ros
+
+    peer = graph.peer()
+    publisher = peer.publisher("nav_msgs/Odometry", "whill/odom", getattr(ros, kind)(500))
+    graph.start("record", tmp_path / "logs", "burst_1")
+    peer.wait_until(lambda _: publisher.get_subscription_count())
+    time.sleep(0.3)
+    publish(peer, publisher, 400)
+    time.sleep(0.5)
+    assert graph.end("record") == 0, graph.log("record")
+    rows = recorded(tmp_path / "logs" / "trials" / "burst_1")
+    assert rows == sorted(set(rows)), "a message was recorded twice"
+    assert len(rows) >= 399
+
+
+def test_best_effort_publisher_that_joins_a_reliable_one_is_heard_too(graph, tmp_path):
+    from bridge import ros
+
+    peer = graph.peer()
+    first = peer.publisher("nav_msgs/Odometry", "whill/odom", ros.reliable(500))
+    graph.start("record", tmp_path / "logs", "two_1")
+    peer.wait_until(lambda _: first.get_subscription_count())
+    second = peer.publisher("nav_msgs/Odometry", "whill/odom", ros.best_effort(500))
+    peer.wait_until(lambda _: second.get_subscription_count())
+    time.sleep(0.3)
+    publish(peer, second, 50)
+    time.sleep(0.5)
+    assert graph.end("record") == 0, graph.log("record")
+    assert len(recorded(tmp_path / "logs" / "trials" / "two_1")) >= 49

@@ -1,0 +1,201 @@
+"""CSV and TUM files of any columns into a dataset, and inputs that are measured wheel speeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import sysid
+from bridge.whill import ChairState, WheelOdometry
+from sysid.logs.conversion import ConvertConfig, convert
+from sysid.logs.log import Command, load_log, with_timeout
+from sysid.logs.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
+from sysid.replay.wheel_model import wheel_model
+from whill_mjx.io.fields import DATASET
+
+pytestmark = pytest.mark.quick
+CHAIR = {trial.name: trial for trial in load_log(Path(sysid.__file__).parent / "data" / "chair").trials}
+DRIVE = CHAIR["random_1"]
+T0 = 1.7e9  # s, Unix time
+
+
+def columns(trial=DRIVE):
+    """Columns of a drive on one clock: time, commands, odometry and outside pose."""
+    o, g, c = trial.odometry, trial.ground_truth, trial.command
+    held = np.searchsorted(c.t, o.t + 1e-9, side="right") - 1
+    return {"t": o.t, "cv": c.v[held], "cw": c.omega[held], "x": o.x, "y": o.y, "yaw": o.yaw, "v": o.v, "w": o.omega,
+            "gx": np.interp(o.t, g.t, g.x), "gy": np.interp(o.t, g.t, g.y), "gyaw": np.interp(o.t, g.t, g.yaw)}
+
+
+def write(path, table, separator=",", header=True, comma=False):
+    """Write columns by name; comma: as the decimal point."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [separator.join(f"{one:.6f}" for one in row) for row in zip(*table.values(), strict=True)]
+    rows = [row.replace(".", ",") for row in rows] if comma else rows
+    path.write_text("\n".join([separator.join(table)] * header + rows) + "\n")
+    return path
+
+
+def quaternion(yaw):
+    return {"qx": 0 * yaw, "qy": 0 * yaw, "qz": np.sin(yaw / 2), "qw": np.cos(yaw / 2)}
+
+
+def check(trial, pose=True):
+    """The trial is the drive that was written."""
+    np.testing.assert_allclose(trial.odometry.v, DRIVE.odometry.v, atol=1e-3)
+    np.testing.assert_allclose(trial.odometry.omega, DRIVE.odometry.omega, atol=1e-3)
+    held = np.searchsorted(trial.command.t, 10.0, side="right") - 1
+    assert trial.command.v[held] == pytest.approx(DRIVE.command.v[100], abs=1e-3)
+    if pose:
+        np.testing.assert_allclose(trial.odometry.yaw, DRIVE.odometry.yaw, atol=5e-3)
+
+
+def with_units(c):
+    return {"time [ms]": 1e3 * c["t"], "cmd_speed [km/h]": 3.6 * c["cv"], "cmd_turn (deg/s)": np.rad2deg(c["cw"]),
+            "x_mm": 1e3 * c["x"], "y_mm": 1e3 * c["y"], "heading [deg]": np.rad2deg(c["yaw"]) % 360,
+            "speed_kmh": 3.6 * c["v"], "yaw rate [deg/s]": np.rad2deg(c["w"])}
+
+
+def without_units(c):
+    return {"timestamp": 1e9 * (T0 + c["t"]), "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_x": c["x"], "odom_y": c["y"],
+            "odom_theta": np.rad2deg(c["yaw"]), "odom_v": 3.6 * c["v"], "odom_w": np.rad2deg(c["w"]), "gt_x": c["gx"],
+            "gt_y": c["gy"], "gt_yaw": c["gyaw"]}
+
+
+def plotted(c):
+    pose = quaternion(c["yaw"])
+    return {"__time": T0 + c["t"], "/cmd_vel/linear/x": c["cv"], "/cmd_vel/angular/z": c["cw"],
+            "/odom/pose/pose/position/x": c["x"], "/odom/pose/pose/position/y": c["y"],
+            **{f"/odom/pose/pose/orientation/{name[1]}": values for name, values in pose.items()},
+            "/odom/twist/twist/linear/x": c["v"], "/odom/twist/twist/angular/z": c["w"],
+            "/odom/twist/twist/linear/y": 0 * c["v"]}
+
+
+@pytest.mark.parametrize("names", [with_units, without_units, plotted])
+def test_columns_are_found_by_their_names_and_units_by_names_or_numbers(tmp_path, names):
+    log, _ = convert(ConvertConfig(write(tmp_path / "drive.csv", names(columns())), tmp_path / "log"))
+    (trial,) = log.trials
+    assert trial.name == "drive" and (trial.ground_truth is not None) == (names is without_units)
+    check(trial)
+
+
+def test_files_of_one_drive_are_joined_by_time_and_the_decision_is_written_and_can_be_repeated(tmp_path):
+    c, folder = columns(), tmp_path / "monday"
+    turn, seen = quaternion(c["yaw"]), quaternion(c["gyaw"])
+    write(folder / "cmd_vel.csv", {"%time": 1e9 * (T0 + c["t"]), "field.linear.x": c["cv"], "field.angular.z": c["cw"]})
+    write(folder / "odom.csv", {"header.stamp.secs": np.floor(T0 + c["t"]), "header.stamp.nsecs": 1e9 * (c["t"] % 1),
+                                "pose.pose.position.x": c["x"], "pose.pose.position.y": c["y"],
+                                **{f"pose.pose.orientation.{name[1]}": one for name, one in turn.items()},
+                                "twist.twist.linear.x": c["v"], "twist.twist.angular.z": c["w"]})
+    write(folder / "mocap.tum", {"t": T0 + c["t"], "x": c["gx"], "y": c["gy"], "z": 0 * c["gx"], **seen},
+          separator=" ", header=False)
+    log, notes = convert(ConvertConfig(folder, tmp_path / "log"))
+    check(log.trials[0])
+    assert log.trials[0].ground_truth is not None and any("column ground_truth.x=mocap/tx:m" in note for note in notes)
+    decided = log.fields["columns"]
+    again, _ = convert(ConvertConfig(folder, tmp_path / "again", columns=tuple(decided)))
+    assert again.fields["columns"] == decided
+    np.testing.assert_array_equal(again.trials[0].odometry.values, log.trials[0].odometry.values)
+
+
+def test_each_file_with_commands_and_odometry_is_a_drive(tmp_path):
+    for name in ("circle_1", "circle_2"):
+        c = columns(CHAIR[name])
+        write(tmp_path / "drives" / f"{name}.csv", {"t": c["t"], "v_cmd": c["cv"], "w_cmd": c["cw"], "x": c["x"],
+                                                    "y": c["y"], "theta": c["yaw"], "v": c["v"], "w": c["w"]})
+    log, _ = convert(ConvertConfig(tmp_path / "drives", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1", "circle_2"]
+
+
+def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):
+    c = columns()
+    path = write(tmp_path / "drive.csv", {"Zeit": c["t"], "v_soll": c["cv"], "w_soll": c["cw"], "v_ist": c["v"],
+                                          "w_ist": c["w"]}, separator=";", comma=True)
+    lines = path.read_text().splitlines()
+    lines[5] = ";".join([lines[5].split(";")[0], "", "", "", ""])
+    path.write_text("\n".join(lines))
+    log, notes = convert(ConvertConfig(path, tmp_path / "log"))
+    assert len(log.trials[0].odometry.t) == len(c["t"]) - 1 and any("dead reckoned" in note for note in notes)
+
+
+def unnamed(c):
+    return {"a": c["t"], "b": c["cv"], "c": c["cw"], "d": c["v"], "e": c["w"]}
+
+
+def of_unknown_origin(c):
+    return {"time": c["t"], "vel_ref": c["cv"], "omega_ref": c["cw"], "x": c["gx"] + 3, "y": c["gy"], "yaw": c["gyaw"]}
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    (unnamed, "no column is surely a command, .*Its columns are drive/a, drive/b.*Give --columns"),
+    (of_unknown_origin, "not clear what drive/x, drive/y, drive/yaw are.*guessed: .*'odometry.x=drive/x:m'.*--columns"),
+    (lambda c: {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"]}, "neither odometry .* nor an outside pose"),
+    (lambda c: {"cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]},
+     "no column of drive is surely its time"),
+])
+def test_without_a_sure_guess_one_line_names_columns_guess_and_flags_and_nothing_is_written(tmp_path, names, said):
+    path = write(tmp_path / "drive.csv", names(columns()))
+    with pytest.raises(ValueError, match=said) as caught:
+        convert(ConvertConfig(path, tmp_path / "log"))
+    assert "\n" not in str(caught.value) and not (tmp_path / "log").exists()
+
+
+def test_flags_say_what_no_name_does(tmp_path):
+    said = ("time=a:s", "command.v=b:m/s", "command.omega=c", "odometry.v=d", "odometry.omega=drive/e:rad/s")
+    path = write(tmp_path / "drive.csv", unnamed(columns()))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=said))
+    check(log.trials[0], pose=False)
+    with pytest.raises(ValueError, match="'furlong' is no unit of odometry.x"):
+        convert(ConvertConfig(path, tmp_path / "other", columns=("odometry.x=a:furlong",)))
+    with pytest.raises(ValueError, match="no such column .found drive/a"):
+        convert(ConvertConfig(path, tmp_path / "other", columns=("odometry.x=f",)))
+
+
+def test_wheel_speeds_and_an_outside_pose_are_an_input_without_commands(tmp_path):
+    c = columns()
+    left, right = ((c["v"] + side * c["w"] * 0.496 / 2) / 0.1325 * 60 / (2 * np.pi) for side in (-1, 1))
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "wheel_left_rpm": left, "wheel_right_rpm": right,
+                                          "mocap_x": c["gx"], "mocap_y": c["gy"], "mocap_yaw": c["gyaw"]})
+    log, notes = convert(ConvertConfig(path, tmp_path / "log"))
+    assert log.fields["input"] == "wheels" and log.trials[0].odometry is None
+    assert any("no commands" in note for note in notes) and any("measured wheel speeds" in note for note in log.notes)
+    np.testing.assert_allclose(log.trials[0].command.v, c["v"], atol=1e-3)
+    assert log.trials[0].command.t[3] == pytest.approx((c["t"][2] + c["t"][3]) / 2)  # half an interval before
+    assert set(wheel_model(log.spec).params.values) >= {"radius", "track", "ahead"}
+
+
+@pytest.mark.parametrize("period", [0.05, 0.5])
+def test_states_of_the_chair_become_the_odometry_that_the_bridge_makes_of_them(period):
+    t = np.arange(0.0, 12.0, period)
+    left, right = 6.0 * np.sin(0.4 * t) + 3.0 * t, 4.0 * np.sin(0.4 * t) + 3.0 * t
+    rates = 2.4 * np.cos(0.4 * t) + 3.0, 1.6 * np.cos(0.4 * t) + 3.0
+    states = [SimpleNamespace(left_motor_angle=np.angle(np.exp(1j * a)), right_motor_angle=-np.angle(np.exp(1j * b)),
+                              left_motor_speed=v * 0.1325 * 3.6, right_motor_speed=-w * 0.1325 * 3.6)
+              for a, b, v, w in zip(left, right, *rates, strict=True)]
+    mine = chair_odometry(t, np.array([chair_row(one) for one in states]), 0.1325, 0.496)
+    bridge = WheelOdometry()
+    theirs = [bridge.update(now, ChairState(**vars(one))) for now, one in zip(t, states, strict=True)]
+    np.testing.assert_allclose(mine[:, :3], [(one.x, one.y, one.yaw) for one in theirs], atol=1e-9)
+    np.testing.assert_allclose(mine[2:-2, 3], (0.1325 * (rates[0] + rates[1]) / 2)[2:-2], atol=0.02)
+
+
+def test_wheels_among_joints_are_found_by_their_names():
+    names = ["arm_left_joint", "front_left_wheel", "rear_left_wheel", "right_wheel", "caster_wheel"]
+    state = SimpleNamespace(name=names, position=[9.0, 1.0, 1.2, 2.0, 7.0], velocity=[])
+    row = joint_row(state)
+    assert row[:2] == pytest.approx((1.1, 2.0)) and np.isnan(row[2:]).all()
+    assert np.isinf(joint_row(SimpleNamespace(name=["a", "b"], position=[0.0, 0.0], velocity=[]))).all()
+    t = np.arange(0.0, 2.0, 0.1)
+    rows = np.column_stack([np.angle(np.exp(3j * t)), np.angle(np.exp(5j * t)), np.full((len(t), 2), np.nan)])
+    np.testing.assert_allclose(joint_twist(t, rows, 0.1, 0.5), np.tile([0.4, 0.4], (len(t), 1)), atol=1e-9)
+
+
+def test_a_base_with_a_time_out_stops_in_pauses_of_the_commands():
+    command = Command(np.array([0.0, 0.1, 0.2, 3.0, 3.1]), np.array([0.5, 0.5, 0.5, 0.5, 0.0]), np.zeros(5))
+    held = with_timeout(command, 0.5)
+    np.testing.assert_allclose(held.t, [0.0, 0.1, 0.2, 0.7, 3.0, 3.1])
+    np.testing.assert_allclose(held.v, [0.5, 0.5, 0.5, 0.0, 0.5, 0.0])
+    assert "command_timeout" in {field.name for field in DATASET}

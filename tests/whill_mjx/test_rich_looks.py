@@ -1,0 +1,102 @@
+"""Rich looks: one record per world, drawn inside the reset, that changes what is seen and leaves a way through."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.env import RICH, make_env, observe, repainted, reset_state
+from whill_mjx.tasks.tasks import make_task, sample_world
+from whill_mjx.world.eye import develop, plain_eye
+from whill_mjx.world.render import camera_rotation, pinhole, render
+from whill_mjx.world.render.pallas import Tiling, render_pallas
+from whill_mjx.world.rich import PASSAGE, furnish, paint, roles_of
+
+SIZE = 16
+
+
+def furnished(task: str, key: jax.Array):
+    world_key, key = jax.random.split(key)
+    return furnish(key, sample_world(make_task(task), world_key).scene, lone=task == "corridor")
+
+
+@pytest.fixture(scope="module")
+def room():
+    env, params = make_env("corridor", looks="rich", height=SIZE, width=SIZE)
+    reset = jax.jit(lambda key: reset_state(env, params, key))
+    return env, reset, jax.jit(lambda state: observe(env, state))
+
+
+def test_the_looks_of_a_world_are_one_pytree_and_the_same_key_gives_the_same_frame(room):
+    env, reset, see = room
+    state = reset(jax.random.key(1))
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(state.scene.rich))
+    assert state.scene.rich.materials.paint.shape == (len(roles_of(state.scene)), 3)
+    first, again, other = see(state), see(reset(jax.random.key(1))), see(reset(jax.random.key(2)))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(np.asarray(first, int) - other).mean() > 5
+    other_paint = jax.jit(lambda state: repainted(env, state, jax.random.key(3)))(state)
+    np.testing.assert_array_equal(other_paint.scene.boxes.centre, state.scene.boxes.centre)
+    assert np.abs(np.asarray(first, int) - see(other_paint)).mean() > 5
+
+
+def test_an_image_may_be_late_by_two_control_periods(room):
+    _, reset, see = room
+    state = reset(jax.random.key(1))
+    eye = dataclasses.replace(state.scene.rich.eye, delay=jnp.array(2))
+    state = dataclasses.replace(
+        state, scene=dataclasses.replace(state.scene, rich=dataclasses.replace(state.scene.rich, eye=eye))
+    )
+    moved = state.trail.at[:2, 0].add(0.5)
+    late = dataclasses.replace(state, trail=moved)
+    np.testing.assert_array_equal(see(state), see(late))  # what is two periods old is still as it was
+    there = dataclasses.replace(state, trail=state.trail.at[2, 0].add(0.5))
+    assert np.abs(np.asarray(see(state), int) - see(there)).max() > 10
+
+
+@pytest.mark.parametrize("task", ["corridor", "obstacle_course"])
+def test_things_never_close_the_passage(task):
+    draw = jax.jit(jax.vmap(lambda key: furnished(task, key).boxes))
+    boxes = jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(0), 300)))
+    seen = 0
+    for world in range(300):
+        one = jax.tree.map(lambda leaf, world=world: leaf[world], boxes)
+        walls, rest = one.centre[:2, 1] - np.array([1, -1]) * one.half[:2, 1], slice(3, None)
+        reach_x = one.half[:, 0] * np.abs(np.cos(one.yaw)) + one.half[:, 1] * np.abs(np.sin(one.yaw))
+        reach_y = one.half[:, 0] * np.abs(np.sin(one.yaw)) + one.half[:, 1] * np.abs(np.cos(one.yaw))
+        for x in np.arange(-1.5, 3.6, 0.05):  # where the goal is not yet reached
+            near = one.mask[rest] & (np.abs(one.centre[rest, 0] - x) < reach_x[rest])
+            low, high = (one.centre[rest, 1] - reach_y[rest])[near], (one.centre[rest, 1] + reach_y[rest])[near]
+            seen += near.sum()
+            edges = sorted(zip(low, high, strict=True))
+            free, reached = 0.0, walls[1]
+            for start, end in [*edges, (walls[0], walls[0])]:
+                free, reached = max(free, start - reached), max(reached, end)
+            assert free > 0.9 and PASSAGE > 0.9, (world, x, free)
+    assert seen > 100
+
+
+def test_the_kernel_draws_rich_looks_as_the_renderer_does():
+    scene = paint(jax.random.key(1), furnished("corridor", jax.random.key(2)))
+    pose = jnp.array([0.5, 0.0, 0.68]), camera_rotation(0.1, 0.15)
+    ours = jax.jit(lambda scene: render(*pose, pinhole(1.2, SIZE, SIZE), scene, SIZE, SIZE))(scene)
+    kernel = jax.jit(lambda scene: render_pallas(*pose, pinhole(1.2, SIZE, SIZE), scene, SIZE, SIZE,
+                                                 tiling=Tiling(SIZE, SIZE), interpret=True))(scene)  # fmt: skip
+    assert RICH.antialias and np.abs(np.asarray(ours, int) - kernel).max() <= 1
+    assert np.std(ours) > 5
+
+
+def test_the_papers_looks_are_what_the_corridor_shows_by_itself():
+    plain, params = make_env("corridor", height=SIZE, width=SIZE)
+    named, _ = make_env("corridor", looks="paper", height=SIZE, width=SIZE)
+    assert (named.random_looks, named.photometric, named.rich) == (plain.random_looks, plain.photometric, plain.rich)
+    with pytest.raises(ValueError, match="looks is 'neon'"):
+        make_env("corridor", looks="neon")
+
+
+def test_a_plain_eye_leaves_an_image_as_it_is():
+    image = jax.random.randint(jax.random.key(0), (SIZE, SIZE, 3), 0, 120).astype(jnp.uint8)
+    sent = develop(image, plain_eye(), jnp.zeros(()), jax.random.key(1), jnp.array(0))
+    assert np.abs(np.asarray(sent, int) - image).max() <= 2

@@ -1,0 +1,192 @@
+"""A task of a user's own, outside the package: the one that docs/tasks.md shows, and wrong ones."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.env import make_env, reset_state, step_state
+from whill_mjx.io.command_line import OptionError
+from whill_mjx.learning.setup import find_preset
+from whill_mjx.tasks.base import Budget, Task
+from whill_mjx.tasks.corridor import Corridor
+from whill_mjx.tasks.options import named_task, read_fields
+from whill_mjx.tasks.tasks import TASKS, find_task, make_task, register_task, source_of, unregister_task
+
+PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
+LINES = 60
+"""Most lines that a task of one's own may take."""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """The page's task as a file."""
+    text = re.search(r"```python\n(\"\"\"parking.py.*?)```", PAGE.read_text(), re.DOTALL).group(1)
+    path = tmp_path_factory.mktemp("user") / "parking.py"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.quick
+def test_the_pages_task_is_short_and_found_by_its_file(file):
+    assert len(file.read_text().splitlines()) <= LINES
+    task = make_task(f"{file}:Parking", bay_x=2.5)
+    assert task.name == "parking" and task.bay_x == 2.5 and len(source_of(task)) == 64
+    assert source_of(Corridor()) is None
+    assert find_preset("cpu", task).total_steps == 100_000 and find_preset("cpu", task).instances == 32
+    assert task.sweeps and type(find_task(f"{file}:Parking")) is type(task)
+
+
+def test_its_rewards_endings_and_observations_are_those_of_the_step(file):
+    env, params = make_env(f"{file}:Parking", layout="fixed")
+    state = jax.jit(lambda key: reset_state(env, params, key))(jax.random.key(0))
+    step = jax.jit(lambda state, action: step_state(env, params, state, action))
+    still = jnp.array([-1 / 3, 0.0])  # 0 m/s between -0.4 and 0.8
+    _, outcome = step(state, still)
+    assert float(outcome.reward) == pytest.approx(-0.05, abs=0.02)
+    assert set(outcome.metrics) >= {"lost", "success", "collision"} and not outcome.metrics["lost"]
+    far = jnp.zeros_like(state.vehicle.qpos).at[0].set(-4.0)
+    moved = type(state.vehicle)(**{**vars(state.vehicle), "qpos": state.vehicle.qpos + far})
+    _, outcome = step(type(state)(**{**vars(state), "vehicle": moved}), still)
+    assert outcome.metrics["lost"] == 1 and bool(outcome.terminated) and not outcome.metrics["collision"]
+    assert [name for name, _ in env.sensors] == ["goal", "lidar", "odometry"]
+
+
+@pytest.mark.quick
+def test_the_commands_take_its_file_and_its_fields(file):
+    from whill_mjx.evaluate import EvaluateOptions, choose_task
+    from whill_mjx.train import TrainOptions, choose_preset
+
+    options = TrainOptions(task=f"{file}:Parking", preset="cpu", layout="fixed", set=("bay_x=2.8", "action_repeat=3"))
+    task = choose_preset(options).task
+    assert (task.bay_x, task.layout, task.action_repeat) == (2.8, "fixed", 3)
+    chosen = choose_task(EvaluateOptions(policy="random", task=f"{file}:Parking", set=("max_steps=20",)), None)
+    assert chosen.name == "parking" and chosen.max_steps == 20
+
+
+@pytest.mark.long
+def test_it_is_trained_and_evaluated_from_the_command_line(file, tmp_path):
+    from whill_mjx import evaluate, train
+
+    reference, run = f"{file}:Parking", tmp_path / "run"
+    train.main(train.TrainOptions(
+        out=run, task=reference, vehicle=Path("whill_cr_ramp"), preset="smoke", learner="ppo", steps=64, eval_every=64,
+        episodes=4, planner=False, videos=0, set=("bay_x=2.8",),
+    ))  # fmt: skip
+    trained = json.loads((run / "evaluation.json").read_text())
+    assert trained["task"]["bay_x"] == 2.8 and "lost" in trained["policy"]
+    table = json.loads((run / "policy" / "policy.json").read_text())
+    assert table["observation"] == {"goal": [2], "lidar": [24], "odometry": [5]} and table["task"] == reference
+    found = evaluate.main(evaluate.EvaluateOptions(policy=str(run), out=tmp_path / "eval", episodes=4, videos=0))
+    assert found["task"]["name"] == "parking" and found["task"]["bay_x"] == 2.8
+    assert {"lost", "success"} <= set(found["drivers"]["policy"])
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("text", "reference", "said"), [
+    ("", "{file}:Parkign", "has no task 'Parkign' .known: none"),
+    ("x = ", "{file}:Parking", "cannot be imported: SyntaxError"),
+    ("import whill_mjx_nowhere", "{file}:Parking", "No module named 'whill_mjx_nowhere'"),
+    ("Parking = 3", "{file}:Parking", "3 is no task"),
+    ("", "nowhere.py:Parking", "no such file nowhere.py"),
+    ("", "no_module_at_all:Parking", "No module named 'no_module_at_all'"),
+    ("", "parkign", "known: .*corridor.*obstacle_course"),
+])  # fmt: skip
+def test_a_task_that_cannot_be_had_is_one_line(text, reference, said, tmp_path):
+    path = tmp_path / f"wrong_{abs(hash((text, reference)))}.py"
+    path.write_text(text)
+    reference = reference.format(file=path)
+    with pytest.raises(OptionError, match=said) as caught:
+        named_task(reference)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(f"--task {reference}: ")
+
+
+@dataclass(frozen=True)
+class Slalom(Corridor):
+    """Another task's child, with neither name nor budget of its own."""
+
+    poles: tuple[float, ...] = (1.0, 2.0)
+
+
+@pytest.mark.quick
+def test_a_task_inherits_neither_name_nor_budget():
+    task = Slalom()
+    assert task.name == "slalom" and not task.budgets and Corridor.budgets
+    with pytest.raises(ValueError, match="no budget for the preset 'paper'.*--steps"):
+        find_preset("paper", task)
+    asked = find_preset("paper", task, steps=1234)
+    assert asked.total_steps == 1234 and asked.learner.vector_scale == 1.0
+    assert find_preset("smoke", task).total_steps > 0
+
+
+@pytest.mark.quick
+def test_a_registered_task_is_known_by_its_name_until_it_is_forgotten():
+    register_task(Slalom)
+    try:
+        assert make_env("slalom", layout="fixed")[0].task == Slalom(layout="fixed")
+        with pytest.raises(ValueError, match="another name"):
+            register_task(type("Slalom", (Corridor,), {"__module__": "elsewhere", "name": "slalom"})())
+    finally:
+        unregister_task("slalom")
+    assert "slalom" not in TASKS
+
+
+@pytest.mark.quick
+def test_wrong_tasks_and_fields_are_refused():
+    class Loose(Corridor):
+        pass
+
+    with pytest.raises(TypeError, match="frozen dataclass"):
+        register_task(Loose)
+    with pytest.raises(TypeError, match="no task"):
+        register_task("corridor")
+
+    @dataclass(frozen=True)
+    class Misspelt(Corridor):
+        budgets: ClassVar = {"cpu": Budget(100, learner={"learning_rate": 1.0})}
+
+    with pytest.raises(ValueError, match="there is no 'learning_rate' to change"):
+        find_preset("cpu", Misspelt())
+    with pytest.raises(OptionError, match="no field 'wdith'"):
+        read_fields(Corridor(), ["wdith=2"])
+    assert read_fields(Slalom(), ["poles=1,3", "width=2"]) == {"poles": (1.0, 3.0), "width": 2.0}
+
+
+@pytest.mark.quick
+def test_an_ending_with_a_name_of_the_library_is_refused():
+    @dataclass(frozen=True)
+    class Late(Task):
+        def endings(self, moment):
+            return {"timeout": moment.time_s > 1.0}
+
+    env, params = make_env(Late())
+    with pytest.raises(ValueError, match="ending 'timeout' is the library's own"):
+        jax.eval_shape(lambda key: step_state(env, params, reset_state(env, params, key), jnp.zeros(2)),
+                       jax.random.key(0))  # fmt: skip
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", list(TASKS))
+def test_every_task_that_ships_begins_free_and_away_from_its_goal(name):
+    from whill_mjx.vehicle.specs import WHILL_CR
+    from whill_mjx.world.scene import clearance, footprint
+
+    task = TASKS[name]
+
+    def look(key):
+        world = task.sample_world(key)
+        start = world.start
+        free = clearance(footprint(WHILL_CR, start[0], start[1], start[2]), world.scene.boxes)
+        return free, jnp.linalg.norm(task.goal(world.scene) - start[:2])
+
+    free, away = jax.jit(jax.vmap(look))(jax.random.split(jax.random.key(1), 200))
+    assert float(free.min()) > 0.05 and float(away.min()) > task.goal_radius + 0.5
+    assert np.isfinite(away).all()

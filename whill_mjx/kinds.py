@@ -1,0 +1,213 @@
+"""What all Gymnasium environments of one kind in a process share: the static environment, spaces, compiled programs.
+
+A kind is a task with its fields, a vehicle with its parameters, what is observed, and how worlds and vehicles vary. The
+first environment of a kind compiles, every other one is ready at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import numbers
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.batch import BatchEnv, BatchState, make_batch
+from whill_mjx.env import POSE_METRICS, make_env, observe
+from whill_mjx.evaluation.conditions import NAMES, Condition, begin_under, nominal
+from whill_mjx.vehicle.types import TimeStep
+
+OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
+"""What `reset(options=...)` may change of an episode; docs/evaluate.md says what each means."""
+COUNTED = ("timeout", "time_s", "episode_return")
+"""Metrics of an end that are in no `info`: Gymnasium tells them otherwise."""
+FORKED = (
+    "JAX was started before this process was forked, and its threads do not survive a fork: the environment would "
+    'hang. Use gymnasium.vector.AsyncVectorEnv(..., context="spawn"), or WhillVectorEnv, which computes all '
+    "instances in one program."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """Compiled once per process and number of instances."""
+
+    batch: BatchEnv
+    observation_space: gymnasium.Space
+    action_space: gymnasium.spaces.Box
+
+    @cached_property
+    def reset(self) -> Any:
+        """(origin, condition or None) -> state and first time step of one instance."""
+
+        def begin(origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
+            change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
+            return strong(self.batch.begin_one(origin, change))
+
+        return jax.jit(begin)
+
+    @cached_property
+    def step(self) -> Any:
+        """(state, action) -> state and time step of one instance."""
+        return jax.jit(lambda state, action: strong(self.batch.step_one(state, action)))
+
+    @cached_property
+    def reset_all(self) -> Any:
+        """(origins (N,), condition or None) -> state and first time steps."""
+
+        def begin(origins: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
+            change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
+            return strong(jax.vmap(lambda origin: self.batch.begin_one(origin, change))(origins))
+
+        return jax.jit(begin)
+
+    @cached_property
+    def step_all(self) -> Any:
+        """(state, actions (N, 2)) -> state and time steps; nothing begins anew."""
+        return jax.jit(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
+
+    @cached_property
+    def step_or_reset(self) -> Any:
+        """(state, actions (N, 2)) -> state and time steps; instances that have ended begin a new episode instead."""
+        return jax.jit(lambda state, actions: strong(self.batch.step(state, actions)))
+
+    @cached_property
+    def restart(self) -> Any:
+        """(state, time steps, mask (N,), origins (N,)) -> the same with new episodes where the mask is set."""
+
+        def begin(state: BatchState, steps: TimeStep, mask: jax.Array, origins: jax.Array):
+            fresh = jax.vmap(self.batch.begin_one)(origins)
+
+            def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+                return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            return strong(jax.tree.map(choose, fresh, (state, steps)))
+
+        return jax.jit(begin)
+
+    @cached_property
+    def picture(self) -> Any:
+        """State -> camera image (H, W, 3) uint8 of one instance."""
+        return jax.jit(lambda state: observe(self.batch.env, state.env))
+
+
+def strong(tree: Any) -> Any:
+    """The arrays with types that do not give way: a state from a reset and one from a step are then of one program."""
+    return jax.tree.map(lambda leaf: leaf if _is_key(leaf) else jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+_KINDS: dict[Any, Kind] = {}
+_forked = False
+
+
+def find_kind(arguments: Mapping[str, Any]) -> Kind:
+    """The kind of environment that these arguments of `make_env`, and `spread`, give.
+
+    Raises:
+        ValueError: of `make_env`.
+        RuntimeError: this process was forked from one in which JAX runs, and the kind is new.
+    """
+    key = _key_of(arguments)
+    if key not in _KINDS:
+        if _forked:
+            raise RuntimeError(FORKED)
+        _KINDS[key] = _make_kind(dict(arguments))
+    return _KINDS[key]
+
+
+def check_process() -> None:
+    """Raise RuntimeError in a process that was forked from one in which JAX runs."""
+    if _forked:
+        raise RuntimeError(FORKED)
+
+
+def _make_kind(arguments: dict[str, Any]) -> Kind:
+    spread = arguments.pop("spread", 0.0)
+    env, params = make_env(**arguments)
+    same = _static(env, params, spread)
+    if same in _KINDS:
+        return _KINDS[same]
+    actions = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    _KINDS[same] = Kind(make_batch(env, params, 1, spread), space_of(env), actions)
+    return _KINDS[same]
+
+
+def _static(env: Any, params: Any, spread: float) -> Any:
+    """What makes two environments the same program."""
+    parts = [getattr(env, field.name) for field in dataclasses.fields(env) if field.name != "model"]
+    leaves, tree = jax.tree.flatten(params)
+    return (env.model.spec, env.model.config, *parts, tree, tuple(float(leaf) for leaf in leaves), spread)
+
+
+def _key_of(arguments: Mapping[str, Any]) -> Any:
+    """Arguments as they were given; a vehicle file counts by its content."""
+    values = []
+    for name in sorted(arguments):
+        value = arguments[name]
+        if name == "vehicle" and isinstance(value, str | os.PathLike) and os.path.isfile(value):
+            value = (os.path.abspath(value), os.stat(value).st_mtime_ns)
+        if isinstance(value, Mapping):
+            value = tuple(sorted(value.items()))
+        elif isinstance(value, list):
+            value = tuple(value)
+        elif isinstance(value, tuple) and name == "vehicle" and len(value) == 2 and not isinstance(value[0], str):
+            leaves, tree = jax.tree.flatten(value[1])
+            value = (value[0], tree, tuple(float(leaf) for leaf in leaves))
+        values.append((name, value))
+    return tuple(values)
+
+
+def space_of(env: Any) -> gymnasium.Space:
+    """Observation space of an environment: a box of bytes, or a dict of the sensors' boxes."""
+    if not env.sensors:
+        return gymnasium.spaces.Box(0, 255, (env.height, env.width, 3), np.uint8)
+    boxes: dict[str, gymnasium.Space] = {}
+    for name, sensor in env.sensors:
+        reading = sensor.reading(env)
+        boxes[name] = gymnasium.spaces.Box(reading.low, reading.high, reading.shape, reading.dtype)
+    return gymnasium.spaces.Dict(boxes)
+
+
+def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
+    """The condition that `reset(options=...)` asks for; None where it asks for nothing.
+
+    Raises:
+        ValueError: an unknown option, or a value that is no finite number.
+    """
+    if not options:
+        return None
+    for name, value in options.items():
+        if name not in OPTIONS:
+            raise ValueError(f"reset has no option {name!r} (known: {', '.join(OPTIONS)}). Correct the name, or leave "
+                             "it out.")
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+            raise ValueError(f"option {name} is {value!r}; it must be a finite number. Correct it.")
+    return dataclasses.replace(nominal(), **{name: jnp.asarray(value, float) for name, value in options.items()})
+
+
+def info_names(metrics: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Names of the numbers and of the flags of an `info`."""
+    return list(POSE_METRICS), [name for name in metrics if name not in (*POSE_METRICS, *COUNTED)]
+
+
+def _after_fork() -> None:
+    global _forked
+    from jax._src import xla_bridge
+
+    started = getattr(xla_bridge, "backends_are_initialized", None)
+    _forked = started() if started else True
+
+
+os.register_at_fork(after_in_child=_after_fork)

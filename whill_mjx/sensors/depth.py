@@ -1,0 +1,54 @@
+"""A depth camera at the place of the vehicle's camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.world.render import pinhole, render_frame
+
+
+@dataclass(frozen=True)
+class Depth(Sensor):
+    """Distance along the optical axis (H, W) [m], at most `reach`; or as bytes (H, W, 1), 255 at the lens."""
+
+    name: ClassVar[str] = "depth"
+    visual: ClassVar[bool] = True
+
+    height: int | None = None
+    """Rows; None takes those of the environment."""
+    width: int | None = None
+    """Columns; None takes those of the environment."""
+    reach: float = 10.0
+    """Largest distance [m]; what is farther, and the sky, shows it."""
+    as_bytes: bool = False
+    """Bytes, as the learners read images, instead of metres."""
+
+    def size(self, env: Any) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.height or env.height, self.width or env.width
+
+    def reading(self, env: Any) -> Reading:
+        if self.as_bytes:
+            return Reading((*self.size(env), 1), 0, 255, np.uint8)
+        return Reading(self.size(env), 0.0, self.reach)
+
+    def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
+        env, state = view.env, view.state
+        position, rotation = camera_pose(env.model, state.vehicle.qpos)
+        height, width = self.size(env)
+        intrinsics = pinhole(env.model.spec.camera.fov_y, height, width)
+        depth = render_frame(position, rotation, intrinsics, state.scene, height, width).depth
+        depth = jnp.clip(depth, 0.0, self.reach)
+        if not self.as_bytes:
+            return memory, depth
+        return memory, jnp.round(255.0 * (1.0 - depth / self.reach))[..., None]
+
+    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
+        return value[..., ::-1, :] if self.as_bytes else value[..., ::-1]

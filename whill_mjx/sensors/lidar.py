@@ -1,0 +1,81 @@
+"""A scanning range finder in a horizontal plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.world.scene import Boxes
+
+
+@dataclass(frozen=True)
+class Lidar(Sensor):
+    """Distances (rays,) [m] to the first box in each direction, at most `reach`; the vehicle itself is not seen.
+
+    Ray k looks (k + 0.5) / rays of the field of view to the left of its right edge. The scan is level: the tilt of the
+    vehicle is not followed. Round things (`Scene.solids`) are not met.
+    """
+
+    name: ClassVar[str] = "lidar"
+
+    rays: int = 360
+    fov: float = 2.0 * math.pi
+    """Field of view [rad], centred straight ahead."""
+    reach: float = 10.0
+    """Largest distance [m]."""
+    x: float = 0.0
+    """Ahead of the chassis origin [m]."""
+    y: float = 0.0
+    """To the left of it [m]."""
+    z: float = 0.2
+    """Height above the ground [m]; boxes that end below are not met."""
+    yaw: float = 0.0
+    """Turn to the left [rad]."""
+
+    def angles(self) -> np.ndarray:
+        """(rays,) rad, from straight ahead of the vehicle to the left."""
+        return self.yaw + self.fov * ((np.arange(self.rays) + 0.5) / self.rays - 0.5)
+
+    def reading(self, env: Any) -> Reading:
+        return Reading((self.rays,), 0.0, self.reach)
+
+    def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
+        body = view.moment.body
+        c, s = jnp.cos(body.yaw), jnp.sin(body.yaw)
+        x, y = body.x + self.x * c - self.y * s, body.y + self.x * s + self.y * c
+        return memory, distances(x, y, body.yaw + self.angles(), view.moment.scene.boxes, self.reach, self.z, self.z)
+
+    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
+        return value[..., ::-1]
+
+
+def distances(
+    x: jax.Array, y: jax.Array, angles: jax.Array, boxes: Boxes, reach: float, low: float, high: Any
+) -> jax.Array:
+    """(R,) m from a place to the first box in each direction, at most `reach`.
+
+    Args:
+        x, y: () m, where the rays begin.
+        angles: (R,) rad in the room.
+        boxes: what they meet.
+        reach: largest distance [m].
+        low, high: heights [m]; boxes that end below `low` or begin at `high` or above are not met.
+    """
+    turn = angles[:, None] - boxes.yaw  # (R, P): direction in each box's frame
+    dx, dy = x - boxes.centre[:, 0], y - boxes.centre[:, 1]
+    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
+    start = jnp.stack([dx * c + dy * s, dy * c - dx * s])[:, None]  # (2, 1, P)
+    way = jnp.stack([jnp.cos(turn), jnp.sin(turn)])  # (2, R, P)
+    way = jnp.where(jnp.abs(way) < 1e-6, 1e-6, way)
+    half = jnp.stack([boxes.half[:, 0], boxes.half[:, 1]])[:, None]
+    ends = jnp.stack([(-half - start) / way, (half - start) / way])  # (2, 2, R, P)
+    enter, leave = ends.min(0).max(0), ends.max(0).min(0)
+    bottom, top = boxes.centre[:, 2] - boxes.half[:, 2], boxes.centre[:, 2] + boxes.half[:, 2]
+    met = (leave >= jnp.maximum(enter, 0.0)) & boxes.mask & (bottom < high) & (top >= low)
+    return jnp.min(jnp.where(met, jnp.maximum(enter, 0.0), reach), -1, initial=reach)

@@ -1,0 +1,62 @@
+"""Occupancy grids: what is free, unknown and occupied, and the borders of the free space.
+
+World frame: that of the map's file, x and y in m. The origin's yaw turns the grid about its lower left corner, as
+map_server defines it. Everything here is the host's work, in numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+FREE, UNKNOWN, OCCUPIED = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """Occupancy grid."""
+
+    cells: np.ndarray
+    """(rows, columns) uint8 of FREE, UNKNOWN and OCCUPIED; row 0 is at the bottom, where y begins."""
+    resolution: float
+    """Edge of a cell [m]."""
+    origin: tuple[float, float, float]
+    """x [m], y [m], yaw [rad] of the lower left corner of the grid."""
+    occupancy: np.ndarray | None = None
+    """(rows, columns) int8: the values of nav2's OccupancyGrid, 0 to 100 and -1 for unknown; None of made grids."""
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """World coordinates (..., 2) of points (..., 2) in the grid's own frame [m]."""
+        x, y, yaw = self.origin
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return points @ np.array([[cos, sin], [-sin, cos]]) + np.array([x, y])
+
+    def free_points(self) -> np.ndarray:
+        """(F, 2) world coordinates of the centres of all free cells."""
+        rows, columns = np.nonzero(self.cells == FREE)
+        return self.to_world((np.stack([columns, rows], -1) + 0.5) * self.resolution)
+
+
+def wall_segments(grid: GridMap) -> np.ndarray:
+    """Borders of the free space as straight segments (S, 2, 2), world coordinates [m].
+
+    Edges between a free cell and one that is not, each run along a row or a column joined to one segment. The free
+    space lies to the left of the way from a segment's first point to its second.
+    """
+    free = np.pad(grid.cells == FREE, 1)
+    segments: list[np.ndarray] = []
+    for transposed in (False, True):
+        field = free.T if transposed else free
+        for side in (1, -1):
+            # Free cells whose neighbour in the row before (side 1) or after (side -1) is not free.
+            border = field & ~np.roll(field, side, axis=0)
+            starts = np.argwhere(border & ~np.roll(border, 1, axis=1))
+            ends = np.argwhere(border & ~np.roll(border, -1, axis=1))
+            line = starts[:, 0] - 1 + (side < 0)  # the padding of one cell taken off
+            first, last = starts[:, 1] - 1, ends[:, 1]
+            run = np.stack([np.stack([first, line], -1), np.stack([last, line], -1)], 1).astype(float)
+            run = run[..., ::-1] if transposed else run
+            segments.append(run[:, ::-1] if (side < 0) != transposed else run)
+    return grid.to_world(np.concatenate(segments) * grid.resolution)

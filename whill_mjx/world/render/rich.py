@@ -1,0 +1,148 @@
+"""Colour of what a ray meets in a world with rich looks: procedural materials, lamps, soft shadows, sunlight, gloss.
+
+One formula draws all materials: cells with joints, a tone by cell, blotches and grain. Which one it is, is numbers of
+its label, so that a pixel costs the same whatever it shows. Elementwise, shared by both renderers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.world.render.textures import random_cell, smooth_noise
+from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
+
+NUMBERS = 26
+"""Numbers of a material in the table."""
+WRAP = 0.3
+"""Share of a lamp's light that comes around corners: lamps are wide, and walls throw light back."""
+
+
+def material_table(materials: Any) -> jax.Array:
+    """(L, NUMBERS) of materials: see `shade_rich` for the places."""
+    inverse = 1.0 / jnp.maximum(materials.cell, 1e-3)
+    columns = [
+        materials.paint, materials.second, materials.band_paint, inverse, materials.shift[:, None],
+        0.5 * materials.joint[:, None] * inverse, materials.joint_tone[:, None], materials.tone[:, None],
+        materials.fill[:, None], materials.blotch[:, None], 1.0 / materials.blotch_size[:, None],
+        materials.grain[:, None], 1.0 / materials.grain_size, materials.band, materials.glow[:, None],
+        materials.gloss[:, None],
+    ]  # fmt: skip
+    return jnp.concatenate(columns, 1)
+
+
+def shade_rich(view: Any, stage: Any, rays: Rays, code, solid, seen, depth) -> list:
+    """Three arrays: the root of the linear light that comes from what rays meet, or of the sky."""
+    lights, seed = view.lights, view.looks.seed
+    depth = jnp.where(seen, depth, 0.0)
+    point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
+    code = jnp.where(solid, code, 4 * GROUND)
+    row, m = stage.row(code), stage.material(code >> 2)
+    normal = face_normal(row, *point)
+    length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
+    facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
+    pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
+    paint, tone = stage.settle(_paint(stage, row, m, point, pixel, code >> 2, seed))
+    light = stage.settle(_light(lights, normal, point))
+    gleam = m[25] * _mirror(lights, rays, point, facing) * jnp.where(normal[2] > 0.9, 1.0, 0.0)
+    looks, height = view.looks, jnp.clip(rays.z * length, 0.0, 1.0)
+    colours = []
+    for channel in range(3):
+        sky = looks.sky_horizon[channel] + height * (looks.sky_zenith[channel] - looks.sky_horizon[channel])
+        value = paint[channel] * (tone * light[channel] + m[24]) + gleam * lights.colour[0, channel]
+        value = jnp.maximum(value * lights.exposure, 0.0)
+        colours.append(jnp.where(seen, jnp.sqrt(value), sky))
+    return colours
+
+
+def _paint(stage, row, m, point, pixel, label, seed) -> tuple[list, jax.Array]:
+    """Reflectance of a surface, and the factor on it of cells, joints, blotches and grain."""
+    x, y, z = point
+    s = row[8] * x + row[9] * y + row[10] * z + row[11]
+    t = row[12] * x + row[13] * y + row[14] * z + row[15]
+    own = stage.small(label.astype(jnp.uint32)) * 17.0
+    b = t * m[10] + 0.37
+    line = jnp.floor(b)
+    a = s * m[9] + m[11] * line + 0.19
+    column = jnp.floor(a)
+    lot = random_cell(column, line, own, seed, stage.whole)
+    other = lot * 61.0 - jnp.floor(lot * 61.0)
+    cells = jnp.maximum(m[9], m[10]) * pixel  # cells in a pixel
+    fine = stage.ratio(1.0, 1.0 + 4.0 * cells * cells)
+    at_joint = jnp.maximum(jnp.abs(a - column - 0.5) + m[12], jnp.abs(b - line - 0.5) + m[13]) > 0.5
+    thin = jnp.minimum(1.0, stage.ratio(2.0 * jnp.maximum(m[12], m[13]), cells + 1e-6))  # a joint thinner than a pixel
+    joint = jnp.where(at_joint, m[14] * fine * jnp.maximum(thin, 0.35), 0.0)
+    blotch = smooth_noise(s * m[18] + own, t * m[18], seed) - 0.5
+    grains = jnp.maximum(m[20], m[21]) * pixel
+    grain = (smooth_noise(s * m[20], t * m[21] + own, seed) - 0.5) * stage.ratio(1.0, 1.0 + grains * grains)
+    tone = (1.0 + 2.0 * m[15] * fine * (lot - 0.5)) * (1.0 + 2.0 * m[17] * blotch) * (1.0 + 2.0 * m[19] * grain)
+    filled = jnp.where(other < m[16], 1.0, 0.0)
+    filled = m[16] + fine * (filled - m[16])
+    banded = (z > m[22]) & (z < m[23])
+    paint = []
+    for channel in range(3):
+        value = m[channel] + filled * (m[3 + channel] - m[channel])
+        paint.append(jnp.where(banded, m[6 + channel], value))
+    return paint, jnp.maximum(jnp.where(banded, 1.0 + 0.5 * m[17] * blotch, tone * (1.0 - joint)), 0.0)
+
+
+def _light(lights, normal, point) -> list:
+    """Light on a surface, for each channel: ambient, lamps, soft shadows near the floor, and a patch of sunlight."""
+    x, y, z = point
+    sky = 0.8 + 0.2 * normal[2]
+    near = jnp.clip((lights.half_width - jnp.abs(y)) * 4.0, 0.0, 1.0)
+    corner = jnp.where(normal[2] > 0.5, 0.75 + 0.25 * near, 0.78 + 0.22 * jnp.clip(z * 4.0, 0.0, 1.0))
+    open_ = corner * shadow_factor(lights.caster, x, y, z)
+    light = [lights.ambient[i] * sky * open_ for i in range(3)]
+    for lamp in range(lights.position.shape[0]):
+        to = [lights.position[lamp, axis] - point[axis] for axis in range(3)]
+        square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2] + 0.15
+        inverse = jax.lax.rsqrt(square)
+        cosine = (to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2]) * inverse
+        strength = jnp.maximum(WRAP + (1.0 - WRAP) * cosine, 0.05) * inverse * inverse * open_
+        light = [light[i] + strength * lights.colour[lamp, i] for i in range(3)]
+    back = jnp.abs(lights.window[0] - y) / jnp.abs(lights.sun[1])  # way back to the plane of the window
+    beside = jnp.abs(x + back * lights.sun[0] - lights.window[1])
+    above = jnp.abs(z + back * lights.sun[2] - lights.window[2])
+    inside = jnp.clip((lights.window[3] - beside) * 12.0, 0.0, 1.0)
+    inside = inside * jnp.clip((lights.window[4] - above) * 12.0, 0.0, 1.0)
+    inside = inside * jnp.clip(beside * 20.0 - 0.3, 0.0, 1.0)  # the bar in the middle of the window
+    cosine = normal[0] * lights.sun[0] + normal[1] * lights.sun[1] + normal[2] * lights.sun[2]
+    patch = inside * jnp.maximum(cosine, 0.0)
+    return [light[i] + patch * lights.sunlight[i] for i in range(3)]
+
+
+def shadow_factor(casters, x, y, z) -> jax.Array:
+    """Share of the light that things leave to a point: soft, darkest at their foot, and away from the lamps."""
+    factor = 1.0
+    for index in range(casters.shape[0]):
+        c = [casters[index, i] for i in range(10)]
+        rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point
+        dx, dy = x - c[0] - 0.5 * rise * c[7], y - c[1] - 0.5 * rise * c[8]
+        along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
+        reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
+        out = jnp.maximum(along - c[4] - reach, across - c[5] - reach)
+        soft = jnp.clip(1.0 - out / (0.06 + 0.35 * rise), 0.0, 1.0)
+        factor = factor * (1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0))
+    return factor
+
+
+def _mirror(lights, rays: Rays, point, facing) -> jax.Array:
+    """Strength of the lamps' mirror image in a smooth floor."""
+    up = jnp.maximum(jnp.abs(rays.z), 1e-3)
+    total = 0.0
+    for lamp in range(lights.position.shape[0]):
+        way = (lights.position[lamp, 2] - point[2]) / up
+        dx, dy = point[0] + way * rays.x - lights.position[lamp, 0], point[1] + way * rays.y - lights.position[lamp, 1]
+        far = 1.0 + 3.0 * (dx * dx + 4.0 * dy * dy)
+        total = total + 1.0 / (far * far)
+    glance = 1.0 - facing
+    return total * (0.08 + 0.9 * glance * glance * glance)
+
+
+def floor_light(lights: Any, x, y) -> jax.Array:
+    """() mean light on the floor and the walls near a point, for the exposure control."""
+    up = (0.0, 0.0, 1.0)
+    return sum(_light(lights, up, (x, y, 0.4 + 0.0 * x))) / 3.0  # type: ignore[arg-type, return-value]
