@@ -241,7 +241,8 @@ def _subject(
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
-        model, alone = model.with_effects(config.effects), ()
+        alone: tuple[str, ...] = ()
+        model = model.with_effects(config.effects)
         if config.calibrate and not config.parameters:
             model, alone = calibrated(model, trials)
         plant, params = model.plant, model.params if params is None else params
