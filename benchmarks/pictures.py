@@ -225,6 +225,7 @@ def office(out: Path) -> None:
 
     views = [np.asarray(view(jax.random.key(seed)))[..., ::-1] for seed in (0, 1, 2)]
     column_of = np.concatenate([np.pad(one, ((0, 11), (12, 0), (0, 0)), constant_values=255) for one in views])
+    assert above is not None
     height = above.shape[0]
     sheet = np.concatenate([above, np.resize(column_of[:height], (height, column_of.shape[1], 3))], 1)
     cv2.imwrite(str(out), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])

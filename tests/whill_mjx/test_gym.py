@@ -12,9 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from whill_mjx import kinds
-from whill_mjx.gym import WhillEnv
-from whill_mjx.gym_vector import WhillVectorEnv
+from whill_mjx.gym import WhillEnv, kinds
+from whill_mjx.gym.vector import WhillVectorEnv
 from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
 
 SHORT = ObstacleCourse(max_steps=4)

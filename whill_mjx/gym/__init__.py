@@ -1,7 +1,7 @@
 """Gymnasium for one vehicle: `WhillEnv`, and an id for every known task, such as WhillCorridor-v0.
 
 Importing this module registers the ids; `gymnasium.make("whill_mjx.gym:WhillCorridor-v0")` imports it by itself.
-Many vehicles in one program are `whill_mjx.gym_vector.WhillVectorEnv`, which `gymnasium.make_vec` makes.
+Many vehicles in one program are `whill_mjx.gym.vector.WhillVectorEnv`, which `gymnasium.make_vec` makes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from whill_mjx.env import POSE_METRICS
-from whill_mjx.kinds import Kind, check_process, condition_of, find_kind, info_names
+from whill_mjx.gym.kinds import Kind, check_process, condition_of, find_kind, info_names
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.tasks.tasks import TASKS, Task
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -83,7 +83,7 @@ class WhillEnv(gymnasium.Env):
 
         Args:
             seed: of this and all later episodes.
-            options: changes of this episode, such as {"start_y": 0.2, "light": 0.5} (`whill_mjx.kinds.OPTIONS`).
+            options: changes of this episode, such as {"start_y": 0.2, "light": 0.5} (`whill_mjx.gym.kinds.OPTIONS`).
 
         Raises:
             ValueError: an unknown option.
@@ -211,7 +211,7 @@ def register_id(task: Task) -> str:
     """Register the id of a task, and return it."""
     identity = env_id(task)
     gymnasium.register(
-        identity, entry_point="whill_mjx.gym:WhillEnv", vector_entry_point="whill_mjx.gym_vector:WhillVectorEnv",
+        identity, entry_point="whill_mjx.gym:WhillEnv", vector_entry_point="whill_mjx.gym.vector:WhillVectorEnv",
         kwargs={"task": task.name},
     )  # fmt: skip
     return identity

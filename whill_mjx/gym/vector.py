@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from whill_mjx.gym import check_render_mode
-from whill_mjx.kinds import check_process, condition_of, find_kind, info_names
+from whill_mjx.gym.kinds import check_process, condition_of, find_kind, info_names
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.tasks.tasks import Task
 from whill_mjx.vehicle.specs import VehicleSpec
