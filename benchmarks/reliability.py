@@ -114,9 +114,9 @@ def kill_again_and_again(name: str, kills: int, folder: Path, seed: int = 0) -> 
     chosen, straight, broken = random.Random(seed), folder / "straight", folder / "broken"
     began = time.monotonic()
     child = started(name, straight)
-    told = child.communicate()[1]
+    said = child.communicate()[1]
     if child.returncode:
-        raise RuntimeError(f"{name} ended with {child.returncode}: {told.strip().splitlines()[-1:]}")
+        raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
     seconds = time.monotonic() - began
     found = {"lost": 0, "half_written": 0, "different": 0, "seconds": round(seconds), "kills": 0}
     for number in (SIGNALS[k % len(SIGNALS)] for k in range(kills)):
@@ -158,9 +158,9 @@ def interrupted(names: list[str], count: int, seed: int = 0) -> Figures:
                 time.sleep(chosen.uniform(0.5, 40.0))
                 began = time.monotonic()
                 child.send_signal(signal.SIGINT)
-                told = child.communicate()[1]
+                said = child.communicate()[1]
                 seconds.append(time.monotonic() - began)
-                wrong += child.returncode != 130 or "Traceback" in told
+                wrong += child.returncode != 130 or "Traceback" in said
                 print(f"{name}: {seconds[-1]:.2f} s, exit code {child.returncode}", flush=True)
     late = figure(seconds, "s")
     return {"ctrl_c_p95_s": {**late, "value": float(np.quantile(seconds, 0.95))},

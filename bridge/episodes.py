@@ -5,7 +5,7 @@ A message is its length as four bytes, big end first, and a JSON object in UTF-8
     {"id": 1, "call": "hello", "protocol": 1, "token": "..."}
 
 and each call gets one answer, {"id": 1, "result": {...}} or {"id": 1, "error": "..."}. After bytes that are no message
-the server says so and closes. It listens on the loopback address unless told of another, which needs a token.
+the server says so and closes. It listens on the loopback address unless another is given, which needs a token.
 
 | call | arguments | result |
 |---|---|---|

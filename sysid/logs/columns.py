@@ -170,8 +170,8 @@ def _by_name(table: Table, name: str) -> Column | None:
         if words[-1] in ("nsecs", "nsec", "nanosec") and "+" not in name and {"header", "stamp"} & set(words):
             return None  # the rest of a second; joined with secs when read
         return Column("time", table.stem, name, unit, "its name")
-    told = {one for known in STREAM_WORDS.values() for one in known}
-    quantity = _quantity([word for word in words if word not in told] or words)
+    stream_words = {one for known in STREAM_WORDS.values() for one in known}
+    quantity = _quantity([word for word in words if word not in stream_words] or words)
     if quantity is None:
         return None
     stream, sure = _stream(words, _words(table.stem), quantity, table)

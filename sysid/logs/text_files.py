@@ -154,8 +154,8 @@ def _each_whole(tables: Sequence[Table]) -> bool:
 
 def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple[list[Column], list[str]]:
     """What the columns hold: as said, as guessed from names and numbers, and as answered on a terminal."""
-    told = [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
-    columns = guess(tables, told)
+    decided = [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
+    columns = guess(tables, decided)
     problem = _problem(tables, columns)
     if problem and sys.stdin.isatty() and sys.stdout.isatty():
         print(f"{source}: {problem}\nGuessed:")
@@ -163,8 +163,8 @@ def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple
             print(f"  {one}" + (f"   ({one.why})" if one.why else ""))
         print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
         answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
-        told += [read_decision(text, tables) for text in answer.split()]
-        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, told)]
+        decided += [read_decision(text, tables) for text in answer.split()]
+        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, decided)]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
         names = [f"{table.stem}/{name}" for table in tables for name in table.columns]

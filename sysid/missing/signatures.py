@@ -73,7 +73,7 @@ def signature_columns(
         pair = axis.signed or axis.dependent
         change = flat[cursor] - (flat[cursor + 1] if pair else at)
         if axis.dependent and np.abs(change).max() < UNSEEN * np.abs(flat[cursor] - at).max():
-            change = flat[cursor] - at  # nothing tells the two apart here: not a column of its own
+            change = flat[cursor] - at  # nothing separates the two here: not a column of its own
         parts.append(change / span)
         cursor += 2 if pair else 1
         if position == 0:

@@ -14,8 +14,8 @@ SIZES = {
     "wheel radius": ("wheel_radius_difference.common", "wheels.radius"),
     "track": ("track_width.error", "wheels.track"),
 }
-UNKNOWN = ("Without an outside pose this log cannot tell a wrong wheel radius, track or odometry's scale from one "
-           "another: they are taken as stated, and the odometry's path has their error.")
+UNKNOWN = ("Without an outside pose this log does not separate errors of wheel radius, track and odometry's scale "
+           "from one another: they are taken as stated, and the odometry's path has their error.")
 
 
 def calibration_notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:

@@ -108,7 +108,7 @@ def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...
 
     A command fixes how fast wheels turn, an outside pose how far the vehicle comes by that: both together show radii
     and track. The odometry beside them shows the sizes that it takes for them, and the pose itself which point of the
-    vehicle it follows. Without an outside pose nothing tells them apart. On a skid drive wheels slip in every turn, and
+    vehicle it follows. Without an outside pose nothing separates them. On a skid drive wheels slip in every turn, and
     the track has no part of its own in that.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):

@@ -26,7 +26,7 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
         wheels: joints or actuators that were named; of two the first is the left one.
 
     Raises:
-        ValueError: they cannot be told, or do not stand in pairs.
+        ValueError: their names do not show them, or they do not stand in pairs.
     """
     hinges = {joint.name: joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name}
     driven = {actuator.name: actuator.target for actuator in spec.actuators}
@@ -45,10 +45,10 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
     rolling = [name for name, joint in hinges.items() if _rolls(joint)]
     wheels_alone = [name for name in rolling if not PASSIVE.search(f"{name} {hinges[name].parent.name}")]
     for names in ([name for name in pulled if name in rolling], wheels_alone, rolling):
-        told = all(map(_side, names)) if len(names) == 2 else len(names) in (4, 6)
-        if told and (in_order := _by_side(spec, names)) is not None:
+        sided = all(map(_side, names)) if len(names) == 2 else len(names) in (4, 6)
+        if sided and (in_order := _by_side(spec, names)) is not None:
             return in_order
-    raise ValueError(f"{path}: the driven wheels cannot be told by their names (joints: {', '.join(hinges)}). Name "
+    raise ValueError(f"{path}: the names do not show which wheels are driven (joints: {', '.join(hinges)}). Name "
                      "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four or six.")
 
 

@@ -28,7 +28,7 @@ from whill_mjx.vehicle.types import TimeStep
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
 """What `reset(options=...)` may change of an episode; docs/evaluate.md says what each means."""
 COUNTED = ("timeout", "time_s", "episode_return")
-"""Metrics of an end that are in no `info`: Gymnasium tells them otherwise."""
+"""Metrics of an end that are in no `info`: Gymnasium reports them otherwise."""
 FORKED = (
     "JAX was started before this process was forked, and its threads do not survive a fork: the environment would "
     'hang. Use gymnasium.vector.AsyncVectorEnv(..., context="spawn"), or WhillVectorEnv, which computes all '

@@ -130,8 +130,8 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         info: dict[str, Any] = {}
         for index in np.flatnonzero(ended):
             last = jax.tree.map(lambda leaf, index=index: leaf[index], obs)
-            told = {name: value[index].item() for name, value in now.items() if not name.startswith("_")}
-            info = self._add_info(info, {"final_obs": last, "final_info": told}, int(index))
+            named = {name: value[index].item() for name, value in now.items() if not name.startswith("_")}
+            info = self._add_info(info, {"final_obs": last, "final_info": named}, int(index))
         self._state, self._step = self._kind.restart(self._state, self._step, ended, self._origins(None, ended))
         obs, now = self._observed(self._step)
         return obs, reward, terminated, truncated, {**now, **info}

@@ -22,8 +22,8 @@ class Odometry(Sensor):
         return Reading((5,))
 
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
-        told = view.state.vehicle.odometry
-        return memory, jnp.stack([told.x, told.y, told.yaw, told.v, told.omega])
+        reported = view.state.vehicle.odometry
+        return memory, jnp.stack([reported.x, reported.y, reported.yaw, reported.v, reported.omega])
 
     def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
         return value * np.array([1.0, -1.0, -1.0, 1.0, -1.0], np.float32)

@@ -163,7 +163,7 @@ def tasks_in(module: ModuleType) -> dict[str, Task]:
 
 
 def source_of(task: Task) -> str | None:
-    """SHA-256 of the file that defines a task; None for the tasks of this package, which its version tells apart."""
+    """SHA-256 of the file that defines a task; None for the tasks of this package, which its version identifies."""
     kind = type(task)
     if kind.__module__.startswith("whill_mjx."):
         return None
