@@ -21,8 +21,12 @@ from whill_mjx.world.render import camera_rotation, pinhole, render_frame
 from whill_mjx.world.scene import Footprint, box, no_boxes, stack_boxes
 from whill_mjx.world.solids import person
 
-MAPS = ("stata_basement/stata_basement", "willow_garage/willow-full", "fetch_office/3_1_16_localization",
-        "fetch_office/9_16_15")
+MAPS = (
+    "stata_basement/stata_basement",
+    "willow_garage/willow-full",
+    "fetch_office/3_1_16_localization",
+    "fetch_office/9_16_15",
+)
 MOST = 2000
 """Walls of the image that counts as right: the nearest ones."""
 SPEED, YAW_RATE, PERIOD = 1.67, 1.0, 0.1
@@ -95,14 +99,16 @@ def deepest(kind: str, tries: int) -> float:
         before = Footprint(x, y, jnp.pi * yaw, half[0], half[1], jnp.asarray(0.9))
         reach, turn = SPEED * PERIOD * jnp.sign(speed), turn * YAW_RATE * PERIOD
         middle = before.yaw + turn / 2
-        after = dataclasses.replace(before, x=x + reach * jnp.cos(middle), y=y + reach * jnp.sin(middle),
-                                    yaw=before.yaw + turn)
+        after = dataclasses.replace(
+            before, x=x + reach * jnp.cos(middle), y=y + reach * jnp.sin(middle), yaw=before.yaw + turn
+        )
         _, share = first_contact(before, after, things, count)
 
         def depth(part):
             part = part * share
-            pose = dataclasses.replace(before, x=x + part * (after.x - x), y=y + part * (after.y - y),
-                                       yaw=before.yaw + part * turn)
+            pose = dataclasses.replace(
+                before, x=x + part * (after.x - x), y=y + part * (after.y - y), yaw=before.yaw + part * turn
+            )
 
             def smaller(low_high, _):
                 low, high = low_high

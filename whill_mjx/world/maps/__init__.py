@@ -1,14 +1,14 @@
 """Maps of real places as worlds to drive in.
 
-    images      image files as grey levels
-    nav2        nav2's YAML and image as an occupancy grid, by nav2's rule
-    footprints  buildings of OpenStreetMap and CityGML as an occupancy grid
-    grid        occupancy grid, borders of the free space
-    straight    long straight walls from the borders of cells
-    field       distance to the nearest thing
-    walls       which walls rays meet and a camera sees
-    places      starts and goals with a way between them
-    playable    all that as the world of an episode
+images      image files as grey levels
+nav2        nav2's YAML and image as an occupancy grid, by nav2's rule
+footprints  buildings of OpenStreetMap and CityGML as an occupancy grid
+grid        occupancy grid, borders of the free space
+straight    long straight walls from the borders of cells
+field       distance to the nearest thing
+walls       which walls rays meet and a camera sees
+places      starts and goals with a way between them
+playable    all that as the world of an episode
 """
 
 from whill_mjx.world.maps.field import DistanceField, distance_at, distance_field, map_clearance

@@ -67,8 +67,10 @@ def load_footprints(path: str | Path, resolution: float = 0.1) -> GridMap:
     low, high = corners.min(0) - MARGIN, corners.max(0) + MARGIN
     columns, rows = np.ceil((high - low) / resolution).astype(int)
     if not np.isfinite(corners).all() or rows * columns > MAX_CELLS:
-        raise ValueError(f"{path}: spans {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, over {MAX_CELLS} cells of "
-                         f"{resolution:g} m. Cut the file or take larger cells.")
+        raise ValueError(
+            f"{path}: spans {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, over {MAX_CELLS} cells of "
+            f"{resolution:g} m. Cut the file or take larger cells."
+        )
     cells = np.zeros((rows, columns), np.uint8)
     for rings in buildings:
         # Corners of cells lie at whole numbers; fillPoly counts from the centres of pixels, in 1/256 of them.
@@ -95,10 +97,16 @@ def _name(element: ET.Element) -> str:
 
 def _osm(root: ET.Element) -> list[list[Ring]]:
     """Rings of every building, the outer ones first; a building is a closed way or a multipolygon."""
-    places = {node.get("id"): (float(node.get("lat", "nan")), float(node.get("lon", "nan")))
-              for node in root.iter("node") if node.get("visible") != "false" and node.get("lat")}
-    ways = {way.get("id"): [place for one in way.iter("nd") if (place := places.get(one.get("ref")))]
-            for way in root.iter("way") if way.get("visible") != "false"}
+    places = {
+        node.get("id"): (float(node.get("lat", "nan")), float(node.get("lon", "nan")))
+        for node in root.iter("node")
+        if node.get("visible") != "false" and node.get("lat")
+    }
+    ways = {
+        way.get("id"): [place for one in way.iter("nd") if (place := places.get(one.get("ref")))]
+        for way in root.iter("way")
+        if way.get("visible") != "false"
+    }
     chosen: list[list[list[tuple[float, float]]]] = []
     for way in root.iter("way"):
         ring = ways.get(way.get("id"), [])
@@ -162,8 +170,11 @@ def _rings(polygon: ET.Element) -> list[Ring]:
             continue
         lists = [one for one in ring if _name(one) == "posList"]
         size = int((lists[0].get("srsDimension") if lists else None) or 3)
-        numbers = [float(word) for one in (lists or [one for one in ring if _name(one) == "pos"])
-                   for word in (one.text or "").split()]
+        numbers = [
+            float(word)
+            for one in (lists or [one for one in ring if _name(one) == "pos"])
+            for word in (one.text or "").split()
+        ]
         if len(numbers) % size:
             raise ValueError(f"{len(numbers)} numbers in points of {size}")
         rings.append(np.array(numbers).reshape(-1, size)[:, :2])

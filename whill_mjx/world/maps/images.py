@@ -41,8 +41,10 @@ def read_levels(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     if size is None:
         raise ValueError(f"{path}: {PROBLEM}")
     if max(size) > LONGEST_SIDE or size[0] * size[1] > MAX_PIXELS:
-        raise ValueError(f"{path}: is {size[0]} x {size[1]} pixels; at most {MAX_PIXELS} pixels, {LONGEST_SIDE} a side,"
-                         " are read. Cut the map.")
+        raise ValueError(
+            f"{path}: is {size[0]} x {size[1]} pixels; at most {MAX_PIXELS} pixels, {LONGEST_SIDE} a side,"
+            " are read. Cut the map."
+        )
     samples, alpha = (_netpbm(path, data), None) if data[:1] == b"P" else _decoded(path, data)
     return (_upper_byte(samples) if samples.ndim == 2 else luma(samples)), alpha
 

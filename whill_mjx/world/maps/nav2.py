@@ -32,8 +32,10 @@ def load_map(path: str | Path) -> GridMap:
     table = check_table(str(path), MAP, read_map_yaml(path))
     occupied, free = table["occupied_thresh"], table["free_thresh"]
     if not free < occupied:
-        raise ValueError(f"{path}: free_thresh is {free:g} and occupied_thresh {occupied:g}; the first must be less. "
-                         "Correct the file.")
+        raise ValueError(
+            f"{path}: free_thresh is {free:g} and occupied_thresh {occupied:g}; the first must be less. "
+            "Correct the file."
+        )
     mode = table.get("mode", "trinary")
     levels, alpha = read_levels(path.parent / table["image"])
     occupancy = level_occupancy(mode, occupied, free, bool(table["negate"]))[levels]
@@ -95,8 +97,10 @@ def read_map_yaml(path: Path) -> dict[str, Any]:
         reason = " ".join(str(getattr(error, "problem", None) or "nested too deep or no text").split())
         raise ValueError(f"{path}{place}: is no YAML ({reason[:80]}). Correct the file.") from None
     if not isinstance(node, yaml.MappingNode):
-        raise ValueError(f"{path}: has no fields; a map has image, resolution, origin, negate, occupied_thresh and "
-                         "free_thresh. Give the YAML file of a map.")
+        raise ValueError(
+            f"{path}: has no fields; a map has image, resolution, origin, negate, occupied_thresh and "
+            "free_thresh. Give the YAML file of a map."
+        )
     fields = {field.name: field for field in MAP}
     table: dict[str, Any] = {}
     for key, value in node.value:

@@ -100,5 +100,6 @@ def draw_places(
     if not starts:
         raise ValueError(
             f"the map has no start and goal {reach.nearest:g} to {reach.farthest:g} m apart: its widest place has "
-            f"{clear.max():.2f} m of clearance, its longest way is {longest:.1f} m. Ask for less, or check the scale.")
+            f"{clear.max():.2f} m of clearance, its longest way is {longest:.1f} m. Ask for less, or check the scale."
+        )
     return Places(np.concatenate(starts), np.concatenate(ends), np.concatenate(ways))

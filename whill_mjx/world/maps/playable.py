@@ -65,8 +65,10 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, se
     clear = clearances(space, grid.resolution)
     space = connected(space, clear >= reach.passing)
     if not space.any():
-        raise ValueError(f"the map's widest place has {clear.max():.2f} m of clearance, and the vehicle needs "
-                         f"{reach.passing:g} m. Check the resolution and the thresholds.")
+        raise ValueError(
+            f"the map's widest place has {clear.max():.2f} m of clearance, and the vehicle needs "
+            f"{reach.passing:g} m. Check the resolution and the thresholds."
+        )
     places = draw_places(grid, space, reach, seed=seed)
     return MapScene(grid, space, map_walls(straight_walls(grid, space), keep), places)
 
