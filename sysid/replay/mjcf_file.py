@@ -20,7 +20,6 @@ from whill_mjx.logs.dataset import write_text
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
-STEP = 0.005  # s, physics step of a URDF on two wheels: it settles and drives as with MuJoCo's 2 ms
 STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
@@ -194,7 +193,7 @@ def load_robot(
         joints = wheel_joints(path, spec, wheels)
         if stated is not None:
             if len(joints) == 2:
-                spec.option.timestep, spec.option.impratio = STEP, STIFF  # the file has none
+                spec.option.impratio = STIFF  # the file has none
             replaced += _as_in_gazebo(path, spec, joints)
         _complete(path, spec, joints)
         if timestep is not None:

@@ -263,7 +263,7 @@ def test_a_start_is_that_of_the_tracked_point_also_where_the_room_matters(small_
     start = jnp.array([1.0, 2.0, 0.3, 0.0, 0.0])
     command = jnp.zeros((30, 2, 2)).at[..., 0].set(0.2)
     path = jax.jit(lambda command: path_of(plant, turned, command, start))(command)
-    np.testing.assert_allclose(path[0, :3], start[:3], atol=1e-5)
+    np.testing.assert_allclose(path[0, :3], start[:3], atol=1e-4)
     moved = np.asarray(path[-1, :2] - path[0, :2])
     np.testing.assert_allclose(np.arctan2(moved[1], moved[0]), 0.3 - 0.5, atol=1e-3)
 
