@@ -44,8 +44,10 @@ SHOWN = {"bump": {"rise": 0.02, "width": 0.3, "x": 0.9, "y": 0.2},
          "pid_drive": {"kp": 5.0, "ki": 2.0, "kd": 0.1, "integral_limit": 0.02}}  # fmt: skip
 ELSEWHERE = {"unnamed"}
 """Tables, most of whose knots one drive does not reach: test_catalogue.py and test_effect_unnamed.py."""
-SILENT = {"command_delay.delay", "command_dead_zone.linear", "command_dead_zone.wheel"}
-"""Parameters that this drive does not tell: the ramp behind a delay swallows it, v and wheel speeds stay large."""
+SILENT = {"command_delay.delay", "command_dead_zone.linear", "command_dead_zone.wheel", "motor_line.no_load_speed",
+          "motor_line.droop"}
+"""Parameters that this drive does not tell: the ramp behind a delay swallows it, v and wheel speeds stay large, and the
+chair's torques end far below the line of a motor."""
 
 
 GROUPS = {"drive": ("command", "actuation", "sensing"), "ground": ("force", "world")}
