@@ -45,15 +45,9 @@ _HOMES = {
     "step": "whill_mjx.env",
     "make_batch": "whill_mjx.batch",
     "WhillEnv": "whill_mjx.gym",
-    "WhillVectorEnv": "whill_mjx.gym_vector",
     "ObstacleCourse": "whill_mjx.tasks.tasks",
     "Corridor": "whill_mjx.tasks.tasks",
-    "Task": "whill_mjx.tasks.tasks",
-    "World": "whill_mjx.tasks.tasks",
-    "Budget": "whill_mjx.tasks.tasks",
-    "register_task": "whill_mjx.tasks.tasks",
     "VehicleSpec": "whill_mjx.vehicle.specs",
-    "CameraMount": "whill_mjx.vehicle.specs",
     "VehicleConfig": "whill_mjx.vehicle.config",
     "VehicleParams": "whill_mjx.vehicle.types",
     "preset": "whill_mjx.vehicle.presets",
@@ -68,15 +62,25 @@ _HOMES = {
     "load_policy": "whill_mjx.evaluation.policy_file",
     "share_results": "whill_mjx.processor",
 }
+_EXTENDING = {
+    "Task": "whill_mjx.tasks.tasks",
+    "World": "whill_mjx.tasks.tasks",
+    "Budget": "whill_mjx.tasks.tasks",
+    "register_task": "whill_mjx.tasks.tasks",
+    "CameraMount": "whill_mjx.vehicle.specs",
+    "WhillVectorEnv": "whill_mjx.gym_vector",
+}
+"""Names for tasks, vehicles and clients of one's own (docs/tasks.md); `import *` leaves them out."""
 __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use: importing the package stays quick."""
-    if name not in _HOMES:
+    home = _HOMES.get(name) or _EXTENDING.get(name)
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_EXTENDING})
