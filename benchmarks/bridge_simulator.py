@@ -26,6 +26,8 @@ import numpy as np
 
 from benchmarks.bridge import CLAIM, Figures, cpu_model
 from benchmarks.harness import figure, record
+from bridge.options import Parser, in_range, whole
+from whill_mjx.io.command_line import guarded
 
 SENDER = """
 import sys, time, rclpy
@@ -171,14 +173,14 @@ def measure_fuzz(domain: int, folder: Path, count: int) -> Figures:
 
 def main() -> None:
     """Measure and record."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge_simulator", description=__doc__,
+    parser = Parser(prog="python -m benchmarks.bridge_simulator", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = ("record", "lock_step", "fuzz")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each recording")
-    parser.add_argument("--steps", type=int, default=500, help="of each of five rounds in lock-step")
-    parser.add_argument("--resets", type=int, default=1000)
-    parser.add_argument("--messages", type=int, default=100_000, help="damaged ones")
+    parser.add_argument("--seconds", type=in_range(0), default=60.0, help="of each recording")
+    parser.add_argument("--steps", type=whole(), default=500, help="of each of five rounds in lock-step")
+    parser.add_argument("--resets", type=whole(), default=1000)
+    parser.add_argument("--messages", type=whole(), default=100_000, help="damaged ones")
     options = parser.parse_args()
     domain, figures = 61 + os.getpid() % 30, {}
     with tempfile.TemporaryDirectory() as name:
@@ -200,4 +202,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

@@ -8,7 +8,6 @@ Writes benchmarks/results/logs.json.
 
 from __future__ import annotations
 
-import argparse
 import re
 import resource
 import subprocess
@@ -23,6 +22,8 @@ import numpy as np
 
 from benchmarks.harness import figure, record
 from benchmarks.log_faults import FAULTS, ROOT, Drive, Fault, Robot, healthy
+from bridge.options import Parser, whole
+from whill_mjx.io.command_line import guarded
 
 CLAIM = "Faults of time and frames in driving logs are named, healthy logs are not, and an hour of driving is read fast"
 WRONG = re.compile("sign is reversed|check its unit")
@@ -209,11 +210,11 @@ def progress(text: str) -> None:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.logs", description=__doc__.split("\n\n")[0])
+    parser = Parser(prog="python -m benchmarks.logs", description=__doc__.split("\n\n")[0])
     parser.add_argument("--parts", nargs="+", default=["faults", "hour"], choices=["faults", "hour"])
-    parser.add_argument("--count", type=int, default=200, help="faulty logs, and healthy ones")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--repeats", type=int, default=3, help="of the hour")
+    parser.add_argument("--count", type=whole(), default=200, help="faulty logs, and healthy ones")
+    parser.add_argument("--seed", type=whole(0), default=0)
+    parser.add_argument("--repeats", type=whole(), default=3, help="of the hour")
     parser.add_argument("--dry", action="store_true", help="print what goes wrong, record nothing")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
@@ -228,4 +229,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

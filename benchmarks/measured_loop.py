@@ -4,9 +4,11 @@
 
 `ladder` (drive_norlab, skid-steered robot): the base model with a turn efficiency is fitted to steps of 6 s on asphalt,
 gravel and sand; then the loop names an effect, the vehicle with it is fitted, and the loop goes on from there until it
-names none. Each rung is scored on steps that were never fitted. `change`: the vehicle of the asphalt run is the
-reference, gravel and sand are asked what changed. `mrclam` (five nearly ideal robots): verdicts with the base model's
-delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
+names none. Each rung is scored on steps that were never fitted, with all parameters refitted, and as `alone` with those
+of the named effect alone: the rest is gained by base parameters that moved beside it. `peers` (`measured_peers`) says
+what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
+asphalt run is the reference, gravel and sand are asked what changed. `mrclam` (five nearly ideal robots): verdicts with
+the base model's delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
 """
@@ -15,7 +17,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,18 +27,19 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
+from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.missing.catalogue import PARAMETER
-from sysid.pages.loop_report import effects, replay
+from sysid.pages.loop_report import base_table, effects, replay, shifts
 from sysid.replay.models import with_effects
 from sysid.verdict.late_pose import NAME
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Result
-from sysid.verdict.vehicles import fitted_after, fitted_before, refit_poses
+from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, refit_poses
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE
 from whill_mjx.vehicle.parameters import set_values
@@ -49,6 +52,7 @@ HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.
 ROBOTS = (1, 2, 3, 4, 5)
 BLOCK = 5  # steps that follow one another and are drawn together
 DRAWS = 4000
+MANY = 10**6  # steps: all
 TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
 SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
 DEAD = {"command_dead_zone"}
@@ -62,7 +66,7 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/measured."""
-    parts: tuple[Literal["ladder", "change", "mrclam"], ...] = ("ladder", "change", "mrclam")
+    parts: tuple[Literal["ladder", "peers", "change", "mrclam"], ...] = ("ladder", "peers", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
     windows: Annotated[int, COUNT] = 96
@@ -133,8 +137,11 @@ def one_loop(
     # As often as what comes after, so that this is no reason to be better.
     before = refit_poses(result, fitted_before(result))
     after = refit_poses(result, fitted_after(result)) if found["verdict"] == "named" else before
+    alone = named_alone(result, before)
+    found["base"] = base_table(result)
     found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
-    found["before"], found["after"] = (errors(held, replay(result, one, held)) for one in (before, after))
+    found["before"], found["alone"], found["after"] = (
+        errors(held, replay(result, one, held)) for one in (before, alone, after))
     wrench = find_unnamed(result)
     if wrench is not None and wrench.kept:
         found["unnamed"] = wrench.table.quantity
@@ -181,6 +188,15 @@ def interval(trials: list[str], before: dict[str, list[float]], after: dict[str,
     return float(1 - total[1] / total[0]), float(low), float(high)
 
 
+def gained(
+    stem: str, trials: list[str], before: dict[str, list[float]], after: dict[str, list[float]], column: int
+) -> dict[str, dict[str, Any]]:
+    """Figures of the share of the error removed, with its interval."""
+    share, low, high = interval(trials, before, after, column)
+    return {stem: figure([share], "share"), f"{stem}_low": figure([low], "share"),
+            f"{stem}_high": figure([high], "share")}
+
+
 def of_terrain(trials: list[str], terrain: str) -> list[str]:
     return [name for name in trials if terrain in ("all", *[one for one in TRAIN if one in name])]
 
@@ -189,8 +205,13 @@ def ladder(settings: Benchmark) -> None:
     """Ideal, fitted base, and every vehicle that the loop made of it."""
     loops = climb(settings, "ladder", drive_log(settings, tuple(TRAIN)))
     rungs = {"ideal": loops[0]["ideal"], "base": loops[0]["before"]}
-    rungs |= {"_".join(["with", str(i + 1), *[one["name"] for one in loop["effects"]]]): loop["after"]
-              for i, loop in enumerate(loops) if loop["verdict"] == "named" or "unnamed" in loop}
+    alone = {}
+    for number, loop in enumerate(loops, start=1):
+        if loop["verdict"] == "named" or "unnamed" in loop:
+            name = "_".join(["with", str(number), *[one["name"] for one in loop["effects"]]])
+            rungs[name] = loop["after"]
+            if loop["verdict"] == "named":
+                alone[name] = loop["before"], loop["alone"]
     figures, trials = {}, list(loops[0]["before"])
     last = list(rungs)[-1]
     for terrain in ("all", *TRAIN):
@@ -199,14 +220,37 @@ def ladder(settings: Benchmark) -> None:
             for name, rows in rungs.items():
                 value = float(np.mean([rows[trial][column] for trial in mine]))
                 figures[f"ladder_{terrain}_{metric}_{name}"] = figure([value], unit)
-            gain, low, high = interval(mine, rungs["base"], rungs[last], column)
-            stem = f"ladder_gain_{terrain}_{metric}"
-            figures |= {stem: figure([gain], "share"), f"{stem}_low": figure([low], "share"),
-                        f"{stem}_high": figure([high], "share")}
+            figures |= gained(f"ladder_gain_{terrain}_{metric}", mine, rungs["base"], rungs[last], column)
+            for name, (before, after) in alone.items():
+                figures |= gained(f"ladder_alone_{terrain}_{metric}_{name}", mine, before, after, column)
     figures["drive_gain_over_fitted_base"] = figures["ladder_gain_all_position"]
     show(figures)
     report(loops)
     record("measured", CLAIM, figures, replacing="ladder_")
+
+
+def peers(settings: Benchmark) -> None:
+    """What models of the commands alone predict, fitted to all training steps."""
+    log = drive_log(replace(settings, windows=MANY), tuple(TRAIN))
+    held = log.held_out
+    training, judged = (steps_of(trials, log.spec.track) for trials in (log.training, held))
+    figures: dict[str, Any] = {}
+    base: dict[str, float] = {}
+    for count in KINEMATIC:
+        base, predicted = fit_kinematic(training, count)
+        print(f"{count} numbers: {', '.join(f'{name} {value:.3g}' for name, value in base.items())}", flush=True)
+        figures |= mean_errors(f"peer_{count}_numbers", errors(held, as_predictions(held, judged, predicted(judged))))
+    predicted = fit_network(training, base)
+    figures |= mean_errors("peer_network", errors(held, as_predictions(held, judged, predicted(judged))))
+    figures |= mean_errors("peer_ideal", errors(held, [ideal_replay(trial) for trial in held]))
+    show(figures)
+    record("measured", CLAIM, figures, replacing="peer_")
+
+
+def mean_errors(stem: str, rows: dict[str, list[float]]) -> dict[str, Any]:
+    """Figures of the mean errors of position and yaw."""
+    position, yaw = np.mean(list(rows.values()), axis=0).tolist()
+    return {f"{stem}_position": figure([position], "m"), f"{stem}_yaw": figure([yaw], "rad")}
 
 
 def change(settings: Benchmark) -> None:
@@ -214,19 +258,21 @@ def change(settings: Benchmark) -> None:
     loops = climb(settings, "asphalt", drive_log(settings, ("asphalt",)))
     named = [i for i, loop in enumerate(loops) if loop["verdict"] == "named"]
     vehicle = load_vehicle(settings.out / f"asphalt_{named[-1] + 1 if named else 1}.toml")[1]
+    days = (drive_log(settings, ("asphalt",)),)  # whose blocks show how far the vehicle wanders
     figures = {}
     for terrain in ("gravel", "sand"):
         log = drive_log(settings, (terrain,))
-        loop = one_loop(settings, f"asphalt_to_{terrain}", log, config_of(settings, vehicle), vehicle=vehicle)
+        loop = one_loop(settings, f"asphalt_to_{terrain}", log, config_of(settings, vehicle), vehicle=vehicle,
+                        references=days)
+        print(f"{terrain}: " + ("; ".join(shifts(loop["base"])) or "base parameters as on asphalt"), flush=True)
         trials = list(loop["before"])
         for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
             stem = f"changed_{terrain}_{metric}"
             for which in ("ideal", "before", "after"):
                 value = float(np.mean([row[column] for row in loop[which].values()]))
                 figures[f"{stem}_{which}"] = figure([value], unit)
-            gain, low, high = interval(trials, loop["before"], loop["after"], column)
-            figures |= {f"{stem}_gain": figure([gain], "share"), f"{stem}_gain_low": figure([low], "share"),
-                        f"{stem}_gain_high": figure([high], "share")}
+            figures |= gained(f"{stem}_gain", trials, loop["before"], loop["after"], column)
+            figures |= gained(f"{stem}_alone", trials, loop["before"], loop["alone"], column)
         report([loop])
     show(figures)
     record("measured", CLAIM, figures)
@@ -279,7 +325,8 @@ def report(loops: list[dict[str, Any]]) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"ladder": (ladder, "drive_norlab"), "change": (change, "drive_norlab"), "mrclam": (mrclam, "mrclam")}
+    parts = {"ladder": (ladder, "drive_norlab"), "peers": (peers, "drive_norlab"), "change": (change, "drive_norlab"),
+             "mrclam": (mrclam, "mrclam")}
     for name in settings.parts:
         part, folder = parts[name]
         if not (settings.shared / "data" / "measured" / folder).is_dir():

@@ -1,8 +1,9 @@
-"""Pictures of README: `python -m benchmarks.pictures drive`, `loop RUN` or `ros`; each is written to docs/images/.
+"""Pictures of the pages: `python -m benchmarks.pictures drive`, `loop RUN`, `ros` or `map`; they go to docs/images/.
 
     drive      drive.webp: a planner drives the obstacle course; camera picture beside the world from above
     loop RUN   missing_effect.png: a verdict of `sysid.close_loop`, from RUN/report.json
     ros        ros2.png: which node publishes which topic
+    map        map.png: a made map from above, and what a camera sees of its walls
 
 README's verdict is of drives of the contact plant, of which one tyre is 1.2 % larger than the other:
 
@@ -194,6 +195,42 @@ def ros(out: Path) -> None:
     print(out)
 
 
+def office(out: Path) -> None:
+    """A made map of rooms and pillars from above, its starts and goals, and three views from starts."""
+    import cv2
+    import jax
+    import jax.numpy as jnp
+
+    from whill_mjx.world.maps import FREE, OCCUPIED, GridMap, make_map_scene, map_scene_sampler, shown
+    from whill_mjx.world.maps.picture import from_above
+    from whill_mjx.world.render import Quality, camera_rotation, pinhole, render
+
+    row, column = np.mgrid[:220, :400]
+    solid = (row < 3) | (row > 216) | (column < 3) | (column > 396)
+    solid |= (abs(column + row // 3 - 170) < 2) & (abs(row - 60) > 14) & (abs(row - 170) > 14)  # a slanted wall
+    solid |= (abs(row - 110) < 2) & (column > 150 - row // 3) & (abs(column - 300) > 16)
+    solid |= np.hypot(row - 60, column - 310) < 8
+    solid |= (abs(row - 165) < 10) & (abs(column - 240) < 22)
+    grid = GridMap(np.where(solid, OCCUPIED, FREE).astype(np.uint8), 0.05, (0.0, 0.0, 0.0))
+    made = make_map_scene(grid)
+    above = cv2.imdecode(np.frombuffer(from_above(made, 1000), np.uint8), cv2.IMREAD_COLOR)
+    lens = pinhole(1.1, 176, 234)
+
+    @jax.jit
+    def view(key: jax.Array) -> jax.Array:
+        scene, start = map_scene_sampler(made)(key)
+        position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], 0.1, 0.0)
+        scene = shown(scene, position, rotation, lens, 234)
+        return render(position, rotation, lens, scene, 176, 234, Quality(antialias=True))
+
+    views = [np.asarray(view(jax.random.key(seed)))[..., ::-1] for seed in (0, 1, 2)]
+    column_of = np.concatenate([np.pad(one, ((0, 11), (12, 0), (0, 0)), constant_values=255) for one in views])
+    height = above.shape[0]
+    sheet = np.concatenate([above, np.resize(column_of[:height], (height, column_of.shape[1], 3))], 1)
+    cv2.imwrite(str(out), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(f"{out}: {len(made.walls.segments)} walls, {sheet.shape[1]} x {sheet.shape[0]}")
+
+
 def main() -> None:
     """Draw what the command line names."""
     parser = Parser(prog="python -m benchmarks.pictures", description=__doc__,
@@ -202,8 +239,11 @@ def main() -> None:
     kinds.add_parser("drive", help="the moving picture")
     kinds.add_parser("loop", help="a named effect").add_argument("run", type=Path, help="folder with report.json")
     kinds.add_parser("ros", help="nodes and topics")
+    kinds.add_parser("map", help="a map and its walls")
     given = parser.parse_args()
-    if given.kind == "drive":
+    if given.kind == "map":
+        office(IMAGES / "map.png")
+    elif given.kind == "drive":
         drive(IMAGES / "drive.webp")
     elif given.kind == "loop":
         loop(given.run, IMAGES / "missing_effect.png")

@@ -1,13 +1,14 @@
 """Sight that transfers: `python -m benchmarks.sight`. Figures of rich looks and of the foreign corridor.
 
 Parts: "frames" times images with rich looks, "steps" control steps of an environment that shows them, "foreign" gathers
-what `python -m benchmarks.foreign --out FILE` wrote (`--drives FILE ...`), "training" the time of trainings
-(`--runs NAME=FOLDER ...`).
+what `python -m benchmarks.foreign --out FILE` wrote (`--drives FILE ...`), "training" the speed of trainings and their
+last evaluation (`--runs NAME=FOLDER ...`, names that begin with paper or transfer).
 """
 
 from __future__ import annotations
 
 import json
+import statistics
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-import tyro
 
-from benchmarks.harness import figure, record, time_calls
+from benchmarks.harness import device_name, figure, record, time_calls
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import RICH, Env, State, make_env, reset_state
+from whill_mjx.evaluation.novelty import SETTLED
+from whill_mjx.io import command_line
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.world.render import pinhole, render
 from whill_mjx.world.render.pallas import render_pallas
@@ -35,15 +36,19 @@ class Options:
     """Options of the benchmark."""
 
     parts: tuple[str, ...] = ("frames", "steps")
-    """Parts to measure: frames, steps, foreign."""
+    """Parts to measure: frames, steps, foreign, training."""
     worlds: int = 0
     """Worlds per call; 0 takes 16,384 on an accelerator and 64 on a CPU."""
     repeats: int = 5
     """Timed repeats."""
     drives: tuple[Path, ...] = ()
     """Files that `benchmarks.foreign` wrote."""
+    runs: tuple[str, ...] = ()
+    """Folders of trainings."""
+    stops: tuple[str, ...] = ()
+    """NAME=NAT: surprise at which a policy stops for good; the same drives are counted once more with that stop."""
     device: str = ""
-    """Device on which those drives ran."""
+    """Device on which those drives or trainings ran; none says this one."""
 
 
 def many_states(env: Env, params: Any, worlds: int) -> State:
@@ -109,25 +114,56 @@ def steps(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
 def foreign(options: Options) -> dict[str, dict[str, Any]]:
     """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians."""
     drives = [one for path in options.drives for one in json.loads(path.read_text())["drives"]]
+    stops = {name: float(nat) for name, nat in (text.split("=", 1) for text in options.stops)}
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in drives:
         groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
+        if one["driver"] == "policy" and one["policy"] in stops:
+            surprised = max(one["novelty"][SETTLED:], default=0.0) >= stops[one["policy"]]
+            end = "stopped" if surprised else one["end"]
+            groups.setdefault((one["policy"], "with_stop", one["variant"]), []).append(end)
     found: dict[str, dict[str, Any]] = {}
     medians: dict[tuple[str, str], list[float]] = {}
     for (policy, driver, variant), ends in sorted(groups.items()):
-        for end in ("arrived", "collided"):
+        for end in ("arrived", "collided", *(["stopped"] if driver == "with_stop" else [])):
             share = ends.count(end) / len(ends)
             name = "_".join(["foreign", policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
-            found[name] = {"value": share, "unit": "share", "device": options.device, "drives": len(ends)}
+            device = options.device or device_name()
+            found[name] = {"value": share, "unit": "share", "device": device, "drives": len(ends)}
             if policy.startswith("transfer") and driver == "policy":
                 medians.setdefault((variant, end), []).append(share)
     for (variant, end), shares in medians.items():
         if end == "arrived":
-            found[f"foreign_{variant}"] = figure(shares, "share", options.device)
+            found[f"foreign_{variant}"] = figure(shares, "share", options.device or None)
     worst = [medians[key] for key in medians if key[1] == "collided"]
     if worst:
-        found["foreign_collided_worst"] = figure(max(worst, key=lambda shares: float(np.median(shares))), "share",
-                                                 options.device)  # fmt: skip
+        found["foreign_collided_worst"] = figure(max(worst, key=statistics.median), "share", options.device or None)
+    return found
+
+
+def training(options: Options) -> dict[str, dict[str, Any]]:
+    """Time of a control step with rich looks over one with the paper's, and the last evaluation of each training."""
+    speeds: dict[str, list[float]] = {"paper": [], "transfer": []}
+    ends: dict[str, list[float]] = {"paper": [], "transfer": []}
+    steps_done = {}
+    for text in options.runs:
+        name, folder = text.split("=", 1)
+        kind = next(kind for kind in speeds if name.startswith(kind))
+        rows = [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+        rates = [row["env_steps_per_s"] for row in rows if "env_steps_per_s" in row]
+        speeds[kind].append(statistics.median(rates[5:]))  # the first rows compile
+        evaluated = [row for row in rows if "eval/success" in row]
+        ends[kind].append(evaluated[-1]["eval/success"])
+        steps_done[kind] = evaluated[-1]["env_steps"]
+    found: dict[str, dict[str, Any]] = {}
+    device = options.device or None
+    for kind, values in ends.items():
+        if values:
+            name = f"{kind}_training_success"
+            found[name] = {**figure(values, "share", device), "env_steps": steps_done[kind], "episodes": 200}
+    if all(speeds.values()):
+        ratios = [statistics.median(speeds["paper"]) / one for one in speeds["transfer"]]
+        found["rich_step_time_ratio"] = figure(ratios, "ratio", device)
     return found
 
 
@@ -141,8 +177,10 @@ def main(options: Options) -> None:
         found |= steps(options, worlds)
     if "foreign" in options.parts:
         found |= foreign(options)
+    if "training" in options.parts:
+        found |= training(options)
     record("sight", CLAIM, found)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    command_line.run(Options, main, __doc__, positional=False)

@@ -86,8 +86,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
 def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     """The drives, the reference drives and the vehicle, checked; ValueError or FileNotFoundError says what is wrong."""
     from sysid.logs.measured import load_any
+    from sysid.missing.fit_statistics import load_fitted
     from whill_mjx.vehicle.presets import preset_params
-    from whill_mjx.vehicle.vehicle_file import load_vehicle
 
     if arguments.vehicle is not None and arguments.reference:
         raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to them.")
@@ -100,9 +100,9 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     vehicle = None
     if arguments.vehicle is not None:
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")
-        spec, vehicle, _ = load_vehicle(arguments.vehicle)
+        spec, vehicle = load_fitted(arguments.vehicle)
         check_same_vehicle(log, spec, str(arguments.vehicle), "The vehicle file must be of the same vehicle")
-    base = preset_params(log.spec, LoopConfig.preset) if vehicle is None else vehicle
+    base = preset_params(log.spec, LoopConfig.preset) if vehicle is None else vehicle.params
     known = {one.effect for one in (*hypotheses(log.spec, base), *outside_hypotheses(log.spec, base, ()))}
     for name in arguments.without:
         check_known("--without", name, sorted(known))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-COMMANDS = ("train", "evaluate", "drive", "look", "export_mjcf")
+COMMANDS = ("train", "evaluate", "drive", "look", "maps", "export_mjcf")
 
 
 def first_line(name: str) -> str:

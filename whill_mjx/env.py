@@ -27,13 +27,15 @@ from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import TimeStep, VehicleParams, VehicleState
 from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.collision import first_contact, free_distance, obstacles_of, poses_between, touches
 from whill_mjx.world.eye import develop, mounted
+from whill_mjx.world.maps.walls import shown
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import Quality, pinhole, render
 from whill_mjx.world.render.rich import floor_light
 from whill_mjx.world.rich import furnish, paint
-from whill_mjx.world.scene import Scene, clearance, collides, footprint
+from whill_mjx.world.scene import Scene, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode; the endings of a task come on top (`end_names`)."""
@@ -291,8 +293,9 @@ def _control_period(
     task = env.task
     vehicle = drive(env.model, params, state.vehicle, command)
     vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
+    vehicle, collided = _stopped(env, state, vehicle)
     step_count = state.step_count + 1
-    moment = moment_of(env, state, vehicle, command, step_count)
+    moment = moment_of(env, state, vehicle, command, step_count, collided)
     terms = task.rewards(moment)
     reward = jnp.asarray(sum(terms.values()))
     ends = endings_of(task, moment)
@@ -317,8 +320,27 @@ def _control_period(
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 
+def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[VehicleState, jax.Array]:
+    """The vehicle after a control period, where it first touched something if it did, and whether it did."""
+    task, spec = env.task, env.model.spec
+    before, after = (footprint(spec, *reference_pose(env.model, qpos)) for qpos in (state.vehicle.qpos, vehicle.qpos))
+    fastest = max(abs(task.v_min), abs(task.v_max))
+    duration = env.model.config.control_dt
+    poses = poses_between(fastest, task.omega_max, duration, spec.body_length / 2, spec.body_width / 2)
+    obstacles = obstacles_of(state.scene, after.x, after.y)
+    collided, share = first_contact(before, after, obstacles, poses)
+    collided = collided & ~vehicle.diverged
+    there = state.vehicle.qpos + share * (vehicle.qpos - state.vehicle.qpos)
+    return dataclasses.replace(vehicle, qpos=jnp.where(collided, there, vehicle.qpos)), collided
+
+
 def moment_of(
-    env: Env, before: State, vehicle: VehicleState, command: jax.Array, step_count: jax.Array
+    env: Env,
+    before: State,
+    vehicle: VehicleState,
+    command: jax.Array,
+    step_count: jax.Array,
+    collided: jax.Array | None = None,
 ) -> Moment:
     """What rewards, endings and observations look at, after a control period that began in a state.
 
@@ -328,11 +350,13 @@ def moment_of(
         vehicle: at its end.
         command: (2,) v [m/s] and omega [rad/s] of the period.
         step_count: () control periods since the start of the episode.
+        collided: () whether something was touched in the period; None asks whether it is touched at its end.
     """
     x, y, yaw = reference_pose(env.model, vehicle.qpos)
     body = footprint(env.model.spec, x, y, yaw)
     distance = jnp.linalg.norm(env.task.goal(before.scene) - jnp.stack([x, y]))
-    collided = collides(body, before.scene.boxes) & ~vehicle.diverged
+    if collided is None:
+        collided = touches(body, obstacles_of(before.scene, body.x, body.y)) & ~vehicle.diverged
     return Moment(
         scene=before.scene,
         pose=jnp.stack([x, y, yaw]),
@@ -402,7 +426,7 @@ def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
         "v": v,
         "omega": omega,
         "goal_distance": state.goal_distance,
-        "clearance": clearance(footprint(env.model.spec, x, y, yaw), state.scene.boxes),
+        "clearance": free_distance(footprint(env.model.spec, x, y, yaw), state.scene),
     }
 
 
@@ -412,7 +436,8 @@ def observe(env: Env, state: State) -> jax.Array:
         return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
-    image = render(position, rotation, intrinsics, state.scene, env.height, env.width)
+    scene = shown(state.scene, position, rotation, intrinsics, env.width)
+    image = render(position, rotation, intrinsics, scene, env.height, env.width)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))

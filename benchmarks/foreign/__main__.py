@@ -5,7 +5,6 @@ Needs MUJOCO_GL=egl or osmesa where there is no display. Drives are spread over 
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,19 @@ from typing import Any
 from benchmarks.foreign.drivers import CONTROLS
 from benchmarks.foreign.room import VARIANTS
 from benchmarks.foreign.run import Job, drive_all
+from bridge.options import Parser, whole
+from whill_mjx.io.command_line import guarded
 
 
 def main() -> None:
     """Drive, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.foreign", description=__doc__)
+    parser = Parser(prog="python -m benchmarks.foreign", description=__doc__)
     parser.add_argument("--policy", nargs="*", default=[], metavar="NAME=FOLDER", help="policy files")
     parser.add_argument("--controls", nargs="*", default=[], choices=CONTROLS, help="of the first policy")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=VARIANTS)
-    parser.add_argument("--drives", type=int, default=200, help="of each policy in each variant")
-    parser.add_argument("--first-seed", type=int, default=5000)
-    parser.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--drives", type=whole(), default=200, help="of each policy in each variant")
+    parser.add_argument("--first-seed", type=whole(0), default=5000)
+    parser.add_argument("--processes", type=whole(), default=len(os.sched_getaffinity(0)))
     parser.add_argument("--out", type=Path, default=Path("foreign.json"))
     options = parser.parse_args()
     named = [text.split("=", 1) for text in options.policy]
@@ -53,4 +54,5 @@ def table(results: list[dict[str, Any]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

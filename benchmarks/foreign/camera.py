@@ -21,7 +21,8 @@ class Camera:
     def __init__(self, model: mujoco.MjModel, mount: dict[str, Any], plain: bool, random: np.random.Generator) -> None:
         self.model, self.data = model, mujoco.MjData(model)
         self.renderer: mujoco.Renderer | None = None
-        self.plain, self.random, self.gain = plain, random, None
+        self.plain, self.random = plain, random
+        self.gain: float | None = None
         options = mujoco.MjvOption()
         options.geomgroup[4] = 0
         self.options = options
@@ -70,12 +71,12 @@ class Camera:
         if self.plain:
             return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
         light = picture.astype(np.float32)
-        wanted = np.clip(self.target / max(float(light.mean()), 4.0), 0.4, 3.5)
-        first = self.gain is None
-        self.gain = wanted if first else self.gain + (wanted - self.gain) * (1 - math.exp(-PERIOD / self.lag))
+        wanted = min(max(self.target / max(float(light.mean()), 4.0), 0.4), 3.5)
+        before = wanted if self.gain is None else self.gain
+        self.gain = before + (wanted - before) * (1 - math.exp(-PERIOD / self.lag))
         row = np.linspace(-1, 1, RENDERED, dtype=np.float32)
         shade = 1 - self.corner * 0.5 * (row[:, None] ** 2 + row[None] ** 2)
-        light = light * float(self.gain) * self.white.astype(np.float32) * shade[..., None]
+        light = light * self.gain * self.white.astype(np.float32) * shade[..., None]
         light = 255.0 * np.clip(light / 255.0, 0, 1) ** self.gamma
         if self.blur > 0.2:
             light = cv2.GaussianBlur(light, (0, 0), 2 * self.blur)
@@ -84,7 +85,8 @@ class Camera:
         sent = np.clip(light + 0.5, 0, 255).astype(np.uint8)
         large = cv2.resize(sent, (4 * size, 4 * size), interpolation=cv2.INTER_LINEAR)
         packed = cv2.imencode(".jpg", large, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1]
-        return cv2.resize(cv2.imdecode(packed, cv2.IMREAD_COLOR), (size, size), interpolation=cv2.INTER_AREA)
+        received = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
+        return cv2.resize(received, (size, size), interpolation=cv2.INTER_AREA)
 
 
 def _looking(roll: float, pitch: float, yaw: float) -> np.ndarray:

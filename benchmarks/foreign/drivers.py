@@ -52,7 +52,7 @@ class Planner:
 
     def _search(self, start: tuple[float, float, float]) -> np.ndarray:
         """(K, 3) poses from the start to the goal's circle, 0.1 m apart."""
-        heap = [(0.0, 0.0, start, None)]
+        heap: list[Any] = [(0.0, 0.0, start, ())]
         came: dict[tuple[int, int, int], Any] = {}
         while heap:
             _, cost, pose, before = heapq.heappop(heap)
@@ -62,7 +62,7 @@ class Planner:
             came[cell] = (pose, before)
             if math.hypot(pose[0] - GOAL[0], pose[1] - GOAL[1]) < 0.9:
                 path = [pose]
-                while before is not None:
+                while before:
                     pose, before = came[before]
                     path.append(pose)
                 return np.array(path[::-1])
@@ -78,11 +78,11 @@ class Planner:
 
 
 class Sighted:
-    """A policy file, with the images as they are, blank, or the first one kept; with its stop for the unknown."""
+    """A policy file, with the images as they are, blank, or the first one kept."""
 
-    def __init__(self, policy: Any, see: str = "policy", stop: bool = False) -> None:
-        self.policy, self.see, self.first = policy, see, None
-        self.stop = stop
+    def __init__(self, policy: Any, see: str = "policy") -> None:
+        self.policy, self.see = policy, see
+        self.first: np.ndarray | None = None
         policy.reset()
 
     def command(self, image: np.ndarray) -> tuple[float, float]:

@@ -38,8 +38,10 @@ class _Xml:
     """Collects the parts of a model."""
 
     def __init__(self, random: np.random.Generator) -> None:
-        self.random, self.assets = random, {}
-        self.asset, self.world, self.count = [], [], 0
+        self.random, self.count = random, 0
+        self.assets: dict[str, bytes] = {}
+        self.asset: list[str] = []
+        self.world: list[str] = []
 
     def material(self, picture=None, colour=(1, 1, 1), repeat=(1.0, 1.0), cube=False, uniform=True, **more) -> str:
         """A material; with a picture, of so many repeats per metre (or per face with uniform False)."""
@@ -246,7 +248,7 @@ def _wall_colour(random) -> np.ndarray:
 
 def _things(xml: _Xml, random, carton_at, across: float, along: float) -> list[tuple[float, float, float, float]]:
     """Chairs, bins, balls, plants and crates at the walls; the wider way past the carton stays 1.05 m wide."""
-    placed = []
+    placed: list[tuple[float, float, float, float]] = []
     wider = -1 if carton_at[1] > 0 else 1
     for _ in range(int(random.integers(1, 6))):
         side, deep, long = int(random.choice([-1, 1])), random.uniform(0.05, 0.17), random.uniform(0.06, 0.3)

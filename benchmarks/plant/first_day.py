@@ -28,7 +28,7 @@ BALL, BALL_X = 0.012, -0.06  # m, radius of the small robot's ball and its place
 SMALL = Chair(
     nominal=Nominal(0.033, 0.16, 0.12, 1.2), radius=(0.033, 0.033), track=0.16, mass=1.2, com=(-0.02, 0.0, 0.03),
     gyration=(0.05, 0.055, 0.06), wheel_mass=0.04, armature=6e-5, damping=4e-4, friction=0.8, patch=5e-4,
-    roller=0.05, roller_drag=0.0, kp=0.03, ki=0.15, torque_limit=0.25, delay=0.03,
+    roller=0.05, roller_drag=0.0, kp=0.02, ki=0.1, torque_limit=0.06, delay=0.03,
 )
 SLOWER, FASTER = 0.25, 1.8  # of speeds and yaw rates of the chair's manoeuvres, for the small robot
 
@@ -129,7 +129,8 @@ class SmallPlant(Plant):
   <worldbody><geom name="floor" type="plane" size="0 0 1"/>
     <body name="chassis" pos="0 0 {high}"><freejoint/>
       <inertial pos="{' '.join(map(str, chair.com))}" mass="{frame}" diaginertia="{inertia}"/>{wheels}
-      <geom name="ball" type="sphere" size="{BALL}" pos="{BALL_X} 0 {BALL - high}"/></body></worldbody>
+      <body name="caster" pos="{BALL_X} 0 {BALL - high}"><geom name="ball" type="sphere" size="{BALL}"/></body>
+    </body></worldbody>
   <contact><pair geom1="floor" geom2="tyre_left" {tyre}/><pair geom1="floor" geom2="tyre_right" {tyre}/>
     <pair geom1="floor" geom2="ball" condim="3" friction="{chair.roller} {chair.roller} 0 0 0" {solver}/></contact>
 </mujoco>""")

@@ -257,8 +257,9 @@ def _joints(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, v: np.ndarray, omega:
     the window's start alone. Within windows both are apart by so much (Laplace, which bears jumps).
     """
     count = len(x)
-    changes = [np.flatnonzero(np.abs(np.diff([x[k], y[k], yaw[k]], axis=1)).max(axis=0) > HELD) + 1
-               for k in range(count)]
+    changes: list[list[int]] = [
+        (np.flatnonzero(np.abs(np.diff([x[k], y[k], yaw[k]], axis=1)).max(axis=0) > HELD) + 1).tolist()
+        for k in range(count)]
     way, turn = (DRIVE_DT * np.cumsum(np.pad(rate, ((0, 0), (1, 0))), axis=1) for rate in (v, omega))  # before a sample
 
     def apart(k: int, begin: int, end: int, gone: float, turned: float) -> np.ndarray:
@@ -270,11 +271,12 @@ def _joints(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, v: np.ndarray, omega:
     inside = [apart(k, a, b, way[k, b] - way[k, a], turn[k, b] - turn[k, a])
               for k in range(count) for a, b in pairwise(changes[k])]
     usual = np.abs(inside).mean(axis=0) if inside else np.ones(2)
-    found = _Joints(*(np.zeros(count - 1) for _ in range(3)), np.full((count - 1, 2), DRIVE_ROWS))
+    found = _Joints(np.zeros(count - 1), np.zeros(count - 1), np.zeros(count - 1),
+                    np.full((count - 1, 2), DRIVE_ROWS))
     ratio = np.full(count - 1, np.nan)
     for k in range(count - 1):
         if len(changes[k]) and len(changes[k + 1]):
-            last, first = int(changes[k][-1]), int(changes[k + 1][0])
+            last, first = changes[k][-1], changes[k + 1][0]
             found.between[k] = last, DRIVE_ROWS + first
             found.way[k], found.turn[k] = way[k, -1] - way[k, last], turn[k, -1] - turn[k, last]
             lost = apart(k + 1, 0, first, way[k + 1, first], turn[k + 1, first])

@@ -62,6 +62,8 @@ class Reference:
     remark: str
     noise: np.ndarray | float = 1.0
     """(C,) noise of the drives in question over that of the reference days."""
+    simulated: bool = False
+    """Whether `leftovers` are drawn from what a vehicle file says of its fit: there are no reference days."""
 
     @property
     def shared(self) -> float:

@@ -4,11 +4,13 @@ does not reproduce, and the noise."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from sysid.errors.features import CHANNELS, bin_width
 from sysid.errors.noise import (
     first_scales,
     fit_roughness,
@@ -20,7 +22,8 @@ from sysid.errors.space import Space, make_space
 from sysid.logs.log import Log, Trial
 from sysid.missing.base_fit import BaseFit
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
-from sysid.missing.drives import make_drives
+from sysid.missing.drives import Drives, make_drives
+from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins
 from sysid.replay.records import Plant
 from sysid.search.result import Progress
 from whill_mjx.vehicle.parameters import set_values
@@ -31,6 +34,8 @@ ASSUMED_DAYS = 4.0
 """How many days of reference drives that assumption counts as."""
 LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
 WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
+LEAST_DRAWN = 24
+"""Drives that are simulated, at least, to show the noise that a vehicle file states."""
 
 
 def make_reference(
@@ -88,6 +93,75 @@ def make_reference(
     params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
     return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
                      known, remark)
+
+
+def of_vehicle(
+    plant: Plant, vehicle: FittedVehicle, log: Log, names: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> Reference:
+    """A vehicle that was fitted before, without drives of it: nothing of the log in question is taken for known.
+
+    Spread and noise are those of its fit. Reference drives that stand for the noise are drawn from them, and have no
+    course in common with drives in question: nothing is subtracted from these. Where the file says nothing of its fit,
+    the noise is assumed to be what a fit of the log's own leaves.
+    """
+    params, known = vehicle.params, vehicle.statistics
+    space = make_space(params, log.spec, names)
+    u = space.to_unit(space.initial)
+    assumed = np.diag(assumed_spread(space, u) ** 2)
+    remark = f"one vehicle file: parameters are assumed to vary by {ASSUMED_SPREAD:.0%} of their values from day to day"
+    spread = assumed
+    if known is not None:
+        errors = known.covariance(space.names, space.slope(u))
+        spread = assumed + _within(errors, WEAK_PRIOR)
+        remark += ", beside the standard errors of its fit; how far effects seem to wander is assumed"
+    width = bin_width(log.training) if known is None else known.leftovers.width
+    drives = make_drives(plant, params, space.names, log.training, width)
+    at = drives.simulate(space.to_values(u)[None])[0]
+    measured = {name for c, name in enumerate(CHANNELS) if (drives.features.mask[..., c] > 0).any()}
+    if known is not None and measured <= set(known.leftovers.measured):
+        left = known.leftovers
+    else:
+        why = "the file does not say what its fit left" if known is None else (
+            f"its fit had no {', '.join(sorted(measured - set(known.leftovers.measured)))}")
+        remark += f"; the noise is assumed to be what a fit to these drives leaves, since {why}"
+        left = _own_leftovers(drives, space, u, log, progress)
+    drives = drives.weighted(at, left.factors, log.spec.track)
+    leftovers = _drawn(log.training, drives.mask, left)
+    return Reference(params, space, u, spread, np.zeros((1, space.size)), left.whitener, left.factors, leftovers,
+                     drives.features.width, True, remark, simulated=True)
+
+
+def _own_leftovers(drives: Drives, space: Space, u: np.ndarray, log: Log, progress: Progress | None) -> Leftovers:
+    """What a fit of the base model to the drives themselves leaves, near a vehicle u (P,)."""
+    spread = assumed_spread(space, u)
+    whitener = first_scales(drives.target, drives.mask, replicate_groups(log.training))
+    prior = (u, np.diag(1 / (3 * spread) ** 2))
+    own = BaseFit(drives, space, whitener, difference_sizes(np.diag(spread**2))).run(u, 6, prior, progress)
+    at = drives.simulate(space.to_values(own)[None])[0]
+    level = roughness(at, drives.features.width, log.spec.track)
+    factors = fit_roughness(drives.target - at, drives.mask, level)
+    return leftovers_in_bins(log.training, drives.target - at, drives.mask / factors[level], drives.features.width,
+                             factors)
+
+
+def _drawn(trials: tuple[Trial, ...], mask: np.ndarray, left: Leftovers) -> tuple[Leftover, ...]:
+    """Leftovers of simulated drives with the commands of trials, whose manoeuvres nobody drove."""
+    times = -(-LEAST_DRAWN // len(trials))
+    courses = np.zeros(len(trials), int)
+    for number, group in enumerate(replicate_groups(trials)):
+        courses[group] = number
+    every = np.concatenate([courses + k * (courses.max() + 1) for k in range(times)])
+    series = drawn(left, np.tile(mask, (times, 1, 1)), every.tolist(), np.random.default_rng(0))
+    return tuple(Leftover(replace(trials[i % len(trials)], manoeuvre=f"simulated/{every[i]}"), 0, one,
+                          mask[i % len(trials)]) for i, one in enumerate(series))
+
+
+def _within(covariance: np.ndarray, most: float) -> np.ndarray:
+    """A covariance (P, P) with standard deviations of at most so much."""
+    size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    ratio = np.minimum(1.0, most / size)
+    return np.asarray(covariance * np.outer(ratio, ratio))
 
 
 def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[list[int]]:

@@ -50,6 +50,12 @@ def calibration_notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: 
                          f"({one.low:.4f} to {one.high:.4f}): it takes other sizes than the controller.")
     if "pose_mount.x" in found:
         x, y, yaw = (found[f"pose_mount.{axis}"] for axis in ("x", "y", "yaw"))
+        at_zero = [one for one in (x, y, yaw) if one.identifiable and one.low <= 0 <= one.high]
+        if len(at_zero) == 3:
+            near = 1000 * max(-x.low, x.high, -y.low, y.high)
+            angle = math.degrees(max(-yaw.low, yaw.high))
+            return [*notes, f"The outside pose follows the reference point, within {near:.1f} mm and {angle:.2f} "
+                            "degrees."]
         sides = [_offset(one, names) for one, names in ((x, ("ahead of", "behind")), (y, ("left of", "right of")))
                  if one.identifiable]
         if sides:
@@ -67,7 +73,7 @@ def calibration_notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: 
 
 def _size(what: str, stated: float, value: float, low: float, high: float) -> str:
     interval = f"{stated * low:.4g} to {stated * high:.4g} m"
-    if abs(value - 1) < LEAST:
+    if abs(value - 1) < LEAST or low <= 1 <= high:
         return f"The {what} is as stated, {stated:.4g} m ({interval})."
     side = "larger" if value > 1 else "smaller"
     return (f"The {what} is {stated * value:.4g} m ({interval}), {abs(value - 1):.1%} {side} than the stated "

@@ -11,6 +11,7 @@ from sysid.intervals import uncertainty
 from sysid.logs import odometry_frames
 from sysid.logs.log import Log
 from sysid.logs.measured import load_any
+from sysid.missing.fit_statistics import statistics_of
 from sysid.pages.calibration import calibration_notes
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
@@ -126,7 +127,9 @@ def fit_dataset(
     write_html(out, series)
     intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
     if fit.model is None:
-        save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report))
+        known = statistics_of(log.training, fitted[: len(log.training)], log.spec.track, fit.space.names,
+                              fit.uncertainty.deviation * fit.space.slope(fit.u), fit.uncertainty.covariance)
+        save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report), known.as_table())
     else:
         save_model(out, fit.model, fit.params, intervals, provenance(report))
     return report

@@ -140,12 +140,15 @@ def errors(report: dict[str, Any]) -> str:
                 if metric not in metrics:
                     continue
                 moved = report["change"][part][channel][metric]
-                rows.append([f"{channel}, {metric} [{UNITS[metric]}]".replace("_", " "), metrics[metric],
+                only = None if report["alone"] is None else report["alone"][part][channel][metric]
+                rows.append([f"{channel}, {metric} [{UNITS[metric]}]".replace("_", " "), metrics[metric], only,
                              report["after"][part][channel][metric], floor.get(metric), moved["interval"][0],
                              moved["interval"][1], f"{moved['worse']} of {moved['trials']}"])
         if rows:
-            parts.append(table(["RMSE", "before", "after", "replicates", "change from", "to", "worse in"], rows,
-                               f"{part.replace('_', '-')} trials; the change with its 95 % interval over trials"))
+            parts.append(table(
+                ["RMSE", "before", "named alone", "after", "replicates", "change from", "to", "worse in"], rows,
+                f"{part.replace('_', '-')} trials; for \"named alone\" nothing but what was named has moved, for "
+                "\"after\" the base parameters as well; the change with its 95 % interval over trials"))
     return "".join(parts)
 
 
@@ -248,9 +251,11 @@ def noise(report: dict[str, Any]) -> str:
 
 
 def base(report: dict[str, Any]) -> str:
-    """Base parameters beside their day-to-day spread."""
-    return table(["parameter", "reference", "day-to-day spread", "these drives", "off by [spreads]"],
-                 [[one["name"], one["reference"], one["spread"], one["value"], one["away"]] for one in report["base"]])
+    """Base parameters beside their day-to-day spread: what the last refits made of them."""
+    return table(["parameter", "reference", "day-to-day spread", "refitted before", "after", "unit",
+                  "after is off by [spreads]"],
+                 [[one["name"], one["reference"], one["spread"], one["before"], one["after"], one["unit"], one["away"]]
+                  for one in report["base"]])
 
 
 def fixed(report: dict[str, Any]) -> str:

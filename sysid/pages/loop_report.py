@@ -12,6 +12,8 @@
                       values beyond an end of it leave that end `open`
     before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
                       noise_floor of the same where there are replicates: of the same manoeuvres, held out or not
+    alone             as `after`, of the vehicle before with only the named effects' own parameters fitted; null unless
+                      named
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
     by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
@@ -37,7 +39,9 @@
                       it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
     next_manoeuvre    the drive that would separate the effects of a class, written to next_command.csv; null where
                       there is nothing to separate (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
-    base              base parameters: reference value, day-to-day spread, value on these drives
+    base              base parameters: reference value, day-to-day spread, value on these drives in the search (`value`)
+                      and after the last refits without and with what was named (`before`, `after`), and how many
+                      spreads that with it is `away`
     manifest          everything fixed beforehand, and its SHA-256
 """
 
@@ -71,9 +75,9 @@ from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.result import LoopConfig, Result
-from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before
+from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before
 from whill_mjx.effects import EFFECTS, equation
-from whill_mjx.vehicle.parameters import describe
+from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.types import Parameter, parameters_of
 
 SCHEMA = 1
@@ -109,7 +113,8 @@ def make_report(result: Result) -> dict[str, Any]:
                     "held_out": [t.name for t in result.log.held_out]},
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
-        "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"), "change": change(rows),
+        "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"),
+        "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": moved, "worse": worse(moved), "operating": operating(result, days),
         "contradicted": contradicted(result), "pairs": pairs_of(result),
         "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
@@ -137,6 +142,13 @@ def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Pred
     drives, values = drives_of(result, trials, vehicle)
     simulated = drives.replay(values[None])
     return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
+
+
+def alone(result: Result, trials: tuple[Trial, ...], before: list[Prediction]) -> dict[str, Any] | None:
+    """`after` where only what was named has moved."""
+    if result.search.verdict != "named":
+        return None
+    return table(error_rows(trials, before, replay(result, fitted_alone(result), trials)), trials, "fitted")
 
 
 def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> dict[str, Any]:
@@ -322,12 +334,23 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
 def base_table(result: Result) -> list[dict[str, Any]]:
     """Base parameters on these drives beside the reference."""
     space, reference = result.reference.space, result.reference
-    away = (result.search.final.u - reference.u) / np.sqrt(np.diag(reference.spread))
+    spread = np.sqrt(np.diag(reference.spread))
+    before, after = (np.asarray(get_values(one, list(space.names)), float)
+                     for one in (fitted_before(result), fitted_after(result)))
+    away = (space.to_unit(after) - reference.u) / spread
     slope = space.slope(reference.u)
-    return [{"name": name, "reference": float(space.to_values(reference.u)[i]),
-             "spread": float(np.sqrt(reference.spread[i, i]) * slope[i]),
-             "value": float(space.to_values(result.search.final.u)[i]), "away": float(away[i])}
-            for i, name in enumerate(space.names)]
+    return [{"name": name, "unit": unit, "reference": float(space.to_values(reference.u)[i]),
+             "spread": float(spread[i] * slope[i]), "value": float(space.to_values(result.search.final.u)[i]),
+             "before": float(before[i]), "after": float(after[i]), "away": float(away[i])}
+            for i, (name, unit) in enumerate((name, describe(result.reference.params)[name].unit)
+                                             for name in space.names)]
+
+
+def shifts(rows: list[dict[str, Any]], least: float = 2.0) -> list[str]:
+    """Base parameters that the last refit moved by more than so many day-to-day spreads, in words, furthest first."""
+    far = sorted((row for row in rows if abs(row["away"]) > least), key=lambda row: -abs(row["away"]))
+    return [f"{row['name']} {row['reference']:.4g} -> {row['after']:.4g} {row['unit']} ({row['away']:+.1f} spreads)"
+            for row in far]
 
 
 def summary(report: dict[str, Any]) -> str:
@@ -341,6 +364,15 @@ def summary(report: dict[str, Any]) -> str:
                            for name, p in one["parameters"].items())
         lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
         lines += [f"    {text}" for text in not_determined(one["parameters"])]
+    if report["alone"] is not None:
+        for part in ("training", "held_out"):
+            for channel, metrics in report["alone"][part].items():
+                if "trajectory" in metrics:
+                    lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} m where only what was "
+                                 "named may move")
+    moved = shifts(report["base"])
+    if moved:
+        lines.append(f"  base parameters further than from day to day: {'; '.join(moved)}")
     if report["next_manoeuvre"] is not None:
         lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
     for part in ("training", "held_out"):

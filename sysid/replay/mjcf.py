@@ -34,10 +34,9 @@ from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
-AROUND_ROBOT = ("command_delay", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
+AROUND_ROBOT = ("command_delay", "acceleration_limit", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
 """Effects of the catalogue that every robot may have around it."""
 NEAR = 0.15  # share by which a true radius or track may differ from the file's
-SLOW = 100.0  # times as slow as assumed a servo may be that the file does not have
 
 
 @struct.dataclass
@@ -83,8 +82,11 @@ def mjcf_model(
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry | Size] = {}
     sizes = sizes_of(robot)
-    if calibrate:  # where wheels slip in every turn, the track has no part of its own
-        names = (*names, *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
+    if calibrate:
+        # An added servo is stiff: how a real one lags is in the delay and the limit of acceleration around the robot. A
+        # soft one would fall short of its target. Where wheels slip in every turn, the track has no part of its own.
+        names = (*(one for one in names if not (robot.added and one.startswith("actuator."))),
+                 *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
                  *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
     if robot.motors:
         gain, high = robot.drive_gain
@@ -111,8 +113,6 @@ def mjcf_model(
             raise ValueError(f"{path}: {name} is 0 in the file, so that its bounds cannot be guessed. Give them: "
                              f"parameters={{{name!r}: (lowest, highest)}}.")
         low, high = sorted((value / FACTOR, value * FACTOR)) if given is None else given
-        if calibrate and given is None and entry.array == "actuator_gainprm" and set(entry.ids) <= set(robot.added):
-            low, high = value / SLOW, value * FACTOR
         bounds[name] = (float(np.clip(value, low, high)), low, high, entry.unit)
     # A mass scales its inertia: before an inertia is set by itself.
     entries = dict(sorted(entries.items(), key=lambda one: getattr(one[1], "array", "") != "body_mass"))

@@ -20,12 +20,17 @@ from whill_mjx.logs.dataset import write_text
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
-STEP = 0.005  # s, physics step of a URDF: it settles and drives as with MuJoCo's 2 ms
+STEP = 0.005  # s, physics step of a URDF on two wheels: it settles and drives as with MuJoCo's 2 ms
+STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
+THIN = 0.02  # of its radius: half the width of a wheel that rolls on its middle
 DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
+SKID_SHARE = 1.0
+"""The same where wheels skid in every turn. MuJoCo finds contact forces for a wheel that turns freely: one that its
+servo holds pulls too little along beside what it resists sideways, the less so the heavier it is by itself."""
 ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
 SERVO_STEPS = 2  # the least number of timesteps in that time
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
@@ -114,12 +119,13 @@ class Size:
             place = _added(place, body, move * along * (sign if self.path == "wheels.difference" else 1))
         if self.path == "wheels.track":
             return {"body_pos": place}
-        size = model.geom_size
+        size, reach = model.geom_size, model.geom_rbound  # beyond its reach a geom meets nothing
         for sign, geoms in zip(signs, self.geoms, strict=True):
             factor = value / self.nominal if self.path == "wheels.radius" else 1 + sign * half
             for geom in geoms:
+                reach = _added(reach, geom, abs(factor - 1) * size[geom, 0])
                 size = _added(size, (geom, 0), (factor - 1) * size[geom, 0])
-        return {"body_pos": place, "geom_size": size}
+        return {"body_pos": place, "geom_size": size, "geom_rbound": reach}
 
     def _radius(self, model: Any) -> Any:
         return model.geom_size[self.geoms[0][0], 0]
@@ -187,7 +193,8 @@ def load_robot(
         spec, replaced, stated = read_robot(path, wheels, wheel_radius)
         joints = wheel_joints(path, spec, wheels)
         if stated is not None:
-            spec.option.timestep = STEP if timestep is None else timestep  # the file has none
+            if len(joints) == 2:
+                spec.option.timestep, spec.option.impratio = STEP, STIFF  # the file has none
             replaced += _as_in_gazebo(path, spec, joints)
         _complete(path, spec, joints)
         if timestep is not None:
@@ -479,13 +486,18 @@ def _below_wheels(
 def _as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     """What a URDF leaves to its simulator, a note for each change.
 
-    Parts of one robot do not touch each other. Joints with an end, of arms, heads and suspensions, are held: their
-    motors and springs are not in the file. A driven wheel is held at its speed, whatever its bearing.
+    Wheels roll on the middle of their width: a stiff cylinder stands on its two edges, scrubs in every turn and turns
+    as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of arms, heads
+    and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its speed,
+    whatever its bearing.
     """
     notes = []
+    driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
     for geom in spec.geoms:
         if geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = 0, 1
+        if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and geom.parent.name in driven:
+            geom.size[1] = min(geom.size[1], THIN * geom.size[0])
     for joint in list(spec.joints):
         if joint.name in joints:
             if np.any(joint.frictionloss) or np.any(joint.damping):
@@ -538,7 +550,7 @@ def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float
         wheel, total = inertias[k]
         actuator.set_to_velocity(kv=total / time)
         joint = spec.joint(joints[k])
-        joint.armature += max(ROTOR_SHARE * total - wheel, 0.0)
+        joint.armature += max((ROTOR_SHARE if len(joints) == 2 else SKID_SHARE) * total - wheel, 0.0)
     if bare:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return bare

@@ -26,7 +26,7 @@ from whill_mjx.effects.base import apply_chain
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams
+from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams, parameters_of
 
 AROUND = ("command", "sensing", "outside")
 """Places of effects that need to know nothing of what is inside a model."""
@@ -132,6 +132,19 @@ def effects_around(model: Model, trials: tuple[Trial, ...]) -> tuple[str, ...]:
     hidden = ((ODOMETRY_ALONE, reports), (POSE_ALONE, seen), (BOTH, both))
     left_out = {name for names, shown in hidden if not shown for name in names}
     return tuple(name for name in model.around if name not in left_out)
+
+
+def calibrated(model: Model, trials: tuple[Trial, ...]) -> tuple[Model, tuple[str, ...]]:
+    """A model with `effects_around` it, and names of their parameters that a fit leaves alone: of the limits of
+    acceleration that of each wheel is enough."""
+    names = effects_around(model, trials)
+    limit = make_effects(("acceleration_limit",))[0]
+    if limit.name not in names or limit.name in {effect.name for effect in model.params.effects}:
+        return model.with_effects(names), ()
+    found = model.with_effects(names)
+    others = tuple(f"{limit.name}.{field}" for field in parameters_of(limit) if field != "wheel")
+    neutral = jnp.asarray([getattr(limit, name.partition(".")[2]) for name in others])
+    return replace(found, params=set_parameters(found.params, others, neutral)), others
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:

@@ -11,7 +11,7 @@ moved to the start pose. Its controller, delays and slip are those of a vehicle 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -94,12 +94,10 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     stride = max(round(record_dt / dt), 1)
     record = stride * dt
     records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
-    poses = [_table(trial.ground_truth, 3) for trial in trials]
-    odometries = [_table(trial.odometry, 5) for trial in trials]
     command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
     start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
-    pose_t, pose, pose_mask = _pad(poses)
-    odometry_t, odometry, odometry_mask = _pad(odometries)
+    pose_t, pose, pose_mask = padded([trial.ground_truth for trial in trials], 3)
+    odometry_t, odometry, odometry_mask = padded([trial.odometry for trial in trials], 5)
     pose_index, pose_weight = _grid(pose_t, record, records)
     odometry_index, odometry_weight = _grid(odometry_t, record, records)
     floats = [command.reshape(len(trials), records, stride, 2), start]
@@ -343,8 +341,11 @@ def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.nd
     return index, np.clip(t / record - index, 0.0, 1.0)
 
 
-def _pad(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (B, M), values (B, M, C) and mask (B, M, C) of tables of different length; nan values are masked."""
+def padded(
+    streams: Sequence[PoseStream | OdometryStream | None], columns: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (B, M), values (B, M, C) and mask (B, M, C) of streams of different length; nan values are masked."""
+    tables = [_table(stream, columns) for stream in streams]
     longest = max(max(len(t) for t, _ in tables), 1)
     width = tables[0][1].shape[1]
     time = np.zeros((len(tables), longest))

@@ -24,8 +24,9 @@ from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
 from sysid.replay.models import (
     Model,
+    calibrated,
     calibration_effects,
-    effects_around,
+    describe_parameters,
     get_parameters,
     measured_effects,
     model_space,
@@ -196,7 +197,6 @@ class Problem:
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
     trials = _training(log, config)
-    thin.check_moves(log)
     if config.quick and len(trials) > QUICK_TRIALS:
         trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
@@ -223,6 +223,7 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
     """The training trials with the channels that are fitted."""
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
+    thin.check_moves(log)
     return tuple(_keep_channels(trial, config.channels) for trial in log.training)
 
 
@@ -240,10 +241,13 @@ def _subject(
         if config.vehicle is not None:
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
-        calibrated = config.calibrate and not config.parameters
-        model = model.with_effects((*config.effects, *(effects_around(model, trials) if calibrated else ())))
+        alone: tuple[str, ...] = ()
+        model = model.with_effects(config.effects)
+        if config.calibrate and not config.parameters:
+            model, alone = calibrated(model, trials)
         plant, params = model.plant, model.params if params is None else params
-        space = model_space(params, config.parameters or None)
+        wanted = [name for name in describe_parameters(params) if name not in alone]
+        space = model_space(params, config.parameters or wanted)
         if not config.calibrate or not any(trial.ground_truth is not None for trial in trials):
             why = "no outside pose shows it" if config.calibrate else "not selected"
             for name in [one for one in space.names if one.startswith("wheels.") and one not in config.parameters]:

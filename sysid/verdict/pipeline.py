@@ -23,7 +23,7 @@ from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.preparation import expected_steps, prepare, reference_for
+from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
 from sysid.verdict.search import search
 from sysid.verdict.sensor_noise import compared, with_noise
@@ -38,7 +38,7 @@ def find_missing(
     Args:
         log: the drives in question.
         references: drives of the same vehicle on other days.
-        vehicle: `VehicleParams` fitted before, kept as the reference.
+        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows.
         start: `VehicleParams` where the fit of the base model starts, instead of the preset.
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
@@ -93,7 +93,7 @@ def find_missing(
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
     """`find_missing` with a progress bar."""
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(references), vehicle is not None), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), vehicle is not None), "close the loop", "step")
     try:
         return find_missing(log, references, config, vehicle, progress)
     finally:

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors.noise import repeated
 from sysid.errors.space import FIXED
 from sysid.logs.log import Log
 from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_hypotheses, with_catalogue
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call
-from sysid.missing.reference import make_reference
+from sysid.missing.fit_statistics import FittedVehicle
+from sysid.missing.reference import make_reference, of_vehicle
 from sysid.missing.signatures import PARTS
 from sysid.missing.wander import estimate
 from sysid.replay.models import with_effects
@@ -25,6 +27,10 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
+
+BLOCKS = 8
+"""Of a long reference run, as of a log that stands alone (`sysid.missing.signatures.manoeuvre_groups`)."""
+LEAST_WINDOWS = 3  # of a block, so that a fit to it is not that of one window's noise
 
 
 def prepare(
@@ -63,15 +69,38 @@ def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     return base + 6 * days + 2 * PARTS + 4 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
 
 
+def days_of(references: Sequence[Log]) -> tuple[Log, ...]:
+    """Reference logs as days. Windows of one long run, in which nothing is driven twice, are put into blocks of
+    consecutive ones that count as a day each: they show how far parameters and apparent effects wander."""
+    days: list[Log] = []
+    for log in references:
+        trials = log.training
+        if repeated(trials) or len(trials) < BLOCKS * LEAST_WINDOWS:
+            days.append(log)
+            continue
+        days += [replace(log, name=f"{log.name}, block {number}", trials=tuple(trials[i] for i in part))
+                 for number, part in enumerate(np.array_split(np.arange(len(trials)), BLOCKS), start=1)]
+    return tuple(days)
+
+
 def reference_for(
     log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None, progress: Progress | None = None,
     start: Any = None,
 ) -> Reference:
-    """The vehicle as its reference drives show it; of the log itself where there are none."""
-    known = bool(references) or vehicle is not None
+    """The vehicle as its reference drives or its file show it; of the log itself where there is neither.
+
+    Args:
+        vehicle: `VehicleParams` or `FittedVehicle`, kept as it is.
+    """
+    plant = _plant(log.spec, config)
+    if vehicle is not None:
+        fitted = vehicle if isinstance(vehicle, FittedVehicle) else FittedVehicle(vehicle)
+        free = _free(fitted.params, config)
+        if not references:
+            return of_vehicle(plant, fitted, log, free, progress)
+        return make_reference(plant, fitted.params, days_of(references), True, 0, free, progress, True)
     start = preset_params(log.spec, config.preset) if start is None else start
-    start = with_effects(start, config.with_effects) if vehicle is None else vehicle
-    free = _free(start, config)
+    start = with_effects(start, config.with_effects)
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-    return make_reference(_plant(log.spec, config), start, tuple(references) or (log,), known, iterations, free,
-                          progress, vehicle is not None)
+    return make_reference(plant, start, days_of(references) or (log,), bool(references), iterations,
+                          _free(start, config), progress)

@@ -24,7 +24,7 @@ def compared(drives: Drives, at: np.ndarray, reference: Reference, alpha: float)
     """
     days = reference.leftovers
     theirs = tuple(one.trial for one in days)
-    if not reference.known or any(one is other for one in theirs for other in drives.trials):
+    if not reference.known or reference.simulated:
         return None
     bins = drives.target.shape[1]
     ours = NoisyDrives(reference.target_of(drives) - at, drives.mask, replicate_groups(drives.trials),

@@ -58,13 +58,26 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     names += [name for name in searched(vehicle) if name not in names and name not in result.config.held
               and (name.partition(".")[0] in extra or extra and name == "body.com_z")]
     if result.search.verdict == "named":
-        moved = [axis.parameter for one in result.search.final.hypotheses for axis in one.axes]
-        names += [name for name in dict.fromkeys(moved) if name in have and name not in names
-                  and np.isfinite(float(get_values(vehicle, [name])[0])) and name not in result.config.held]
+        names += [name for name in named_parameters(result, vehicle) if name not in names and name in have]
+    return _to_poses(result, vehicle, names, iterations)
+
+
+def named_parameters(result: Result, vehicle: Any) -> list[str]:
+    """Those of the named effects that a vehicle has and that a fit may move."""
+    have = describe(vehicle)
+    moved = [axis.parameter for one in result.search.final.hypotheses for axis in one.axes]
+    return [name for name in dict.fromkeys(moved) if name in have and name not in result.config.held
+            and np.isfinite(float(get_values(vehicle, [name])[0]))]
+
+
+def _to_poses(result: Result, vehicle: Any, names: list[str], iterations: int) -> Any:
+    """A vehicle with some of its parameters fitted to whole poses and speeds."""
+    trials = result.log.training
     space = make_space(vehicle, result.log.spec, names)
-    spread = np.zeros((space.size, space.size))
-    count = result.reference.space.size
-    spread[:count, :count] = result.reference.spread
+    reference = result.reference
+    known = [reference.space.names.index(name) if name in reference.space.names else -1 for name in space.names]
+    inside = np.array(known) >= 0
+    spread = np.where(np.outer(inside, inside), reference.spread[np.ix_(known, known)], 0.0)
     drives, held = drives_of(result, trials, vehicle)
     u = fit_poses(drives, trials, space, held, spread, iterations)
     return vehicle if u is None else set_values(
@@ -103,6 +116,28 @@ def fitted_before(result: Result) -> Any:
     """The base model fitted to the drives of a result."""
     vehicle = vehicle_before(result)
     return refit_poses(result, vehicle) if result.config.poses else vehicle
+
+
+@lru_cache(maxsize=4)
+def fitted_alone(result: Result) -> Any:
+    """The vehicle of `fitted_before` with what was named (`named_alone`)."""
+    return named_alone(result, fitted_before(result))
+
+
+def named_alone(result: Result, before: Any) -> Any:
+    """A fitted base model with the named effects, of which alone the parameters are fitted: what they gain by
+    themselves. What a fit of all gains beyond that is due to base parameters that moved beside them."""
+    if result.search.verdict != "named":
+        return before
+    vehicle = vehicle_after(result)
+    mine = named_parameters(result, vehicle)
+    named = {axis.parameter for one in result.search.final.hypotheses for axis in one.axes}
+    base = {name: value for name, value in base_values(before).items()
+            if name in describe(vehicle) and name not in named}
+    missing = tuple(effect for effect in before.effects if effect.name not in {one.name for one in vehicle.effects})
+    vehicle = set_values(vehicle, list(base), jnp.asarray(list(base.values()), jnp.result_type(float)))
+    vehicle = type(vehicle)(vehicle.body, (*vehicle.effects, *missing))
+    return _to_poses(result, vehicle, mine, 12) if result.config.poses and mine else vehicle
 
 
 @lru_cache(maxsize=4)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.measured_loop import Benchmark, climb, config_of, drive_log, interval, is_false, keep, of_terrain
+from benchmarks.measured_peers import Steps, all_values, fit_kinematic, motion
 from sysid.replay.models import with_effects
 from whill_mjx.vehicle.presets import preset_params
 
@@ -83,3 +84,25 @@ def test_no_step_is_both_fitted_and_held_out_and_poses_are_known_to_be_late():
     assert {trial.group for trial in log.held_out} == {"asphalt", "gravel", "sand"}
     assert set(log.fields["yaw_rate"]) >= names[0]
     assert log.fields["pose_stamps"] == "receipt" and any(trial.breaks for trial in log.training)
+
+
+def test_a_peer_of_a_few_numbers_predicts_steps_that_it_was_not_fitted_to():
+    truth = {"linear": 0.9, "angular": 0.6, "lag": 0.5, "delay": 0.15, "limit": 3.0}
+
+    def steps(seed, count=16, length=60):
+        rng = np.random.default_rng(seed)
+        command = np.repeat(rng.uniform([-4.0, -2.0], [4.0, 2.0], (count, 1, 2)), length, axis=1)
+        start = rng.uniform([-2.0, -1.0], [2.0, 1.0], (count, 2))
+        index = np.tile(np.arange(4, length, 5), (count, 1))
+        paths = np.stack([np.asarray(motion(all_values(tuple(truth), truth.values()), *one, half=0.54))
+                          for one in zip(command, start, strict=True)])
+        return Steps(command, start, index, np.take_along_axis(paths, index[..., None], axis=1),
+                     np.ones(index.shape), 0.54), paths
+
+    known, _ = steps(0)
+    other, paths = steps(1)
+    found, predict = fit_kinematic(known, 5)
+    for name, value in truth.items():
+        assert found[name] == pytest.approx(value, abs=0.15)  # lag and delay make up for one another
+    moved = np.abs(paths[..., :2]).mean()
+    assert np.abs(predict(other) - paths)[..., :2].mean() < 0.05 * moved

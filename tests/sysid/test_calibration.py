@@ -13,7 +13,7 @@ import pytest
 from benchmarks.plant.first_day import SMALL, Wrong, make_uncalibrated, tracked, write_urdf
 from sysid.errors.prior import UNKNOWN, bounds_alone
 from sysid.intervals.uncertainty import Estimate
-from sysid.logs.log import Log, PoseStream, load_log, make_trial
+from sysid.logs.log import Log, OdometryStream, PoseStream, load_log, make_trial
 from sysid.logs.synthetic import write_dataset
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes
@@ -23,7 +23,6 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
 from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
-from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import Scenario
@@ -146,6 +145,9 @@ def test_without_an_outside_pose_the_report_says_that_sizes_are_taken_as_stated(
     as_stated = Estimate("wheels.radius", 0.098, 0.098, 0.0979, 0.0981, True, "")
     note = calibration_notes((as_stated,), uncalibrated.spec, uncalibrated.training)[0]
     assert note == "The wheel radius is as stated, 0.098 m (0.0979 to 0.0981 m)."
+    at_it = [Estimate(f"pose_mount.{axis}", 0.0, 1e-4, -1e-3, 1e-3, True, "") for axis in ("x", "y", "yaw")]
+    assert calibration_notes(at_it, uncalibrated.spec, uncalibrated.training) == [
+        "The outside pose follows the reference point, within 1.0 mm and 0.06 degrees."]
 
 
 @pytest.fixture(scope="module")
@@ -158,19 +160,39 @@ def small_robot(tmp_path_factory):
     return load_log(log), write_urdf(folder / "robot.urdf")
 
 
-def test_an_own_robot_is_calibrated_by_what_the_command_line_fits(small_robot):
+def test_an_own_robot_gets_what_the_log_shows_by_default(small_robot):
     log, file = small_robot
     given = make_problem(log, FitConfig(model=str(file)))
     assert {"wheels.radius", "wheels.track", "command_delay.delay", "pose_mount.x", "odometry_scale.linear",
-            "geom.ball.friction"} <= set(given.space.names)
+            "acceleration_limit.wheel", "geom.ball.friction"} <= set(given.space.names)
+    assert not any(name.startswith("actuator") or name == "acceleration_limit.linear" for name in given.space.names)
     assert isinstance(given.objective.replay.replay._replay, HostReplay)
-    found = least_squares.fit(given.objective, given.space, starts=given.space.to_unit(given.space.initial)[None],
-                              iterations=10, robust=True)
-    values = dict(zip(given.space.names, given.space.to_values(found.u), strict=True))
-    assert values["wheels.radius"] == pytest.approx(1.03 * 0.033, rel=0.005)
-    assert values["wheels.track"] == pytest.approx(0.95 * 0.16, rel=0.015)
-    assert values["pose_mount.x"] == pytest.approx(0.05, abs=0.005)
-    assert values["pose_mount.yaw"] == pytest.approx(0.14, abs=0.006)
+    blind = tuple(dataclasses.replace(trial, ground_truth=None) for trial in log.trials)
+    alone = make_problem(dataclasses.replace(log, trials=blind), FitConfig(model=str(file))).space
+    assert not {"wheels.radius", "pose_mount.x", "odometry_scale.linear"} & set(alone.names)
+    assert ("wheels.radius", "no outside pose shows it") in alone.fixed
+
+
+def test_sizes_of_an_own_robot_come_out(small_robot):
+    """Planted in the model itself, with noise of a millimetre."""
+    log, file = small_robot
+    wanted = {"wheels.radius": 0.034, "wheels.track": 0.152, "odometry_scale.linear": 0.99, "pose_mount.x": 0.05,
+              "pose_mount.yaw": 0.14}
+    names = tuple(wanted)
+    model = mjcf_model(file, names[:2], effects=("odometry_scale", "pose_mount"), wheel_radius=0.033, track=0.16)
+    batch, _ = make_batch(log.trials, model.plant.dt)
+    replay = HostReplay(model.plant, batch, lambda values: set_parameters(model.params, names, values))
+    seen, random, trials = replay.simulate(np.array([list(wanted.values())])), np.random.default_rng(0), []
+    for i, trial in enumerate(log.trials):
+        pose = seen.pose[0, i, : len(trial.ground_truth.t)] + random.normal(0, 1e-3, (len(trial.ground_truth.t), 3))
+        speeds = seen.odometry[0, i, : len(trial.odometry.t), 3:]
+        odometry = OdometryStream(trial.odometry.t, None, None, None, *speeds.T)
+        trials.append(make_trial(trial.name, trial.command, odometry, PoseStream(trial.ground_truth.t, *pose.T)))
+    planted = dataclasses.replace(log, trials=tuple(trials))
+    fit = fit_log(planted, FitConfig(method="lm", iterations=8, elsewhere=False, parameters=names), model=model)
+    for one in fit.uncertainty.estimates:
+        assert one.value == pytest.approx(wanted[one.name], rel=0.005, abs=2e-3), one.name
+        assert one.identifiable, one.name
 
 
 @pytest.mark.quick
@@ -180,7 +202,7 @@ def test_sizes_of_the_wheels_change_the_model_and_the_file_that_is_written(small
     wanted = {"wheels.radius": 0.036, "wheels.track": 0.15, "wheels.difference": 0.02}
     params = set_parameters(model.params, list(wanted), jnp.array(list(wanted.values())))
     written = load_robot(model.write(tmp_path, params))
-    assert written.distance == pytest.approx(0.15, abs=1e-6)
+    assert written.distance == pytest.approx(0.15, abs=1e-5)
     left, right = (written.host.geom(f"{side}_wheel").size[0] for side in ("left", "right"))
     assert (left + right) / 2 == pytest.approx(0.036, rel=1e-6)
     assert (left - right) / 0.036 == pytest.approx(0.02, rel=1e-5)
@@ -189,6 +211,7 @@ def test_sizes_of_the_wheels_change_the_model_and_the_file_that_is_written(small
     assert floor[0] == pytest.approx(floor[1], abs=1e-4)  # what grows rises
 
 
+@pytest.mark.long
 def test_a_drive_by_the_host_is_that_of_mjx(tmp_path, small_robot):
     """Spheres, which MJX compiles soon; half a second."""
     from test_models import ROBOT
@@ -208,7 +231,7 @@ def test_a_drive_by_the_host_is_that_of_mjx(tmp_path, small_robot):
 
     sets = np.array([[1.0, 0.02, 0.0, 0.1], [0.4, 0.1, 0.2, 0.105], [0.4, 0.1, 0.1, 0.105]])
     ours, theirs = (kind(model.plant, batch, put).simulate(sets) for kind in (HostReplay, Replay))
-    np.testing.assert_allclose(ours.pose, theirs.pose, atol=2e-4)
+    np.testing.assert_allclose(ours.pose, theirs.pose, atol=2e-3)  # MJX has single precision
     assert np.abs(ours.pose[0, 0, -1] - ours.pose[1, 0, -1]).max() > 5e-3
     assert not ours.diverged.any()
 

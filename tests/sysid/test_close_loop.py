@@ -21,7 +21,7 @@ from sysid.logs.synthetic import write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
 from sysid.missing.refit import without_each
-from sysid.pages.loop_report import effects, make_report, manifest, replay, write_run
+from sysid.pages.loop_report import effects, make_report, manifest, replay, shifts, write_run
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
 from sysid.replay.rollout import vehicle_plant
@@ -32,7 +32,15 @@ from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
-from sysid.verdict.vehicles import drives_of, refit_poses, refitter_of, vehicle_after, vehicle_before
+from sysid.verdict.vehicles import (
+    drives_of,
+    fitted_alone,
+    fitted_before,
+    refit_poses,
+    refitter_of,
+    vehicle_after,
+    vehicle_before,
+)
 from whill_mjx.effects import make_effect
 from whill_mjx.effects.card import Falsifier
 from whill_mjx.effects.unnamed import KNOTS
@@ -229,13 +237,29 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     if "slope.along_x" in values:
         low, high = values["slope.along_x"]["interval"]
         assert low - 0.01 < 0.03 < high + 0.01
-    before, after = (read[key]["held_out"]["ground_truth"]["trajectory"] for key in ("before", "after"))
-    assert after < before
+    before, alone, after = (read[key]["held_out"]["ground_truth"]["trajectory"] for key in ("before", "alone", "after"))
+    assert after < before and alone < before
+    page = (tmp_path / "report.html").read_text()
+    assert "named alone" in page and "refitted before" in page
+    assert all({"reference", "before", "after", "spread", "away", "unit"} <= set(row) for row in read["base"])
     assert read["manifest"]["sha256"]
     _, params, provenance = load_vehicle(tmp_path / "vehicle.toml")
     assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
     assert provenance["verdict"] == "named"
     assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_where_only_what_was_named_may_move_the_base_stays_as_it_was(sloping):
+    before, alone = (base_values(one) for one in (fitted_before(sloping), fitted_alone(sloping)))
+    named = {axis.parameter for one in sloping.search.final.hypotheses for axis in one.axes}
+    assert named and {name: value for name, value in alone.items() if name in before and name not in named} == {
+        name: value for name, value in before.items() if name not in named}
+    assert all(alone[name] != 0 for name in named)
+
+
+def test_base_parameters_far_from_the_reference_are_said():
+    row = {"name": "slip_traction.mu", "unit": "-", "reference": 0.8, "before": 0.6, "after": 0.5, "away": -6.0}
+    assert shifts([row, {**row, "away": 0.5}]) == ["slip_traction.mu 0.8 -> 0.5 - (-6.0 spreads)"]
 
 
 def test_base_parameters_that_went_far_widen_the_interval_of_an_effect(sloping):

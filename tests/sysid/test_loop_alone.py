@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from sysid.errors.features import BIN, bin_width, make_features
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
 from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict.alone import UNTOLD, judged, simplest, stands_alone
 from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.preparation import days_of
 from whill_mjx.effects import make_effect
+from whill_mjx.vehicle.specs import HUSKY
 
 pytestmark = pytest.mark.quick
 
@@ -138,3 +140,14 @@ def test_a_replay_shows_the_pose_late_and_the_odometry_in_time():
     late = path_of(plant, Cart((make_effect("pose_delay", delay=0.3),)), command, start)
     np.testing.assert_allclose(late[12:, 0], plain[:-12, 0], atol=1e-5)
     np.testing.assert_array_equal(late[:, 3:], plain[:, 3:])
+
+
+def test_blocks_of_a_long_reference_run_count_as_days():
+    windows = tuple(window(f"run/{i:03d}", speed=1.0 + 0.1 * i) for i in range(26))
+    long, short = (Log("run", HUSKY, trials, "") for trials in (windows, windows[:9]))
+    days = days_of((long, short))
+    assert [len(one.training) for one in days] == [4, 4, 3, 3, 3, 3, 3, 3, 9]
+    assert [trial.name for one in days[:8] for trial in one.training] == [trial.name for trial in windows]
+    assert len({one.name for one in days}) == 9
+    twice = Log("day", HUSKY, (*windows, *windows), "")  # driven twice: one day
+    assert days_of((twice,)) == (twice,)

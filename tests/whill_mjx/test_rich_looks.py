@@ -78,6 +78,7 @@ def test_things_never_close_the_passage(task):
     assert seen > 100
 
 
+@pytest.mark.long
 def test_the_kernel_draws_rich_looks_as_the_renderer_does():
     scene = paint(jax.random.key(1), furnished("corridor", jax.random.key(2)))
     pose = jnp.array([0.5, 0.0, 0.68]), camera_rotation(0.1, 0.15)

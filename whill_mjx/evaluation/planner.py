@@ -16,7 +16,8 @@ from whill_mjx.env import Env, State
 from whill_mjx.tasks.base import Task
 from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
-from whill_mjx.world.scene import Scene, collides, footprint
+from whill_mjx.world.collision import obstacles_of, touches
+from whill_mjx.world.scene import Scene, footprint
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def predicted_return(
 
     def look(pose, twist, command, earlier, distance, farther, time_s):
         body = footprint(env.model.spec, pose[0], pose[1], pose[2])
-        collided = collides(body, scene.boxes)
+        collided = touches(body, obstacles_of(scene, body.x, body.y))
         reached = (distance <= task.goal_radius) & ~collided
         never = jnp.zeros((), bool)
         moment = Moment(
@@ -201,14 +202,14 @@ def predicted_motion(
 
 
 def _touches(config: PlannerConfig, env: Env, scene: Scene, poses: jax.Array, margin: float) -> jax.Array:
-    """(steps,) bool: does the vehicle, grown by `margin` on each side, touch a box at these poses (steps, 3)?"""
+    """(steps,) bool: does the vehicle, grown by `margin` on each side, touch anything at these poses (steps, 3)?"""
 
     def at(pose):
         vehicle = footprint(env.model.spec, pose[0], pose[1], pose[2])
         grown = dataclasses.replace(
             vehicle, half_length=vehicle.half_length + margin, half_width=vehicle.half_width + margin
         )
-        return collides(grown, scene.boxes)
+        return touches(grown, obstacles_of(scene, grown.x, grown.y))
 
     return jax.vmap(at)(poses)
 

@@ -210,8 +210,24 @@ VEHICLE = (
     Field("body", kind="table", needed=False),
     Field("effects", kind="list", needed=False),
     Field("provenance", kind="table", needed=False),
+    Field("statistics", kind="table", needed=False),
 )
 """A vehicle file; without `body` and `effects` these are a base model's for the spec."""
+
+STATISTICS = (
+    Field("schema", kind="whole", choices=(1,), remedy="Fit the vehicle again, or use the version that wrote it."),
+    Field("drives", kind="whole", low=1),
+    Field("bin", "s", 0.01, 60.0),
+    Field("channels", kind="texts"),
+    Field("shared", low=0.0, high=1.0),
+    Field("scale", low=0.0, kind="numbers"),
+    *(Field(name, kind="numbers") for name in ("memory", "inverse")),
+    Field("factors", low=1.0, kind="numbers"),
+    Field("parameters", kind="texts"),
+    Field("standard_error", low=0.0, kind="numbers"),
+    Field("correlation", low=-1.0, high=1.0, kind="numbers"),
+)
+"""[statistics] of a vehicle file: what its fit knows beside the values. Matrices are written row by row."""
 
 EFFECT = (Field("name", kind="text"), Field("parameters", kind="table"))
 """One of [[effects]] of a vehicle file."""

@@ -11,15 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.world.lidar import disturbed, first_hits, sent_from
 from whill_mjx.world.scene import Boxes
 
 
 @dataclass(frozen=True)
 class Lidar(Sensor):
-    """Distances (rays,) [m] to the first box in each direction, at most `reach`; the vehicle itself is not seen.
+    """Distances (rays,) [m] to the first thing in each direction, at most `reach`; the vehicle itself is not seen.
 
     Ray k looks (k + 0.5) / rays of the field of view to the left of its right edge. The scan is level: the tilt of the
-    vehicle is not followed. Round things (`Scene.solids`) are not met.
+    vehicle is not followed. It meets boxes, cylinders, capsules and people, and the walls of a map. A ray without a
+    return reads `reach`.
     """
 
     name: ClassVar[str] = "lidar"
@@ -37,6 +39,14 @@ class Lidar(Sensor):
     """Height above the ground [m]; boxes that end below are not met."""
     yaw: float = 0.0
     """Turn to the left [rad]."""
+    nearest: float = 0.0
+    """Shorter distances give no return [m]."""
+    noise: float = 0.0
+    """Standard deviation of a distance [m]."""
+    dropouts: float = 0.0
+    """Share of rays that give no return by chance."""
+    period: float = 0.0
+    """Duration of a scan [s], during which the vehicle moves on; the first ray is the oldest. 0 freezes it."""
 
     def angles(self) -> np.ndarray:
         """(rays,) rad, from straight ahead of the vehicle to the left."""
@@ -46,10 +56,14 @@ class Lidar(Sensor):
         return Reading((self.rays,), 0.0, self.reach)
 
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
-        body = view.moment.body
+        body, moment = view.moment.body, view.moment
         c, s = jnp.cos(body.yaw), jnp.sin(body.yaw)
-        x, y = body.x + self.x * c - self.y * s, body.y + self.x * s + self.y * c
-        return memory, distances(x, y, body.yaw + self.angles(), view.moment.scene.boxes, self.reach, self.z, self.z)
+        pose = jnp.stack([body.x + self.x * c - self.y * s, body.y + self.x * s + self.y * c, body.yaw])
+        x, y, yaw = sent_from(pose, moment.twist, self.rays, self.period)
+        found = first_hits(moment.scene, x, y, yaw + self.angles(), self.z)
+        if not (self.noise or self.dropouts or self.nearest):
+            return memory, jnp.minimum(found, self.reach)
+        return memory, disturbed(found, key, self.noise, self.dropouts, self.nearest, self.reach)
 
     def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
         return value[..., ::-1]

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 
 from whill_mjx.tasks.base import Task, World
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.world.scene import clearance, footprint
+from whill_mjx.world.collision import free_distance
+from whill_mjx.world.scene import footprint
 
 TRIES = 64
 """Poses drawn at one distance from the goal, of which the first free one is taken."""
@@ -48,7 +49,7 @@ def anywhere(task: Task, spec: VehicleSpec, world: World, key: jax.Array) -> jax
         place = world.start[:2] + far * along + aside * ASIDE * jnp.stack([-along[1], along[0]])
         ahead = goal - place
         yaw = jnp.arctan2(ahead[1], ahead[0]) + turned * TURNED
-        free = clearance(footprint(spec, place[0], place[1], yaw), world.scene.boxes) >= CLEAR
+        free = free_distance(footprint(spec, place[0], place[1], yaw), world.scene) >= CLEAR
         free &= jnp.linalg.norm(ahead) >= task.goal_radius + SHORT
         return jnp.append(place, yaw), free
 

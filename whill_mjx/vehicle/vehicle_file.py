@@ -8,6 +8,7 @@
     name = "pid_drive"          # canonical name; the order is the order in which the effects act
     [effects.parameters.kp]     # value, unit, interval
     [provenance]                # free: data hash, fit, held-out error; interval_confidence is that of all intervals
+    [statistics]                # optional, by sysid.fit: errors of the parameters, and what the model leaves of drives
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ def save_vehicle(
     params: VehicleParams,
     intervals: Mapping[str, tuple[float, float]] | None = None,
     provenance: Mapping[str, Any] | None = None,
+    statistics: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write a vehicle file, whole or not at all.
 
@@ -52,6 +54,7 @@ def save_vehicle(
         intervals: confidence interval of a parameter by its dotted name ("pid_drive.kp").
         provenance: what is worth knowing of the origin; strings, numbers and tables of them. Its
             `interval_confidence`, such as 0.9, belongs to the intervals.
+        statistics: what a fit knows beside the values (`whill_mjx.io.fields.STATISTICS`).
     """
     import tomlkit  # not needed to read a file
 
@@ -68,6 +71,8 @@ def save_vehicle(
         ],
         "provenance": dict(provenance or {}),
     }
+    if statistics is not None:
+        content["statistics"] = dict(statistics)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp")
@@ -134,6 +139,13 @@ def load_intervals(path: str | Path) -> dict[str, tuple[float, float]]:
                     raise ValueError(f"{path}: {where} is [{low:g}, {high:g}]; the lower end comes first. Swap them.")
                 found[f"{holder}.{name}"] = (low, high)
     return found
+
+
+def load_statistics(path: str | Path) -> dict[str, Any] | None:
+    """The checked section `statistics` of a vehicle file, None where it has none; errors as of `load_vehicle`."""
+    path = Path(path)
+    table = _read(path).get("statistics")
+    return None if table is None else fields.check_table(str(path), fields.STATISTICS, table, "statistics", NEWER)
 
 
 def sha256_of(path: str | Path) -> str:

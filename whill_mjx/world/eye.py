@@ -106,7 +106,7 @@ def develop(image: jax.Array, eye: Eye, turning: jax.Array, key: jax.Array, step
     spread = (eye.dark_noise + (eye.noise - eye.dark_noise) * jnp.clip(pixels, 0.0, 1.0)) * (1.0 / 255.0)
     # The sum of four bytes of one random word, less its mean: nearly normal, and a quarter of the random numbers.
     word = jax.random.bits(key, image.shape, jnp.uint32)
-    total = sum((word >> (8 * i) & 255).astype(jnp.int32) for i in range(4))
+    total = sum(((word >> (8 * i) & 255).astype(jnp.int32) for i in range(4)), jnp.zeros(image.shape, jnp.int32))
     pixels = pixels + spread * (total.astype(jnp.float32) - 510.0) * (1.0 / 147.8)
     return jnp.clip(jnp.round(pixels * 255.0), 0.0, 255.0).astype(jnp.uint8)
 

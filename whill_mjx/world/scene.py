@@ -5,10 +5,12 @@ World frame: x forward along the course, y left, z up, ground at z = 0. Lengths 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from whill_mjx.world.materials import Finish
@@ -53,6 +55,32 @@ class Looks:
     seed: jax.Array  # () uint32, of noise and grain
 
 
+@dataclass(frozen=True, eq=False)
+class MapWalls:
+    """Walls of a map. Static, and shared by all instances: a map of thousands of walls is stored once."""
+
+    segments: np.ndarray
+    """(S, 2, 2) float32: both ends of each wall, x and y [m]; the free space lies to the left of its way."""
+    keep: int
+    """Walls that an image shows at most: the scene's last boxes are theirs."""
+    height: float
+    """Height of all walls [m]."""
+    near: np.ndarray
+    """(rows * columns, M) int32: the walls within reach of each square of a coarse grid; -1 is none."""
+    corner: tuple[float, float]
+    """x, y of the coarse grid's lower left corner [m]."""
+    square: float
+    """Edge of its squares [m]."""
+    shape: tuple[int, int]
+    """Its rows and columns."""
+
+    def cell(self, x: jax.Array, y: jax.Array) -> jax.Array:
+        """Line of `near` for a place; the nearest square for one outside."""
+        column = jnp.clip(jnp.floor((x - self.corner[0]) / self.square), 0, self.shape[1] - 1)
+        row = jnp.clip(jnp.floor((y - self.corner[1]) / self.square), 0, self.shape[0] - 1)
+        return (row * self.shape[1] + column).astype(jnp.int32)
+
+
 @struct.dataclass
 class Scene:
     """Everything around the vehicle."""
@@ -60,8 +88,9 @@ class Scene:
     boxes: Boxes
     marker: Marker
     looks: Looks
-    solids: Solids | None = None  # seen, but nothing collides with them
+    solids: Solids | None = None  # seen; rounds collide, blocks do not
     finish: Finish | None = None  # textures, lamps and fog
+    walls: MapWalls | None = struct.field(pytree_node=False, default=None)  # of a map: seen and hit
     ghosts: Boxes | None = None  # upright boxes that are seen, but nothing collides with them
     hidden: jax.Array | None = None  # (P,) bool: boxes that are hit but not seen, for something else shows them
     rich: Any = None  # materials, lights and film of `whill_mjx.world.rich`; they replace colours, looks and finish

@@ -1,4 +1,7 @@
-"""Things a camera can see besides upright boxes: boxes of any rotation, cylinders and capsules; all of fixed number."""
+"""Things besides upright boxes: boxes of any rotation, which are only seen, and cylinders and capsules, which are hit.
+
+All are of fixed number.
+"""
 
 from __future__ import annotations
 

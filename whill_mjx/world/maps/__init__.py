@@ -2,15 +2,22 @@
 
     images      image files as grey levels
     nav2        nav2's YAML and image as an occupancy grid, by nav2's rule
+    footprints  buildings of OpenStreetMap and CityGML as an occupancy grid
     grid        occupancy grid, borders of the free space
+    straight    long straight walls from the borders of cells
     field       distance to the nearest thing
-    walls       walls as boxes
+    walls       which walls rays meet and a camera sees
+    places      starts and goals with a way between them
+    playable    all that as the world of an episode
 """
 
 from whill_mjx.world.maps.field import DistanceField, distance_at, distance_field, map_clearance
+from whill_mjx.world.maps.footprints import load_footprints
 from whill_mjx.world.maps.grid import FREE, OCCUPIED, UNKNOWN, GridMap, wall_segments
 from whill_mjx.world.maps.nav2 import load_map
-from whill_mjx.world.maps.walls import nearest_walls
+from whill_mjx.world.maps.places import Places, Reach
+from whill_mjx.world.maps.playable import MapScene, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.world.maps.walls import cast, nearest_walls, shown
 
 __all__ = [
     "FREE",
@@ -18,10 +25,19 @@ __all__ = [
     "UNKNOWN",
     "DistanceField",
     "GridMap",
+    "MapScene",
+    "Places",
+    "Reach",
+    "cast",
     "distance_at",
     "distance_field",
+    "load_footprints",
     "load_map",
+    "make_map_scene",
     "map_clearance",
+    "map_scene_sampler",
     "nearest_walls",
+    "read_map",
+    "shown",
     "wall_segments",
 ]

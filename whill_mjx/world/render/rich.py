@@ -116,7 +116,7 @@ def _light(lights, normal, point) -> list:
 
 def shadow_factor(casters, x, y, z) -> jax.Array:
     """Share of the light that things leave to a point: soft, darkest at their foot, and away from the lamps."""
-    factor = 1.0
+    factor = jnp.ones_like(x)
     for index in range(casters.shape[0]):
         c = [casters[index, i] for i in range(10)]
         rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point

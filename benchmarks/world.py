@@ -1,0 +1,145 @@
+"""Maps and contact: wrong pixels of the horizon, and how deep a vehicle gets: `python -m benchmarks.world`.
+
+The real maps are those of ../shared/data/maps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.harness import figure, record
+from whill_mjx.world.collision import Obstacles, first_contact, from_above, poses_between, touches
+from whill_mjx.world.maps import FREE, OCCUPIED, GridMap, distance_field, load_map, make_map_scene, map_scene_sampler
+from whill_mjx.world.maps.walls import distances_to, shown, wall_boxes
+from whill_mjx.world.render import camera_rotation, pinhole, render_frame
+from whill_mjx.world.scene import Footprint, box, no_boxes, stack_boxes
+from whill_mjx.world.solids import person
+
+MAPS = ("stata_basement/stata_basement", "willow_garage/willow-full", "fetch_office/3_1_16_localization",
+        "fetch_office/9_16_15")
+MOST = 2000
+"""Walls of the image that counts as right: the nearest ones."""
+SPEED, YAW_RATE, PERIOD = 1.67, 1.0, 0.1
+HALF = 0.4925, 0.277
+"""Half length and width of a WHILL Model CR [m]."""
+CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the benchmark."""
+
+    maps: Path = Path("../shared/data/maps")
+    """Folder of the real maps."""
+    poses: int = 1000
+    """Camera poses in each map."""
+    tries: int = 100_000
+    """Steps at full speed towards each kind of thing."""
+
+
+def wrong_share(path: Path, poses: int) -> float:
+    """Share of the horizon's pixels whose depth is off by more than 0.5 m against the nearest `MOST` walls."""
+    made = make_map_scene(load_map(path))
+    scene, _ = map_scene_sampler(made)(jax.random.key(0))
+    segments = jnp.asarray(made.walls.segments)
+    lens = pinhole(1.0, 64, 64)
+    pitch = 0.1
+    horizon = dataclasses.replace(lens, cy=0.5 + jnp.tan(pitch) * lens.fy)  # an image of one row: the horizon
+    most = min(MOST, len(segments))
+
+    def wrong(start):
+        position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], pitch, 0.0)
+        _, index = jax.lax.top_k(-distances_to(segments, start[0], start[1]), most)
+        every = wall_boxes(segments, index, jnp.ones(most, bool), made.walls.height, (0.8, 0.8, 0.7))
+        few = shown(scene, position, rotation, lens, 64)
+        images = (few, dataclasses.replace(scene, boxes=every, walls=None))
+        one, all_of = (render_frame(position, rotation, horizon, image, 1, 64).depth for image in images)
+        return jnp.mean((jnp.abs(one - all_of) > 0.5) | (jnp.isfinite(one) != jnp.isfinite(all_of)))
+
+    rng = np.random.default_rng(0)
+    starts = made.places.start[rng.integers(0, len(made.places.start), poses)]
+    starts[:, 2] = rng.uniform(-np.pi, np.pi, poses)
+    return float(np.mean(jax.jit(lambda starts: jax.lax.map(wrong, starts))(jnp.asarray(starts, jnp.float32))))
+
+
+def obstacles(kind: str) -> Obstacles:
+    """A thing around (2, 2)."""
+    grey, nothing = (0.5, 0.5, 0.5), from_above(person(-90.0, -90.0))
+    if kind == "wall":
+        return Obstacles(stack_boxes([box(2.0, 2.0, 0.005, 3.0, 1.0, grey)]), nothing)
+    if kind == "corner":
+        return Obstacles(stack_boxes([box(2.0, 2.0, 0.5, 0.5, 1.0, grey, 0.6)]), nothing)
+    if kind == "person":
+        return Obstacles(no_boxes(1), from_above(person(2.0, 2.0)))
+    cells = np.full((80, 80), FREE, np.uint8)
+    cells[36:44, 40:44] = OCCUPIED
+    return Obstacles(no_boxes(1), nothing, distance_field(GridMap(cells, 0.05, (0.0, 0.0, 0.0))))
+
+
+def deepest(kind: str, tries: int) -> float:
+    """Largest depth [m] of all poses up to where the vehicle stops, over random steps at full speed."""
+    things = obstacles(kind)
+    count = poses_between(SPEED, YAW_RATE, PERIOD, *HALF)
+
+    def one(key):
+        far, angle, yaw, speed, turn = jax.random.uniform(key, (5,), minval=-1.0)
+        far = 0.65 + 0.35 * far
+        half = [jnp.asarray(size) for size in HALF]
+        x, y = 2.0 + far * jnp.cos(jnp.pi * angle), 2.0 + far * jnp.sin(jnp.pi * angle)
+        before = Footprint(x, y, jnp.pi * yaw, half[0], half[1], jnp.asarray(0.9))
+        reach, turn = SPEED * PERIOD * jnp.sign(speed), turn * YAW_RATE * PERIOD
+        middle = before.yaw + turn / 2
+        after = dataclasses.replace(before, x=x + reach * jnp.cos(middle), y=y + reach * jnp.sin(middle),
+                                    yaw=before.yaw + turn)
+        _, share = first_contact(before, after, things, count)
+
+        def depth(part):
+            part = part * share
+            pose = dataclasses.replace(before, x=x + part * (after.x - x), y=y + part * (after.y - y),
+                                       yaw=before.yaw + part * turn)
+
+            def smaller(low_high, _):
+                low, high = low_high
+                shrink = (low + high) / 2
+                inner = dataclasses.replace(pose, half_length=half[0] - shrink, half_width=half[1] - shrink)
+                hit = touches(inner, things)
+                return (jnp.where(hit, shrink, low), jnp.where(hit, high, shrink)), None
+
+            (low, _), _ = jax.lax.scan(smaller, (jnp.zeros(()), jnp.asarray(0.2)), None, length=9)
+            return low
+
+        worst = jnp.max(jax.lax.map(depth, jnp.linspace(0.1, 1.0, 10)))
+        return jnp.where(touches(before, things), 0.0, worst)
+
+    keys = jax.random.split(jax.random.key(1), tries)
+    return float(jnp.max(jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=1000))(keys)))
+
+
+def main(options: Options) -> None:
+    """Measure and record."""
+    figures = {}
+    for name in MAPS:
+        share = wrong_share(options.maps / f"{name}.yaml", options.poses)
+        print(f"{name}: {100 * share:.3f} % of the horizon's pixels are wrong", flush=True)
+        figures[name] = share
+    worst = {}
+    for kind in ("wall", "corner", "person", "field"):
+        worst[kind] = deepest(kind, options.tries)
+        print(f"{kind}: {1000 * worst[kind]:.2f} mm deep at most in {options.tries} tries", flush=True)
+    path = record("environment", CLAIM, {
+        "wrong_horizon_pixels": figure([max(figures.values())], "share"),
+        "penetration_cm": figure([100 * max(worst.values())], "cm"),
+    })  # fmt: skip
+    print(f"worst map {max(figures.values()):.5f}, deepest {100 * max(worst.values()):.3f} cm -> {path}")
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Options, prog="python -m benchmarks.world", description=__doc__))

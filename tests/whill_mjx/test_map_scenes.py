@@ -1,0 +1,250 @@
+"""Maps as scenes: straight walls, what a camera sees of them, starts and goals, footprints of cities, the command."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.tasks.map_goal import MapGoal
+from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.world.collision import obstacles_of, touches
+from whill_mjx.world.maps import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridMap,
+    Reach,
+    cast,
+    load_footprints,
+    make_map_scene,
+    map_scene_sampler,
+    shown,
+)
+from whill_mjx.world.maps.straight import open_space, outline, straight_walls
+from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
+from whill_mjx.world.render import camera_rotation, pinhole, render_frame
+from whill_mjx.world.scene import footprint
+
+pytestmark = pytest.mark.quick
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "maps"
+
+
+def tilted_room(cells=120, size=0.05, angle=0.3):
+    """A square room of 4 m, turned by `angle`, in cells of 5 cm."""
+    row, column = np.mgrid[:cells, :cells]
+    x, y = (column + 0.5 - cells / 2) * size, (row + 0.5 - cells / 2) * size
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    inside = (abs(along) < 2.0) & (abs(across) < 2.0)
+    return GridMap(np.where(inside, FREE, OCCUPIED).astype(np.uint8), size, (-cells * size / 2, -cells * size / 2, 0.0))
+
+
+def test_the_outline_runs_around_every_cell_with_the_space_on_its_left():
+    space = np.random.default_rng(0).random((9, 13)) < 0.6
+    loops = outline(space)
+    nexts = [np.roll(loop, -1, 0) for loop in loops]
+    area = sum((a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]).sum() / 2 for a, b in zip(loops, nexts, strict=True))
+    assert area == space.sum()
+    steps = np.concatenate(nexts) - np.concatenate(loops)
+    assert ((steps == 0).sum(1) == 1).all()
+
+
+def test_the_steps_of_a_slanted_wall_become_one_wall():
+    grid = tilted_room()
+    walls = straight_walls(grid, open_space(grid))
+    length = np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1)
+    assert len(walls) <= 12 and np.sort(length)[-4:].min() > 3.6
+    turned = walls.reshape(-1, 2) @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+    assert np.abs(np.abs(turned).max(-1) - 2.0).max() < 0.075
+
+
+def test_streaks_and_specks_go_and_pillars_stay():
+    cells = np.full((60, 60), OCCUPIED, np.uint8)
+    cells[5:50, 5:50] = FREE
+    cells[20, 50:60] = FREE  # a laser through a window
+    cells[30:32, 30:32] = UNKNOWN  # a speck
+    cells[40:42, 20:22] = OCCUPIED  # a table leg
+    cells[10:20, 10:20] = UNKNOWN  # a cupboard
+    space = open_space(GridMap(cells, 0.05, (0.0, 0.0, 0.0)))
+    assert not space[20, 50:].any() and space[30:32, 30:32].all()
+    assert not space[40:42, 20:22].any() and not space[10:20, 10:20].any()
+
+
+def test_a_ray_meets_the_first_wall_and_none_slips_through_a_corner():
+    grid = tilted_room()
+    walls = jnp.asarray(straight_walls(grid, open_space(grid)), jnp.float32)
+    angle = jnp.linspace(0.0, 2 * np.pi, 2001)
+    distance, index = cast(walls, 0.3, -0.2, angle)
+    assert np.isfinite(distance).all() and distance.min() > 1.6 and distance.max() < 3.4
+    start, end = walls[index, 0], walls[index, 1]
+    point = jnp.stack([0.3 + distance * jnp.cos(angle), -0.2 + distance * jnp.sin(angle)], -1)
+    way = end - start
+    aside = (point - start)[:, 0] * way[:, 1] - (point - start)[:, 1] * way[:, 0]
+    np.testing.assert_allclose(aside / jnp.linalg.norm(way, axis=-1), 0.0, atol=1e-4)
+
+
+def test_the_most_seen_come_first_and_once():
+    index, mask = most_seen(jnp.array([7, 3, 7, 7, 9, 3, 1]), 3)
+    assert mask.all() and list(np.asarray(index[:2])) == [7, 3] and int(index[2]) in (1, 9)
+    index, mask = most_seen(jnp.array([4, 4]), 4)
+    assert int(mask.sum()) == 1 and int(index[0]) == 4
+
+
+def many_rooms():
+    """Rooms in a row with doors, 60 pillars: more walls than an image may show."""
+    cells = np.full((160, 400), FREE, np.uint8)
+    cells[[0, -1]] = OCCUPIED
+    cells[:, [0, -1]] = OCCUPIED
+    for column in range(80, 400, 80):
+        cells[:, column : column + 3] = OCCUPIED
+        cells[60:100, column : column + 3] = FREE
+    rng = np.random.default_rng(2)
+    for row, column in rng.integers(8, [150, 390], (60, 2)):
+        cells[row : row + 4, column : column + 4] = OCCUPIED
+    return GridMap(cells, 0.05, (-10.0, -4.0, 0.4))
+
+
+def test_a_camera_sees_the_walls_that_all_walls_would_show():
+    """At most 1 % of the horizon is off by more than 0.5 m against an image of every wall."""
+    made = make_map_scene(many_rooms(), keep=64)
+    scene, _ = map_scene_sampler(made)(jax.random.key(0))
+    segments = jnp.asarray(made.walls.segments)
+    assert 200 < len(segments) < 2000
+    every = wall_boxes(segments, jnp.arange(len(segments)), jnp.ones(len(segments), bool), 2.2, (0.8, 0.8, 0.7))
+    lens = pinhole(1.0, 64, 64)
+
+    @jax.jit
+    @jax.vmap
+    def wrong(start):
+        position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], 0.1, 0.0)
+        few = shown(scene, position, rotation, lens, 64)
+        row = 32 + jnp.round(jnp.tan(-0.1) * lens.fy).astype(int)  # of the horizon
+        one = render_frame(position, rotation, lens, few).depth[row]
+        all_of = render_frame(position, rotation, lens, dataclasses.replace(scene, boxes=every, walls=None)).depth[row]
+        return jnp.mean((jnp.abs(one - all_of) > 0.5) | (jnp.isfinite(one) != jnp.isfinite(all_of)))
+
+    starts = jnp.asarray(made.places.start[::128], jnp.float32)
+    assert float(wrong(starts).mean()) <= 0.01
+
+
+def test_starts_and_goals_are_free_and_a_way_apart():
+    made = make_map_scene(many_rooms(), Reach(nearest=4.0, farthest=9.0))
+    places, segments = made.places, made.walls.segments.astype(float)
+    assert (places.way >= 4.0).all() and (places.way <= 9.0).all()
+    assert (places.way >= np.linalg.norm(places.start[:, :2] - places.goal, axis=-1) - 1e-6).all()
+    start, way = segments[:, 0], segments[:, 1] - segments[:, 0]
+    for point in np.concatenate([places.start[::97, :2], places.goal[::97]]):
+        share = np.clip(((point - start) * way).sum(-1) / (way**2).sum(-1), 0, 1)
+        assert np.linalg.norm(start + share[:, None] * way - point, axis=-1).min() > 0.95 - 0.1
+    with pytest.raises(ValueError, match="m of clearance"):
+        make_map_scene(many_rooms(), Reach(passing=5.0))
+    with pytest.raises(ValueError, match="no start and goal 100 to 200 m apart"):
+        make_map_scene(many_rooms(), Reach(nearest=100.0, farthest=200.0))
+
+
+def test_every_wall_within_reach_is_in_the_list_of_its_square():
+    made = make_map_scene(many_rooms())
+    walls = made.walls
+    for x, y in made.places.start[::256, :2]:
+        listed = set(walls.near[int(walls.cell(jnp.asarray(x), jnp.asarray(y)))])
+        start, way = walls.segments[:, 0], walls.segments[:, 1] - walls.segments[:, 0]
+        share = np.clip(((np.array([x, y]) - start) * way).sum(-1) / (way**2).sum(-1), 0, 1)
+        near = np.flatnonzero(np.linalg.norm(start + share[:, None] * way - [x, y], axis=-1) < 1.2)
+        assert set(near) <= listed
+
+
+OSM = """<osm version="0.6">{}
+<way id="1"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="4"/><nd ref="1"/><tag k="building" v="yes"/></way>
+<way id="2"><nd ref="1"/><nd ref="3"/><tag k="highway" v="path"/></way></osm>"""
+NODES = "".join(f'<node id="{i + 1}" lat="{48 + y / 111_200:.9f}" lon="{10 + x / 74_630:.9f}"/>'
+                for i, (x, y) in enumerate([(0, 0), (20, 0), (20, 10), (0, 10)]))
+GML = """<CityModel xmlns:gml="http://www.opengis.net/gml"><gml:Envelope srsName="EPSG:6677" srsDimension="3"/>
+<cityObjectMember><Building><lod0FootPrint><gml:Polygon>
+<gml:exterior>
+<gml:LinearRing><gml:posList>0 0 5 20 0 5 20 20 5 0 20 5 0 0 5</gml:posList></gml:LinearRing></gml:exterior>
+<gml:interior>
+<gml:LinearRing><gml:posList>5 5 5 15 5 5 15 15 5 5 15 5 5 5 5</gml:posList></gml:LinearRing></gml:interior>
+</gml:Polygon></lod0FootPrint></Building></cityObjectMember></CityModel>"""
+
+
+def test_footprints_have_their_size_in_metres(tmp_path):
+    path = tmp_path / "town.osm"
+    path.write_text(OSM.format(NODES))
+    grid = load_footprints(path)
+    assert (grid.cells == OCCUPIED).sum() * 0.01 == pytest.approx(200.0, rel=0.02)
+    path = tmp_path / "yard.gml"
+    path.write_text(GML)
+    grid = load_footprints(path)
+    assert (grid.cells == OCCUPIED).sum() * 0.01 == pytest.approx(20.0**2 - 10.0**2, rel=0.02)
+    assert grid.origin[:2] == (-10.0, -10.0)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "is no XML"), ("<osm>", "is no XML"), ("<svg/>", "holds <svg>"), ("<osm/>", "has no building"),
+    (OSM.format(""), "has no building"), (OSM.format(NODES).replace('lat="48.0', 'lat="x'), "cannot be read"),
+    ("<!DOCTYPE a [<!ENTITY b 'c'>]><osm/>", "declares XML entities"),
+    (GML.replace("0 0 5 20", "0 0 20"), "points of 3"),
+    (GML.replace("Building", "Road"), r"has no building with a footprint \(found Road"),
+    (GML.replace("20 20 5", "90000 90000 5"), "over 50000000 cells"),
+])  # fmt: skip
+def test_a_file_without_footprints_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "town.osm"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        load_footprints(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+def test_the_walls_of_a_map_are_stored_once_for_a_batch():
+    walls = map_walls(np.array([[[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0], [1.0, 1.0]]]))
+    made = make_map_scene(many_rooms())
+    scene, start = jax.jit(jax.vmap(map_scene_sampler(made)))(jax.random.split(jax.random.key(0), 5))
+    assert scene.walls is made.walls and start.shape == (5, 3) and scene.marker.position.shape == (5, 3)
+    assert walls.near.max() == 1
+
+
+def test_a_vehicle_in_a_map_sees_it_and_stops_at_its_walls(tmp_path):
+    cells = many_rooms().cells[::-1]
+    (tmp_path / "map.pgm").write_bytes(b"P5 400 160 255\n" + np.where(cells == FREE, 254, 0).astype(np.uint8).tobytes())
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [-10, -4, 0.4]\nnegate: 0\n"
+                                       "occupied_thresh: 0.65\nfree_thresh: 0.196\n")
+    env, params = make_env(MapGoal(map=str(tmp_path / "map.yaml"), v_max=1.67))
+
+    @jax.jit
+    def drive(key):
+        first = reset_state(env, params, key)
+
+        def one_step(state, _):
+            state, outcome = step_state(env, params, state, jnp.array([1.0, 0.0]))
+            return state, (outcome.metrics["clearance"], outcome.metrics["collision"])
+
+        last, (clear, hit) = jax.lax.scan(one_step, first, None, length=150)
+        return first, last, clear, hit, observe(env, first)
+
+    first, last, clear, hit, image = drive(jax.random.key(3))
+    assert float(clear[0]) > 0.0 and float(hit.sum()) == 1.0 and float(clear[-1]) == 0.0
+    x, y, yaw = reference_pose(env.model, last.vehicle.qpos)
+    body = footprint(env.model.spec, x, y, yaw)
+    inner = dataclasses.replace(body, half_length=body.half_length - 0.01, half_width=body.half_width - 0.01)
+    assert not bool(touches(inner, obstacles_of(last.scene, body.x, body.y)))
+    assert np.asarray(image).std() > 5.0
+
+
+def test_the_command_writes_a_picture_and_the_walls(tmp_path):
+    (tmp_path / "town.osm").write_text(OSM.format(NODES))
+    command = [sys.executable, "-m", "whill_mjx.maps", "import"]
+    done = subprocess.run([*command, "town.osm", "--out", "scene"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "walls: 8 straight ones" in done.stdout, done.stderr
+    assert (tmp_path / "scene.png").stat().st_size > 1000
+    with np.load(tmp_path / "scene.npz") as arrays:
+        assert arrays["walls"].shape == (8, 2, 2) and arrays["start"].shape[1] == 3
+    for words, message in ((["no.yaml"], "does not exist"), (["town.txt"], "unknown kind of map")):
+        done = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 2 and message in done.stderr and len(done.stderr.strip().splitlines()) == 1

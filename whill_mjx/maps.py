@@ -1,0 +1,68 @@
+"""Make a scene of a map and show what came of it: `python -m whill_mjx.maps import FILE --out scene`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from whill_mjx.io.command_line import POSITIVE, OptionError, Range, listen, refusing, run
+
+listen()
+
+import numpy as np  # noqa: E402
+
+from whill_mjx.io.folders import check_place, write_whole  # noqa: E402
+from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments  # noqa: E402
+from whill_mjx.world.maps.picture import from_above  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Import:
+    """Options of the command."""
+
+    action: str
+    """import"""
+    file: Path
+    """nav2 map (.yaml), OpenStreetMap (.osm) or CityGML (.gml)."""
+    out: Path = Path("scene")
+    """Name of what is written: OUT.png, the map from above, and OUT.npz, its walls, starts and goals."""
+    cell: Annotated[float, Range(0.02, 1.0)] = 0.1
+    """Edge of a cell of a city's footprints [m]."""
+    width: Annotated[float, POSITIVE] = 0.9
+    """Narrowest passage that the vehicle uses [m]."""
+    pixels: Annotated[int, Range(100, 8000)] = 1200
+    """Longer side of the picture."""
+
+
+def main(options: Import) -> None:
+    """Write picture and scene, and print what was found."""
+    if options.action != "import":
+        raise OptionError(f"{options.action}: unknown action (known: import). Correct it.")
+    picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
+    check_place("--out", picture)
+    with refusing():
+        grid = read_map(options.file, options.cell)
+        made = make_map_scene(grid, Reach(passing=options.width / 2))
+    size = np.array(grid.cells.shape[::-1]) * grid.resolution
+    steps, places = len(wall_segments(grid)), made.places
+    print(f"{options.file}: {size[0]:.1f} x {size[1]:.1f} m in cells of {grid.resolution:g} m")
+    print(f"free and within reach: {made.space.sum() * grid.resolution**2:.0f} m2")
+    print(f"walls: {len(made.walls.segments)} straight ones, from {steps} edges of cells")
+    print(f"starts and goals: {len(places.way)} pairs, {places.way.min():.1f} to {places.way.max():.1f} m apart")
+    import io
+
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way)
+    write_whole(arrays, buffer.getvalue())
+    write_whole(picture, from_above(made, options.pixels))
+    print(f"{picture}, {arrays}")
+
+
+def cli() -> None:
+    """Command line."""
+    run(Import, main, __doc__)
+
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,53 @@
+"""A goal in a real map, some metres away, with a way to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+
+from whill_mjx.sensors.commands import Commands
+from whill_mjx.sensors.goal import Goal
+from whill_mjx.sensors.lidar import Lidar
+from whill_mjx.tasks.base import Task, World
+from whill_mjx.world.maps import Reach, make_map_scene, map_scene_sampler, read_map
+
+
+@dataclass(frozen=True)
+class MapGoal(Task):
+    """Drive to a point in a map. Start and goal are drawn anew for each episode; walls are seen, scanned and hit."""
+
+    name: ClassVar[str] = "map_goal"
+    walls: ClassVar[int] = 0
+
+    v_min: float = 0.0
+    v_max: float = 0.8
+    omega_max: float = 1.0
+    max_steps: int = 400
+    goal_radius: float = 0.5
+    smoothness_gain: float = 0.1
+    map: str = ""
+    """nav2 map (.yaml), OpenStreetMap (.osm) or CityGML (.gml)."""
+    nearest: float = 3.0
+    """Shortest way to a goal [m]."""
+    farthest: float = 12.0
+    """Longest way to a goal [m]."""
+
+    def sample_world(self, key: jax.Array) -> World:
+        """One of the map's pairs of start and goal; always the same in a fixed layout."""
+        sample = _sampler(self.map, self.nearest, self.farthest)
+        scene, start = sample(key if self.randomised else jax.random.key(0))
+        return World(scene, start)
+
+    def observations(self) -> Mapping[str, Any]:
+        return {"goal": Goal(), "lidar": Lidar(rays=90, reach=8.0, z=0.3), "commands": Commands(1)}
+
+
+@lru_cache(maxsize=8)
+def _sampler(path: str, nearest: float, farthest: float) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
+    made = make_map_scene(read_map(Path(path)), Reach(nearest=nearest, farthest=farthest))
+    return map_scene_sampler(made)

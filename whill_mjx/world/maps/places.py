@@ -1,0 +1,104 @@
+"""Where an episode in a map may start and end: places that a vehicle can stand at, with a way between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from whill_mjx.world.maps.grid import GridMap
+
+STEP = 0.2
+"""Distance of neighbouring points of the graph of ways, about [m]."""
+AHEAD = 5
+"""Points of the way over which a start's direction is taken."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What a vehicle needs of a place [m]."""
+
+    passing: float = 0.45
+    """Clearance on the way: half the vehicle's width and some room."""
+    standing: float = 0.95
+    """Clearance at start and goal: the farthest corner of a WHILL Model CR from its driven axle, and some room."""
+    nearest: float = 3.0
+    """Shortest way from start to goal."""
+    farthest: float = 12.0
+    """Longest way from start to goal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Q pairs of start and goal in one map."""
+
+    start: np.ndarray
+    """(Q, 3) x [m], y [m], and yaw [rad] along the way."""
+    goal: np.ndarray
+    """(Q, 2) x, y [m]."""
+    way: np.ndarray
+    """(Q,) length of the way [m]."""
+
+
+def clearances(space: np.ndarray, resolution: float) -> np.ndarray:
+    """(rows, columns) m: distance of each cell's centre from the border of the space; 0 outside."""
+    from scipy.ndimage import distance_transform_edt
+
+    padded = np.pad(space, 1)
+    return np.where(space, distance_transform_edt(padded)[1:-1, 1:-1] - 0.5, 0.0) * resolution
+
+
+def draw_places(
+    grid: GridMap, space: np.ndarray, reach: Reach, goals: int = 64, each: int = 32, seed: int = 0
+) -> Places:
+    """Pairs with a way of the asked length between them: `each` starts for each of `goals` goals.
+
+    Raises:
+        ValueError: the map has no such pair; names the largest clearance and the length of the longest way.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import dijkstra
+
+    clear = clearances(space, grid.resolution)
+    stride = max(1, round(STEP / grid.resolution))
+    coarse = clear[stride // 2 :: stride, stride // 2 :: stride]
+    rows, columns = np.nonzero(coarse >= reach.passing)
+    number = np.full(np.add(coarse.shape, 1), -1)
+    number[rows, columns] = np.arange(len(rows))
+    tails, heads, lengths = [], [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        other = number[rows + down, columns + right]
+        linked = other >= 0
+        tails.append(number[rows, columns][linked])
+        heads.append(other[linked])
+        lengths.append(np.full(linked.sum(), np.hypot(down, right) * stride * grid.resolution))
+    count = len(rows)
+    tail, head, length = (np.concatenate(parts) for parts in (tails, heads, lengths))
+    graph = coo_array((length, (tail, head)), (count, count)).tocsr()
+    points = grid.to_world((np.stack([columns, rows], -1) * stride + stride // 2 + 0.5) * grid.resolution)
+    standing = np.flatnonzero(coarse[rows, columns] >= reach.standing)
+    rng = np.random.default_rng(seed)
+    starts, ends, ways = [], [], []
+    longest = 0.0
+    for goal in rng.permutation(standing)[:goals]:
+        distance, before = dijkstra(  # a goal sees no farther than it needs to: a city has a million points
+            graph, directed=False, indices=goal, return_predecessors=True, limit=reach.farthest
+        )
+        far = distance[standing]
+        longest = max(longest, float(far[np.isfinite(far)].max()))
+        fits = standing[(far >= reach.nearest) & (far <= reach.farthest)]
+        if not len(fits):
+            continue
+        chosen = rng.choice(fits, each)
+        ahead = chosen
+        for _ in range(AHEAD):
+            ahead = np.where(before[ahead] >= 0, before[ahead], ahead)
+        way = points[ahead] - points[chosen]
+        starts.append(np.column_stack([points[chosen], np.arctan2(way[:, 1], way[:, 0])]))
+        ends.append(np.repeat(points[goal][None], each, 0))
+        ways.append(distance[chosen])
+    if not starts:
+        raise ValueError(
+            f"the map has no start and goal {reach.nearest:g} to {reach.farthest:g} m apart: its widest place has "
+            f"{clear.max():.2f} m of clearance, its longest way is {longest:.1f} m. Ask for less, or check the scale.")
+    return Places(np.concatenate(starts), np.concatenate(ends), np.concatenate(ways))

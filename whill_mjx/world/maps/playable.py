@@ -1,0 +1,91 @@
+"""A map as a world to drive in: walls, starts and goals; each episode draws one pair."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from whill_mjx.world.maps.footprints import load_footprints
+from whill_mjx.world.maps.grid import GridMap
+from whill_mjx.world.maps.nav2 import load_map
+from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
+from whill_mjx.world.maps.straight import connected, open_space, straight_walls
+from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.scene import MapWalls, Marker, Scene, default_looks, no_boxes
+
+BLUE = (0.04, 0.16, 0.90)
+WALL = (0.78, 0.76, 0.72)
+MARKER_HALF, MARKER_HEIGHT = 0.3, 1.05
+"""Half edge of the goal's square, and the height of its centre [m]."""
+TURNED = 0.3
+"""Largest angle of a start off its way [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapScene:
+    """What a map became: its space, walls and places."""
+
+    grid: GridMap
+    space: np.ndarray
+    """(rows, columns) bool: what a vehicle can reach or see."""
+    walls: MapWalls
+    places: Places
+
+
+def read_map(path: str | Path, cell: float = 0.1) -> GridMap:
+    """Occupancy grid of a map of any known kind, by the ending of its name; footprints get cells of `cell` [m]."""
+    ending = Path(path).suffix.lower()
+    if ending in (".osm", ".gml", ".xml"):
+        return load_footprints(path, cell)
+    if ending in (".yaml", ".yml"):
+        return load_map(path)
+    raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml). Give one of them.")
+
+
+def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, seed: int = 0) -> MapScene:
+    """Walls and places of a grid.
+
+    Args:
+        grid: from `load_map` or `load_footprints`.
+        reach: what the vehicle needs.
+        keep: walls that an image shows at most.
+        seed: of the places.
+
+    Raises:
+        ValueError: no place is wide enough, or no two are the asked distance apart.
+    """
+    reach = reach or Reach()
+    space = open_space(grid)
+    clear = clearances(space, grid.resolution)
+    space = connected(space, clear >= reach.passing)
+    if not space.any():
+        raise ValueError(f"the map's widest place has {clear.max():.2f} m of clearance, and the vehicle needs "
+                         f"{reach.passing:g} m. Check the resolution and the thresholds.")
+    places = draw_places(grid, space, reach, seed=seed)
+    return MapScene(grid, space, map_walls(straight_walls(grid, space), keep), places)
+
+
+def map_scene_sampler(made: MapScene) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:
+    """Function of a key that draws the scene and the start (3,) [m, m, rad] of an episode; pure, of one instance."""
+    starts, goals = made.places.start.astype(np.float32), made.places.goal.astype(np.float32)
+
+    def sample(key: jax.Array) -> tuple[Scene, jax.Array]:
+        start, goal = jnp.asarray(starts), jnp.asarray(goals)
+        which, turn = jax.random.split(key)
+        pair = jax.random.randint(which, (), 0, start.shape[0])
+        begin = start[pair].at[2].add(jax.random.uniform(turn, minval=-TURNED, maxval=TURNED))
+        position = jnp.append(goal[pair], MARKER_HEIGHT)
+        faces = jnp.arctan2(goal[pair, 1] - begin[1], goal[pair, 0] - begin[0])
+        half = jnp.array([0.02, MARKER_HALF, MARKER_HALF])
+        marker = Marker(position, half, faces, jnp.array(BLUE))
+        boxes = no_boxes(made.walls.keep)
+        boxes = dataclasses.replace(boxes, colour=jnp.broadcast_to(jnp.array(WALL), boxes.colour.shape))
+        return Scene(boxes, marker, default_looks(), walls=made.walls), begin
+
+    return sample
