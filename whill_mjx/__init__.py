@@ -18,14 +18,20 @@ if TYPE_CHECKING:
     from whill_mjx.env import step as step
     from whill_mjx.evaluation.policy_file import load_policy as load_policy
     from whill_mjx.gym import WhillEnv as WhillEnv
+    from whill_mjx.gym.vector import WhillVectorEnv as WhillVectorEnv
     from whill_mjx.processor import share_results as share_results
+    from whill_mjx.tasks.tasks import Budget as Budget
+    from whill_mjx.tasks.tasks import Corridor as Corridor
+    from whill_mjx.tasks.tasks import ObstacleCourse as ObstacleCourse
     from whill_mjx.tasks.tasks import Task as Task
+    from whill_mjx.tasks.tasks import World as World
     from whill_mjx.tasks.tasks import register_task as register_task
     from whill_mjx.vehicle.config import VehicleConfig as VehicleConfig
     from whill_mjx.vehicle.parameters import describe as describe
     from whill_mjx.vehicle.parameters import get_values as get_values
     from whill_mjx.vehicle.parameters import set_values as set_values
     from whill_mjx.vehicle.presets import preset as preset
+    from whill_mjx.vehicle.specs import CameraMount as CameraMount
     from whill_mjx.vehicle.specs import VehicleSpec as VehicleSpec
     from whill_mjx.vehicle.types import VehicleParams as VehicleParams
     from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle
@@ -39,8 +45,8 @@ _HOMES = {
     "step": "whill_mjx.env",
     "make_batch": "whill_mjx.batch",
     "WhillEnv": "whill_mjx.gym",
-    "Task": "whill_mjx.tasks.tasks",
-    "register_task": "whill_mjx.tasks.tasks",
+    "ObstacleCourse": "whill_mjx.tasks.tasks",
+    "Corridor": "whill_mjx.tasks.tasks",
     "VehicleSpec": "whill_mjx.vehicle.specs",
     "VehicleConfig": "whill_mjx.vehicle.config",
     "VehicleParams": "whill_mjx.vehicle.types",
@@ -56,15 +62,25 @@ _HOMES = {
     "load_policy": "whill_mjx.evaluation.policy_file",
     "share_results": "whill_mjx.processor",
 }
+_EXTENDING = {
+    "Task": "whill_mjx.tasks.tasks",
+    "World": "whill_mjx.tasks.tasks",
+    "Budget": "whill_mjx.tasks.tasks",
+    "register_task": "whill_mjx.tasks.tasks",
+    "CameraMount": "whill_mjx.vehicle.specs",
+    "WhillVectorEnv": "whill_mjx.gym.vector",
+}
+"""Names for tasks, vehicles and clients of one's own (docs/tasks.md); `import *` leaves them out."""
 __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use: importing the package stays quick."""
-    if name not in _HOMES:
+    home = _HOMES.get(name) or _EXTENDING.get(name)
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_EXTENDING})
