@@ -17,7 +17,7 @@ from whill_mjx.world.scene import Boxes, MapWalls, Scene
 
 SQUARE, NEAR = 0.5, 1.2
 """Edge of the squares that have lists of their walls, and how near a wall has to be: a wheelchair and a step [m]."""
-THICKNESS = 0.02
+THICKNESS = 0.002
 """Depth of a drawn wall, behind its face [m]."""
 
 
