@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import figure, record
+from benchmarks.logs import CLAIM
 from benchmarks.plant.commands import nine
 from benchmarks.plant.first_day import FASTER, SLOWER, Wrong, make_uncalibrated, write_urdf
 from sysid.command_line import progress_bar
@@ -31,7 +32,6 @@ from sysid.search.fitting import expected_steps, fit_log, predict
 from sysid.search.settings import FitConfig
 from whill_mjx.io import command_line
 
-CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
 MANOEUVRES = ("turn", "s_curve", "stop_and_go", "figure_eight")
 LENGTH = 12.0  # s of each manoeuvre
 

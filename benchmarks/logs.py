@@ -25,7 +25,7 @@ from benchmarks.log_faults import FAULTS, ROOT, Drive, Fault, Robot, healthy
 from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
-CLAIM = "Faults of time and frames in driving logs are named, healthy logs are not, and an hour of driving is read fast"
+CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
 WRONG = re.compile("sign is reversed|check its unit")
 """What no fault here is."""
 

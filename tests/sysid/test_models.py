@@ -427,7 +427,7 @@ def test_wheels_that_cannot_be_told_are_asked_for(robot_file, tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(ROBOT.replace('name="left"', 'name="a"').replace('name="right"', 'name="b"')
                     .replace('joint="left"', 'joint="a"').replace('joint="right"', 'joint="b"'))
-    with pytest.raises(ValueError, match="robot.xml: the names do not show which wheels are driven .*joints: a, b.*--wheels"):
+    with pytest.raises(ValueError, match="robot.xml: the names do not show which wheels .*joints: a, b.*--wheels"):
         load_robot(path)
     assert load_robot(path, ("left_motor", "b")).wheels == (6, 7)
     with pytest.raises(ValueError, match="must be two hinge joints"):
