@@ -174,7 +174,7 @@ def test_an_ending_with_a_name_of_the_library_is_refused():
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("name", list(TASKS))
+@pytest.mark.parametrize("name", [name for name in TASKS if name != "map_goal"])  # which needs a map
 def test_every_task_that_ships_begins_free_and_away_from_its_goal(name):
     from whill_mjx.vehicle.specs import WHILL_CR
     from whill_mjx.world.scene import clearance, footprint
