@@ -957,25 +957,6 @@ CLAIMS = (
         ("set", "verdict", "looks the same", "values", "before", "after"),
         _shared,
     ),
-    Claim(
-        MISSING,
-        "A trial: naming by posterior weight",
-        "decision",
-        "`close_loop --decision posterior` beside the search, on logs that were kept aside while it was tuned. 71 logs "
-        "were judged by both. The search stays the default: the trial names too much that is outside the catalogue.",
-        ("figure", "posterior", "search"),
-        (
-            ("right, of 71 logs", "{right}", "{right_search}"),
-            ("right class at 2x", "{class_accuracy_2x|%}", "{class_accuracy_2x_search|%}"),
-            ("wrong name at 2x", "{wrong_name_2x|%}", "{wrong_name_2x_search|%}"),
-            ("outside the catalogue at 2x: unexplained", "{out_of_catalogue_2x|%}", "{out_of_catalogue_2x_search|%}"),
-            ("two effects: both named", "{pair_both|%}", "{pair_both_search|%}"),
-            ("two effects: a wrong name", "{pair_wrong|%}", "{pair_wrong_search|%}"),
-            ("noise factor inside its 95 % interval, twice the noise", "{noise_factor_coverage_2|%}", "-"),
-            ("false alarms at twice the noise, upper 95 % bound", "{false_alarm_upper_noise_2|%}", "-"),
-            ("verdict from saved evidence, one core [s]", "{verdict_s}", "-"),
-        ),
-    ),
     # The code
     Claim(
         "The code itself",

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
 
@@ -35,7 +35,7 @@ from sysid.verdict.pipeline import check_logs, watched
 from sysid.verdict.result import LoopConfig
 
 KIND = "sysid.close_loop"
-OUTPUTS = ("next_command.csv", "posterior.json", "evidence.npz.xz", "steps")
+OUTPUTS = ("next_command.csv", "steps")
 STOPPED = "stopped; give the same command again to go on."
 
 
@@ -61,8 +61,6 @@ class Arguments:
     """Iterations of the base fit."""
     without: tuple[str, ...] = ()
     """Effects of the catalogue that are not looked for, because the vehicle cannot have them."""
-    decision: Literal["search", "posterior"] = "search"
-    """What decides: the search, or, as a trial, posterior weights (writes posterior.json instead of the report)."""
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -73,13 +71,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         log, references, vehicle = load(arguments)
         config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                             without=arguments.without, refit_nulls=arguments.refit_nulls)
-    chosen = {"data": log.sha256, "references": [one.sha256 for one in references], "decision": arguments.decision,
+    chosen = {"data": log.sha256, "references": [one.sha256 for one in references],
               "vehicle": file_label(arguments.vehicle), **settings_of(config, ("thresholds",))}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen):
-        if arguments.decision == "posterior":
-            from sysid.weighing.decision import run as weigh
-
-            return weigh(log, references, arguments.out, config, vehicle)
         return write_result(arguments.out, watched(log, references, config, vehicle))
 
 

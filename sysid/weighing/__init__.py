@@ -1,1 +1,0 @@
-"""A trial beside the search: what is missing by posterior weight, from a saved file of evidence."""
