@@ -961,6 +961,18 @@ CLAIMS = (
             ("verdict from saved evidence, one core [s]", "{verdict_s}", "-"),
         ),
     ),
+    Claim(
+        FIT,
+        "Whether faults of driving logs are named",
+        "logs",
+        "Logs of robots of many sizes with one fault of time or of frames each. Rightly named means that the sentence "
+        "says what it is, and no other sentence says what is not so. Faults too small to matter to a fit do not count.",
+        ("figure", "value", "logs"),
+        (
+            ("faults at the two larger of three sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),
+            ("healthy logs of which something is said", "{time_faults_false|%}", "{time_faults_false|n}"),
+        ),
+    ),
     # The code
     Claim(
         "The code itself",
