@@ -969,7 +969,7 @@ CLAIMS = (
         "says what it is, and no other sentence says what is not so. Faults too small to matter to a fit do not count.",
         ("figure", "value", "logs"),
         (
-            ("faults at the two larger of three sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),
+            ("faults at the two larger sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),
             ("healthy logs of which something is said", "{time_faults_false|%}", "{time_faults_false|n}"),
         ),
     ),
