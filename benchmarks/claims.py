@@ -957,6 +957,18 @@ CLAIMS = (
         ("set", "verdict", "looks the same", "values", "before", "after"),
         _shared,
     ),
+    Claim(
+        FIT,
+        "Whether faults of driving logs are named",
+        "logs",
+        "Logs of robots of many sizes with one fault of time or of frames each. Rightly named means that the sentence "
+        "says what it is, and no other sentence says what is not so. Faults too small to matter to a fit do not count.",
+        ("figure", "value", "logs"),
+        (
+            ("faults at the two larger sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),
+            ("healthy logs of which something is said", "{time_faults_false|%}", "{time_faults_false|n}"),
+        ),
+    ),
     # The code
     Claim(
         "The code itself",
