@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import figure, record
+from whill_mjx.io import command_line
 from whill_mjx.world.collision import Obstacles, first_contact, from_above, poses_between, touches
 from whill_mjx.world.maps import FREE, OCCUPIED, GridMap, distance_field, load_map, make_map_scene, map_scene_sampler
 from whill_mjx.world.maps.walls import shown, wall_boxes
@@ -150,6 +151,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(Options, prog="python -m benchmarks.world", description=__doc__))
+    command_line.run(Options, main, __doc__, positional=False)

@@ -28,7 +28,7 @@ from sysid.replay.records import Measured
 from sysid.replay.rollout import padded
 from whill_mjx.io.fields import shown
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.vehicle.vehicle_file import load_statistics, read_vehicle
+from whill_mjx.vehicle.vehicle_file import load_statistics, load_vehicle
 
 DIGITS = 5  # of numbers in the file
 
@@ -84,9 +84,13 @@ class FittedVehicle:
 
 
 def load_fitted(path: Path) -> tuple[VehicleSpec, FittedVehicle]:
-    """The spec of a vehicle file, and the vehicle with its statistics; ValueError where they do not fit together."""
-    spec, params, _ = read_vehicle(path)
-    table = load_statistics(path)
+    """The spec of a vehicle file or built-in vehicle, and the vehicle with what a fit knows beside it.
+
+    Raises:
+        ValueError: the vehicle is unknown, or the statistics in its file do not fit it.
+    """
+    spec, params, _ = load_vehicle(path)
+    table = load_statistics(path) if path.is_file() else None
     return spec, FittedVehicle(params, None if table is None else _from_table(path, table))
 
 
