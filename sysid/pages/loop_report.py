@@ -80,6 +80,8 @@ from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.types import Parameter, parameters_of
 
+WRITING = "fitting the vehicle to whole poses, without and with what was found, and writing the report"
+"""What `write_result` does, for who waits for it."""
 SCHEMA = 1
 KIND = "sysid-close-loop"
 RESAMPLES = 2000
