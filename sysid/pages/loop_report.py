@@ -102,7 +102,8 @@ def make_report(result: Result) -> dict[str, Any]:
     days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
                           found.scan, seed=result.config.seed)
     about = [one.name for one in result.references]
-    asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
+    vehicle = f"the vehicle of {', '.join(about)}" if about else "the vehicle file"
+    asked = (f"what has changed or is missing against {vehicle}"
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
