@@ -65,7 +65,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Load, close the loop, open the held-out trials, write and print the verdict."""
-    from sysid.pages.loop_report import write_result
+    from sysid.pages.loop_report import WRITING, write_result
 
     with refusing():
         log, references, vehicle = load(arguments)
@@ -74,7 +74,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
     chosen = {"data": log.sha256, "references": [one.sha256 for one in references],
               "vehicle": file_label(arguments.vehicle), **settings_of(config, ("thresholds",))}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen):
-        return write_result(arguments.out, watched(log, references, config, vehicle))
+        found = watched(log, references, config, vehicle)
+        command_line.stage(WRITING)
+        return write_result(arguments.out, found)
 
 
 def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from sysid.replay.model_files import steps_mjx
 from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
+
+_heartbeats: list[Heartbeat] = []
+"""That of the command which runs in this process; none where the package is used from Python."""
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
@@ -23,11 +27,21 @@ def run(options: type, main: Callable[[Any], Any], description: str | None, **mo
 
     def cached(chosen: Any) -> None:
         keep_compiled()
-        with Heartbeat():  # progress bars tick while something long is computed
-            main(chosen)
+        with Heartbeat() as heartbeat:  # progress bars tick while something long is computed
+            _heartbeats.append(heartbeat)
+            try:
+                main(chosen)
+            finally:
+                _heartbeats.remove(heartbeat)
 
     command_line.run(options, cached, description, **more,
                      shares=lambda chosen: not steps_mjx(getattr(chosen, "model", None)))
+
+
+def stage(text: str) -> None:
+    """Say what a command begins now, where no bar shows it; its time is shown until the next bar or stage."""
+    for heartbeat in _heartbeats:
+        heartbeat.stage(text)
 
 
 def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Progress, Callable[[], None]]:
@@ -40,7 +54,12 @@ def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Pro
         bar.set_postfix_str(remark, refresh=count == 0)
         bar.update(min(count, max(bar.total - bar.n, 0)))
 
-    return advance, bar.close
+    def close() -> None:
+        if sys.exc_info()[0] is None and bar.n:  # the total is the most that there may be to do
+            bar.total = bar.n
+        bar.close()
+
+    return advance, close
 
 
 def keep_compiled() -> None:

@@ -29,8 +29,9 @@ def main(config: ConvertConfig) -> Log:
         log, notes = convert(config)
     for note in notes:
         print(note)
-    print(f"{config.out}: {len(log.trials)} trials, {sum(trial.duration for trial in log.trials):.0f} s; look at it "
-          f"with python -m sysid.inspect {config.out}")
+    count, seconds = len(log.trials), sum(trial.duration for trial in log.trials)
+    print(f"{config.out}: {count} trial{'s' * (count > 1)}, {seconds:.0f} s; look at it with python -m sysid.inspect "
+          f"{config.out}")
     return log
 
 

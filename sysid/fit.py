@@ -80,14 +80,16 @@ def main(arguments: Arguments) -> None:
     with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):
         fit(arguments, settings, log, model)
         if arguments.close_loop:
-            from sysid.pages.loop_report import write_result
+            from sysid.pages.loop_report import WRITING, write_result
             from sysid.verdict.pipeline import watched
             from sysid.verdict.result import LoopConfig
 
             if settings.preset != "physical":
                 print("the loop starts from the physical base model")
             config = LoopConfig(quick=settings.quick, seed=settings.seed)
-            write_result(arguments.out / "close_loop", watched(log, references, config))
+            found = watched(log, references, config)
+            command_line.stage(WRITING)
+            write_result(arguments.out / "close_loop", found)
 
 
 def check_storage(settings: FitConfig) -> None:

@@ -27,7 +27,7 @@ FIXED = {
     "body.com_z": "has next to no effect on level ground",
 }
 NUISANCE = {
-    "torque_drive.period": "it is fitted for what others go along with; the cost bends too little for an interval",
+    "torque_drive.period": "this log cannot determine it; it is free so that it does not bias the others",
 }
 """Searched, but never reported as determined: what its curvature at one point says holds nowhere else."""
 BENT = ("body.com_z",)

@@ -9,6 +9,7 @@ pose, a measured speed must be about the commanded one.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -46,15 +47,19 @@ STREAM_WORDS = {
                      "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
 }
 QUANTITY_WORDS = {
-    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi"), "qx": ("qx",), "qy": ("qy",), "qz": ("qz",),
-    "qw": ("qw",), "omega": ("omega", "yawrate", "w", "wz", "angular", "ang", "turnrate", "rot", "gyro", "gyroz",
-                             "angularvel", "angvel", "turn"),
-    "v": ("v", "vx", "speed", "velocity", "linear", "lin", "vel", "forward", "linvel", "linearvel", "throttle"),
+    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gierwinkel"),
+    "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
+    "omega": ("omega", "yawrate", "w", "wz", "angular", "ang", "turnrate", "rot", "gyro", "gyroz", "angularvel",
+              "angvel", "turn", "drehrate", "gierrate"),
+    "v": ("v", "vx", "speed", "velocity", "linear", "lin", "vel", "forward", "linvel", "linearvel", "throttle",
+          "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
 }
 TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
+SAID = "as said"  # why a column has its role where somebody gave no unit
+TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
 
@@ -69,8 +74,10 @@ class Column:
     name: str
     unit: str
     why: str
-    """How role and unit were found; empty where somebody said so."""
+    """How role and unit were found; empty where somebody said both."""
     sure: bool = True
+    assumed: bool = False
+    """Whether neither name nor numbers show the unit, so that it is the usual one."""
 
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{self.unit}"
@@ -113,16 +120,19 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
                     unit = _unit(unit[1:].strip()) if unit else ""
                     if unit and unit not in kind:
                         raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {', '.join(kind)}).")
-                    return Column(role, table.stem, name, unit or next(iter(kind)), "", True)
+                    return Column(role, table.stem, name, unit or _split_unit(name)[1], "" if unit else SAID)
     known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
     raise ValueError(f"--columns {text}: no such column (found {known[:400]}). Correct its name.")
 
 
-def guess(tables: Sequence[Table], said: Sequence[Column] = ()) -> list[Column]:
+def guess(
+    tables: Sequence[Table], said: Sequence[Column] = (), units: Mapping[tuple[str, str], str] | None = None
+) -> list[Column]:
     """What the columns of the files of one drive hold, as far as names and numbers show it.
 
     Args:
         said: what is known already; it is kept.
+        units: units that other drives of the source show, by role and name of the column.
     """
     found = list(said)
     taken = {(one.file, one.name) for one in said}
@@ -139,7 +149,21 @@ def guess(tables: Sequence[Table], said: Sequence[Column] = ()) -> list[Column]:
     found = _origin_counts(found, arrays)
     found = [one if one.why == "" else _time_unit(one, arrays[one.file, one.name]) if one.role == "time" else one
              for one in found]
+    if units:
+        open_ones = {one for one in found if one.why and one.unit not in UNITS[kind_of(one.role)]}
+        found = [replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
+                 if one in open_ones and (one.role, one.name) in units else one for one in found]
     return _units_by_numbers(found, arrays)
+
+
+def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
+    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves."""
+    votes: dict[tuple[str, str], Counter[str]] = {}
+    for columns in drives:
+        for one in columns:
+            if not one.assumed and one.role != "time":
+                votes.setdefault((one.role, one.name), Counter())[one.unit] += 1
+    return {key: vote.most_common(1)[0][0] for key, vote in votes.items()}
 
 
 def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
@@ -147,7 +171,8 @@ def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndar
     elsewhere nobody can know."""
     roles = {one.role for one in found}
     words = set(STREAM_WORDS["odometry"])
-    nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw") and one.why
+    nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw")
+                and one.why not in ("", SAID)
                 and not _stream_said(one.name, "odometry") and not set(_words(one.file)) & words]
     if not nameless or {"odometry.v", "odometry.omega"} & roles:
         return found
@@ -162,6 +187,8 @@ def _by_name(table: Table, name: str) -> Column | None:
     words = _words(plain)
     joined = "".join(words)
     turns = re.search(r"(angular|gyro|rate|orientation|quat\w*|rotation)z$", joined)
+    if _unit(name) in UNITS["time"] and _unit(name) not in ("s", "min"):  # a column that is named after its unit
+        return Column("time", table.stem, name, _unit(name), "its name")
     if not words or NOT_PLANAR & set(words[-2:]) and not turns:
         return None
     stamp_part = words[-1] in ("secs", "sec", "nsecs", "nsec", "nanosec")
@@ -309,12 +336,14 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
     for stream in ("ground_truth", "odometry"):  # angles by their wrap or their range
         role = f"{stream}.yaw"
         if (one := known.get(role)) and one.unit not in UNITS["angle"] and (mine := raw(role)):
-            known[role] = replace(one, unit="deg" if np.ptp(mine[1]) > 30 else "rad", why=f"{one.why}; its range")
+            degrees = bool(np.ptp(mine[1]) > 30)
+            known[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
+                                  assumed=not degrees)
         for axis in ("x", "y"):
             if (one := known.get(f"{stream}.{axis}")) and one.unit not in UNITS["length"] and (mine := raw(one.role)):
-                speed = np.nanmax(np.abs(_rate(*mine)[1])) if len(mine[0]) > 20 else 0.0
-                known[one.role] = replace(one, unit="mm" if speed > 50 else "m", why=f"{one.why}; its rate",
-                                          sure=one.sure)
+                fast = bool(np.percentile(np.abs(_rate(*mine)[1]), 90) > TOO_FAST)
+                known[one.role] = replace(one, unit="mm" if fast else "m", why=f"{one.why}; its rate",
+                                          assumed=not fast)
         for quantity in ("qx", "qy", "qz", "qw"):
             if one := known.get(f"{stream}.{quantity}"):
                 known[one.role] = replace(one, unit="-")
@@ -344,7 +373,8 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
             usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
             largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
             first = next(iter(UNITS[kind_of(one.role)]))
-            one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest)
+            one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest,
+                          assumed=True)
         settled.append(one)
     return settled
 
@@ -367,8 +397,12 @@ def _size_of(
     if max(ours.max(), theirs.max()) < 1e-6 or ours.max() < 1e-9 or theirs.max() < 1e-3:
         return None
     ratio = float(np.percentile(theirs, 90) / max(np.percentile(ours, 90), 1e-12))
-    unit = min(units, key=lambda one: abs(np.log(ratio / units[one])))
-    return unit if abs(np.log(ratio / units[unit])) < np.log(1 + loose) + 0.05 else None
+    apart: dict[str, float] = {}  # ft/s, for example, is too near to km/h for numbers to separate them
+    for one, size in units.items():
+        if all(abs(np.log(size / other)) > np.log(1 + ALIKE) for other in apart.values()):
+            apart[one] = size
+    unit = min(apart, key=lambda one: abs(np.log(ratio / apart[one])))
+    return unit if abs(np.log(ratio / apart[unit])) < np.log(1 + loose) + 0.05 else None
 
 
 def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -134,8 +134,10 @@ def text(found: dict[str, Any]) -> str:
     for name, channels in found["clocks"].items():
         for channel, one in channels.items():
             lag = f", then a lag of {one['lag']:.2f} s" if "command" in name else ""
-            lines.append(f"  {name}, {channel}: {1e3 * one['delay']:+.0f} +- {1e3 * one['error']:.0f} ms{lag}; "
-                         f"gain {one['gain']:.3f} ({one['trials']} trials)")
+            several = one["trials"] > 1  # one trial shows no spread
+            error = f" +- {1e3 * one['error']:.0f}" if several else ""
+            lines.append(f"  {name}, {channel}: {1e3 * one['delay']:+.0f}{error} ms{lag}; "
+                         f"gain {one['gain']:.3f} ({one['trials']} trial{'s' * several})")
     if not found["clocks"]:
         lines.append("  no trial is long and lively enough to compare clocks")
     lines += ["", "Units, signs and frames", *(f"  ! {one}" for one in found["sanity"] or [])]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision
+from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision, shown_units
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
@@ -56,17 +56,20 @@ def read_drives(
     Raises:
         ValueError: in one line, what is not clear, what was guessed and what to give.
     """
-    drives: list[TextDrive] = []
-    agreed: list[str] = list(said)
+    groups: list[tuple[str, list[Table]]] = []
     for files in text_files(source):
         tables = [read_table(path) for path in files]
-        groups = [[table] for table in tables] if len(tables) > 1 and _each_whole(tables) else [tables]
-        for group in groups:
-            alone = len(group) == 1 and (source.is_file() or len(groups) > 1)
-            name = group[0].stem if alone else files[0].absolute().parent.name
-            columns, agreed = _decide(source, group, agreed)
-            columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
-            drives.append(_join(name, source, group, columns, geometry))
+        if source.is_file() or len(tables) > 1 and _each_whole(tables):
+            groups += [(table.stem, [table]) for table in tables]
+        else:
+            groups.append((files[0].absolute().parent.name, tables))
+    units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
+    drives: list[TextDrive] = []
+    agreed: list[str] = list(said)
+    for name, tables in groups:
+        columns, agreed = _decide(source, tables, agreed, units)
+        columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
+        drives.append(_join(name, source, tables, columns, geometry))
     return drives
 
 
@@ -152,10 +155,17 @@ def _each_whole(tables: Sequence[Table]) -> bool:
     return all(len(streams(table)) > 1 for table in tables)
 
 
-def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple[list[Column], list[str]]:
+def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
+    """The decisions that are of these files."""
+    return [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
+
+
+def _decide(
+    source: Path, tables: Sequence[Table], said: Sequence[str], units: Mapping[tuple[str, str], str]
+) -> tuple[list[Column], list[str]]:
     """What the columns hold: as said, as guessed from names and numbers, and as answered on a terminal."""
-    decided = [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
-    columns = guess(tables, decided)
+    decided = _said_of(tables, said)
+    columns = guess(tables, decided, units)
     problem = _problem(tables, columns)
     if problem and sys.stdin.isatty() and sys.stdout.isatty():
         print(f"{source}: {problem}\nGuessed:")
@@ -164,7 +174,7 @@ def _decide(source: Path, tables: Sequence[Table], said: Sequence[str]) -> tuple
         print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
         answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
         decided += [read_decision(text, tables) for text in answer.split()]
-        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, decided)]
+        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, decided, units)]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
         names = [f"{table.stem}/{name}" for table in tables for name in table.columns]

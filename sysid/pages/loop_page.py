@@ -44,7 +44,7 @@ def verdict(report: dict[str, Any]) -> str:
     """The verdict in words, and the effects."""
     missing = report["missing"]
     parts = [paragraph(f"{report['verdict'].capitalize()}: {report['reason']}."),
-             paragraph(f"Asked: {report['question']}. {report['remark']}."),
+             paragraph(f"Asked: {report['question']}. {report['remark'][:1].upper()}{report['remark'][1:]}."),
              paragraph(f"The squared residual exceeds the noise by {missing['excess_before']:.0%} before and by "
                        f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
                        f"{missing['p_value']:.2g}.")]

@@ -80,6 +80,8 @@ from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.types import Parameter, parameters_of
 
+WRITING = "fitting the vehicle to whole poses, without and with what was found, and writing the report"
+"""What `write_result` does, for who waits for it."""
 SCHEMA = 1
 KIND = "sysid-close-loop"
 RESAMPLES = 2000
@@ -100,7 +102,8 @@ def make_report(result: Result) -> dict[str, Any]:
     days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
                           found.scan, seed=result.config.seed)
     about = [one.name for one in result.references]
-    asked = (f"what has changed or is missing against the vehicle of {', '.join(about) or 'the vehicle file'}"
+    vehicle = f"the vehicle of {', '.join(about)}" if about else "the vehicle file"
+    asked = (f"what has changed or is missing against {vehicle}"
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()

@@ -32,6 +32,7 @@ from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with
 from sysid.replay.robot_drive import RobotDrive
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
+from whill_mjx.vehicle.model import import_mjx
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
 AROUND_ROBOT = ("command_delay", "acceleration_limit", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
@@ -133,8 +134,7 @@ def mjcf_model(
 
 def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:
     """place, substep, observe and move of `with_surroundings`."""
-    from mujoco import mjx
-
+    mjx = import_mjx()
     host, root, speed = robot.host, robot.root, robot.speed
     try:
         nominal = mjx.put_model(host)

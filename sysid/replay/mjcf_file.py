@@ -17,6 +17,7 @@ from sysid.replay.robot_files import read_robot
 from sysid.replay.wheels import wheel_joints
 from whill_mjx.io.fields import Field, check
 from whill_mjx.logs.dataset import write_text
+from whill_mjx.vehicle.model import import_mjx
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -513,6 +514,7 @@ def _as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
 
 def _leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
     """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    import_mjx()
     from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
 
     left_out: dict[tuple[str, str], str] = {}

@@ -94,6 +94,7 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
     """`find_missing` with a progress bar."""
     progress, close = command_line.progress_bar(
         expected_steps(config, len(days_of(references)), vehicle is not None), "close the loop", "step")
+    progress(0, "reference vehicle")
     try:
         return find_missing(log, references, config, vehicle, progress)
     finally:

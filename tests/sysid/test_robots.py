@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -187,6 +189,13 @@ def test_inspect_says_what_was_understood_and_draws_it(tmp_path, capsys):
     assert (tmp_path / "seen" / "robot.png").stat().st_size > 5000 and found["drives_straight"]
     inspect_module.main(inspect_module.InspectConfig(dataset=path, out=tmp_path / "seen", json=True))
     assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
+
+
+def test_json_of_a_robot_is_all_that_comes_on_stdout(tmp_path):
+    """In a process of its own, which imports MJX for the first time."""
+    path = robot_file(tmp_path, *TWO)
+    command = [sys.executable, "-m", "sysid.inspect", str(path), "--json"]
+    assert json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)["driven_wheels"] == 2
 
 
 def test_motors_of_a_file_are_driven_by_the_host_with_their_own_limits(tmp_path):

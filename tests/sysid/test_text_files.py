@@ -154,6 +154,31 @@ def test_flags_say_what_no_name_does(tmp_path):
         convert(ConvertConfig(path, tmp_path / "other", columns=("odometry.x=f",)))
 
 
+def foreign(c):
+    """Units that no name says."""
+    return {"ms": 1e3 * c["t"], "target speed": 3.6 * c["cv"], "target turn": np.rad2deg(c["cw"]), "x": 1e3 * c["x"],
+            "y": 1e3 * c["y"], "heading": np.rad2deg(c["yaw"]), "speed": 3.6 * c["v"], "turn": np.rad2deg(c["w"])}
+
+
+def test_drives_in_which_a_unit_does_not_show_have_that_of_the_others(tmp_path):
+    names = ("random_1", "straight_1", "turn_1")
+    for name in names:
+        write(tmp_path / "logs" / f"{name}.csv", foreign(columns(CHAIR[name])))
+    log, _ = convert(ConvertConfig(tmp_path / "logs", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == list(names)
+    for trial in log.trials:
+        for quantity in ("x", "y", "yaw", "v", "omega"):
+            there = getattr(CHAIR[trial.name].odometry, quantity)
+            np.testing.assert_allclose(getattr(trial.odometry, quantity), there, atol=1e-3)
+
+
+def test_a_unit_that_is_left_out_of_a_flag_is_found_as_elsewhere(tmp_path):
+    drive = write(tmp_path / "drive.csv", foreign(columns()) | {"b [deg/s]": np.rad2deg(columns()["w"])})
+    flags = ("time=ms", "command.v=target speed", "odometry.omega=b [deg/s]", "odometry.yaw=heading")
+    log, _ = convert(ConvertConfig(drive, tmp_path / "log", columns=flags))
+    check(log.trials[0])
+
+
 def test_wheel_speeds_and_an_outside_pose_are_an_input_without_commands(tmp_path):
     c = columns()
     left, right = ((c["v"] + side * c["w"] * 0.496 / 2) / 0.1325 * 60 / (2 * np.pi) for side in (-1, 1))

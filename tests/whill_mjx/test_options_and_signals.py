@@ -150,7 +150,7 @@ def test_a_signal_ends_the_work_with_one_line_and_what_it_cleans_up_is_done(numb
         finally:
             open({str(tmp_path / "kept")!r}, "w").close()
         """)
-    assert ended(child, number) == (130, "stopped; go on so.")
+    assert ended(child, number) == (130, f"stopped; go on so. ({signal.Signals(number).name})")
     assert (tmp_path / "kept").exists()
 
 
@@ -179,7 +179,7 @@ SWALLOWS = """
 @pytest.mark.parametrize("body", [COMPILES, SWALLOWS], ids=["XLA compiles", "the work swallows the interrupt"])
 def test_a_signal_ends_the_process_where_no_handler_can(body, tmp_path):
     after = tmp_path / "after"
-    assert ended(started(body.format(after=after)), signal.SIGINT) == (130, "stopped; go on so.")
+    assert ended(started(body.format(after=after)), signal.SIGINT) == (130, "stopped; go on so. (SIGINT)")
     assert not after.exists()
 
 

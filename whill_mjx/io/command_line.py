@@ -229,6 +229,8 @@ class _State:
     working = False
     """`run` has begun; before, a signal ends the imports at once."""
     stopped = "stopped before the work began."
+    signal = "no signal"
+    """Name of the one that stopped the work."""
     before: dict[int, Any] = {}
     """Handlers that were there before."""
     wakeup: tuple[int, int] | None = None
@@ -257,6 +259,7 @@ def listen() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    _State.signal = signal.Signals(number).name
     if not _State.working:
         leave(_State.stopped)
     raise KeyboardInterrupt
@@ -264,17 +267,18 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 def _watch(reader: int) -> None:
     """End the process some time after the first signal that comes through the pipe; 0 ends the watch."""
-    while (received := os.read(reader, 1)) and received[0] not in SIGNALS:
-        if received[0] == 0:
+    while (number := (os.read(reader, 1) or b"\0")[0]) not in SIGNALS:
+        if number == 0:
             os.close(reader)
             return
+    _State.signal = signal.Signals(number).name
     select.select([reader], [], [], GRACE_S)
     WRITING.acquire(timeout=0.2)
     leave(_State.stopped, flush=False)
 
 
 def leave(line: str, flush: bool = True) -> None:
-    """Print the line and end the process with exit code 130, without waiting for other threads or for XLA."""
+    """Print the line with the name of the signal, and end the process with exit code 130; no thread is waited for."""
     if not _State.leaving.acquire(blocking=False):
         threading.Event().wait()  # the other thread ends the process
     if flush:
@@ -286,8 +290,9 @@ def leave(line: str, flush: bool = True) -> None:
     if "multiprocessing" in sys.modules:
         for child in sys.modules["multiprocessing"].active_children():
             child.kill()
+    begin = "" if flush else "\n"  # a bar may stand on the line of the cursor
     try:
-        os.write(2, f"{'' if flush else chr(10)}{line}\n".encode())  # a bar may stand on the line of the cursor
+        os.write(2, f"{begin}{line} ({_State.signal})\n".encode())
     finally:
         os._exit(INTERRUPTED)
 

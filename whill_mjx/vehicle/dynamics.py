@@ -25,7 +25,7 @@ from whill_mjx.vehicle.kinematics import (
     rotation_from_quaternion,
     wheel_speeds,
 )
-from whill_mjx.vehicle.model import VehicleModel, box_inertia
+from whill_mjx.vehicle.model import VehicleModel, box_inertia, import_mjx
 from whill_mjx.vehicle.scalars import apart, scan_apart
 from whill_mjx.vehicle.specs import GRAVITY
 from whill_mjx.vehicle.types import (
@@ -221,8 +221,7 @@ def integrate(
             model, *mass_distribution(model, params, world), world.gravity, state.qpos, state.qvel, force,
             world.wheel_inertia,
         )
-    from mujoco import mjx
-
+    mjx = import_mjx()
     data = model.data.replace(qpos=state.qpos, qvel=state.qvel, qfrc_applied=force)
     data = mjx.step(instance_model(model, params, world), data)
     return rigid.moved(state.qpos, (state.qvel + data.qvel) / 2, model.config.physics_dt), data.qvel

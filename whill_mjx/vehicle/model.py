@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -49,18 +52,23 @@ class VehicleModel:
     @cached_property
     def mjx(self) -> Any:
         """The same for MJX (mjx.Model); made when first asked for, by dynamics "mjx"."""
-        from mujoco import mjx  # prints to stdout when imported, so only on demand
-
+        mjx = import_mjx()
         with jax.ensure_compile_time_eval():  # it may be asked for while tracing, and is kept
             return mjx.put_model(self.mujoco)
 
     @cached_property
     def data(self) -> Any:
         """An mjx.Data of the right shapes; only qpos, qvel and qfrc_applied of it are ever set."""
-        from mujoco import mjx
-
+        mjx = import_mjx()
         with jax.ensure_compile_time_eval():
             return mjx.make_data(self.mjx)
+
+
+def import_mjx() -> ModuleType:
+    """The module mujoco.mjx. It prints to stdout that Warp is not installed, which it does without: that is dropped."""
+    with redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
 
 
 def mujoco_model(
