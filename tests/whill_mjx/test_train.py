@@ -157,7 +157,7 @@ def test_shaping_changes_the_learners_reward_and_not_the_evaluations():
 
     batch = SimpleNamespace(count=2, step=step, env=SimpleNamespace(
         task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1)),
-        random_looks=False, photometric=False))
+        repaints=False, sensors=()))
     state, action = SimpleNamespace(env=SimpleNamespace(command=commands)), jnp.ones((2, 2))
     new, shaped = functional_env(batch, SAFETY["safe"]).step(state, action)
     np.testing.assert_allclose(new.env.command, [[0.1, 0.2]] * 2, atol=1e-6)  # 1 m/s^2 and 2 rad/s^2 for 0.1 s
@@ -377,12 +377,12 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
     def stop(*args, **kwargs):
         raise Enough
 
-    def noted(*args, exploring_starts=0.0):
+    def noted(*args, exploring_starts=0.0, **others):
         shares.append(exploring_starts)
-        return make_env(*args)
+        return make_env(*args, **others)
 
     def batched(*args):
-        tries.append(args[-1])
+        tries.append(args[5])
         return make_batch(*args)
 
     monkeypatch.setattr("whill_mjx.learning.setup.make_batch", batched)
