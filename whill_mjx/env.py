@@ -16,6 +16,7 @@ from whill_mjx.io.fields import ENV, check_fields
 from whill_mjx.sensors.base import Sensor, Sensors, View, as_sensors, begin_sensors, read_sensors
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.base import scale_action
+from whill_mjx.tasks.check import check_task
 from whill_mjx.tasks.parts import BLUE
 from whill_mjx.tasks.starts import draw_start
 from whill_mjx.tasks.tasks import Task, make_task
@@ -139,12 +140,14 @@ def make_env(
             dict. None takes those of the task, and the camera image alone, as an array, where it names none.
 
     Raises:
-        ValueError: unknown task, layout, vehicle, looks or sensor; a share that is none; rich looks of a task that has
+        ValueError: unknown task, layout, vehicle, looks or sensor; a method of the task that fails or returns something
+            else than it must; a share that is none; rich looks of a task that has
             no lane to furnish.
     """
     task = make_task(task) if isinstance(task, str) else task
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
+    check_task(task)
     spec, params = as_vehicle(vehicle)
     chosen = task.observations() if observations is None else observations
     if looks is None:

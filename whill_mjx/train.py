@@ -72,6 +72,7 @@ from whill_mjx.learning.setup import (
 )
 from whill_mjx.learning.shaping import SAFETY, Step, find_safety
 from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.tasks.check import check_task
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -196,6 +197,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
     if options.log is not None and not options.log.exists():
         raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
+    check_task(preset.task)
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)
     if "fit" in preset.vary and options.vehicle is not None:

@@ -179,5 +179,14 @@ def test_a_video_is_recorded(tmp_path):
     assert list(tmp_path.glob("*.mp4"))
 
 
+@pytest.mark.quick
+def test_options_that_are_no_dict_are_refused():
+    from whill_mjx.gym.kinds import condition_of
+
+    with pytest.raises(ValueError, match="must be a dict"):
+        condition_of([1])
+
+
+
 def test_options_are_those_that_an_episode_can_begin_with():
     assert "start_yaw_deg" in kinds.OPTIONS and "latency" not in kinds.OPTIONS

@@ -94,7 +94,7 @@ def test_it_is_trained_and_evaluated_from_the_command_line(file, tmp_path):
 @pytest.mark.parametrize(("text", "reference", "said"), [
     ("", "{file}:Parkign", "has no task 'Parkign' .known: none"),
     ("x = ", "{file}:Parking", "cannot be imported: SyntaxError"),
-    ("import whill_mjx_nowhere", "{file}:Parking", "No module named 'whill_mjx_nowhere'"),
+    ("import whill_mjx_nowhere", "{file}:Parking", "cannot be imported: No module named 'whill_mjx_nowhere'"),
     ("Parking = 3", "{file}:Parking", "3 is no task"),
     ("", "nowhere.py:Parking", "no such file nowhere.py"),
     ("", "no_module_at_all:Parking", "No module named 'no_module_at_all'"),
@@ -107,6 +107,63 @@ def test_a_task_that_cannot_be_had_is_one_line(text, reference, said, tmp_path):
     with pytest.raises(OptionError, match=said) as caught:
         named_task(reference)
     assert "\n" not in str(caught.value) and str(caught.value).startswith(f"--task {reference}: ")
+
+
+HEAD = """from dataclasses import dataclass
+import jax.numpy as jnp, numpy as np
+from whill_mjx import Task, World
+
+class Base(Task):  # a helper that is no task of its own must not stand in the way of the others
+    pass
+
+@dataclass(frozen=True)
+class Mine(Task):
+"""
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("method", "said"), [
+    ("sample_world(self, key): raise KeyError('pillar')", "sample_world, line 10: KeyError: 'pillar'"),
+    ("sample_world(self, key): return 1", "sample_world: returns .*must be a World"),
+    ("sample_world(self, key): return World(Task().sample_world(key).scene, jnp.zeros(2))", r"start has shape .2,."),
+    ("rewards(self, moment): return {'a': moment.goal_distnce}", "rewards, line 10: AttributeError: .*goal_distnce"),
+    ("rewards(self, moment): return {'a': moment.twist}", r"'a' is float32 of shape .2,."),
+    ("rewards(self, moment): return moment.goal_distance", "rewards: returns float32.*a dict of numbers"),
+    ("rewards(self, moment): return {'a': 1.0 if moment.collided else 0.0}", "jnp.where for if"),
+    ("rewards(self, moment): return {'a': np.exp(moment.goal_distance)}", "jax.numpy for numpy"),
+    ("endings(self, moment): return {'success': moment.goal_distance}", "'success' is float32"),
+    ("endings(self, moment): pass", "endings: returns NoneType"),
+    ("goal(self, scene): return 1.0", "goal: returns .*array .2,."),
+    ("reward(self, moment): return {}", "'reward' is never called; 'rewards' would be"),
+])  # fmt: skip
+def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, said, tmp_path):
+    path = tmp_path / f"wrong_{abs(hash(method))}.py"
+    path.write_text(f"{HEAD}    def {method}\n")
+    with pytest.raises(OptionError, match=said) as caught:
+        named_task(f"{path}:Mine")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=said):
+        make_env(find_task(f"{path}:Mine"))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("body", "said"), [
+    ("    bay: list = None\n    def __post_init__(self): object.__setattr__(self, 'bay', [])", "unhashable"),
+    ("    bay: float = field(kw_only=True)", "missing 1 required keyword-only argument: 'bay'"),
+])
+def test_a_task_that_cannot_be_made_is_one_line(body, said, tmp_path):
+    path = tmp_path / f"unmade_{abs(hash(body))}.py"
+    path.write_text(f"{HEAD.replace('import dataclass', 'import dataclass, field')}{body}\n")
+    with pytest.raises(OptionError, match=said):
+        named_task(f"{path}:Mine")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("budgets", [{"smok": Budget(10)}, {"smoke": 400}])
+def test_a_budget_of_no_preset_or_of_no_kind_is_refused(budgets):
+    kind = type("Mistaken", (Task,), {"budgets": budgets})
+    with pytest.raises(ValueError, match="budgets has 'smok"):
+        find_preset("smoke", dataclass(frozen=True)(kind)())
 
 
 @dataclass(frozen=True)

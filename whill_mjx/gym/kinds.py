@@ -188,6 +188,8 @@ def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
     """
     if not options:
         return None
+    if not isinstance(options, Mapping):
+        raise ValueError(f'options is {options!r}; it must be a dict such as {{"start_y": 0.2}}. Correct it.')
     for name, value in options.items():
         if name not in OPTIONS:
             raise ValueError(f"reset has no option {name!r} (known: {', '.join(OPTIONS)}). Correct the name, or leave "

@@ -100,6 +100,10 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
         known = "'paper', 'transfer', 'wallclock', 'cpu', 'smoke', or 'auto' to go by the device"
         raise ValueError(f"unknown preset {name!r}; use {known}.")
     chosen = make_task(task) if isinstance(task, str) else task
+    for key, one in chosen.budgets.items():
+        if key not in PRESETS or not isinstance(one, Budget):
+            raise ValueError(f"task {chosen.name!r}: budgets has {key!r}: {one!r}; it needs a Budget by the name of a "
+                             f"preset ({', '.join(PRESETS)}). Correct it.")
     budget = chosen.budgets.get(name, chosen.budgets.get("paper") if name == "transfer" else None)
     if budget is None and name == "smoke":
         budget = Budget(400, eval_every=200)

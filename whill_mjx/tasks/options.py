@@ -9,6 +9,7 @@ from typing import Any
 
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.tasks.base import Task
+from whill_mjx.tasks.check import check_task
 from whill_mjx.tasks.tasks import find_task
 
 KINDS = {int: "whole number", float: "number", tuple: "list of numbers", bool: "true or false"}
@@ -17,7 +18,9 @@ KINDS = {int: "whole number", float: "number", tuple: "list of numbers", bool: "
 def named_task(name: str, option: str = "--task") -> Task:
     """The task that an option of a command names; OptionError says what is wrong."""
     try:
-        return find_task(name)
+        task = find_task(name)
+        check_task(task)
+        return task
     except (ValueError, TypeError) as error:
         text = str(error).removeprefix(f"task {name!r}: ").replace(f"unknown task {name!r}", "unknown")
         raise OptionError(f"{option} {name}: {text}") from error

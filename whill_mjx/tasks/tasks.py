@@ -37,7 +37,7 @@ from whill_mjx.tasks.obstacle_course import ObstacleCourse as ObstacleCourse
 
 GROUP = "whill_mjx.tasks"
 """Group of the entry points."""
-PARTS = ("base", "options", "parts", "starts", "tasks", "terms")
+PARTS = ("base", "check", "options", "parts", "starts", "tasks", "terms")
 """Files of this room that hold no task."""
 
 
@@ -134,11 +134,15 @@ def find_task(name: str) -> Task:
                              "package.module:TASK or path/to/file.py:TASK.")
         return TASKS[name]
     module = _import(name, place)
-    known = {**tasks_in(module), **{one: value for one, value in vars(module).items() if isinstance(value, Task)}}
-    if attribute not in known and not hasattr(module, attribute):
-        there = ", ".join(known) or "none"
+    if not hasattr(module, attribute):
+        kinds = [kind.__name__ for kind in _kinds_in(module)]
+        there = ", ".join((*kinds, *(one for one, value in vars(module).items() if isinstance(value, Task)))) or "none"
         raise ValueError(f"task {name!r}: {place} has no task {attribute!r} (known: {there}). Correct the name.")
-    return known[attribute] if attribute in known else _as_task(getattr(module, attribute), f"task {name!r}")
+    try:
+        return _as_task(getattr(module, attribute), f"task {name!r}")
+    except TypeError as error:  # no task, or a field without a default
+        text = str(error).removeprefix(f"task {name!r}: ")
+        raise ValueError(f"task {name!r}: {text.rstrip('.')}. Correct the file or the name.") from error
 
 
 def make_task(name: str, **changes: Any) -> Task:
@@ -158,8 +162,12 @@ def sample_world(task: Task, key: jax.Array) -> World:
 
 def tasks_in(module: ModuleType) -> dict[str, Task]:
     """The tasks whose classes a module defines itself, by the names of their classes."""
+    return {kind.__name__: _as_task(kind, kind.__name__) for kind in _kinds_in(module)}
+
+
+def _kinds_in(module: ModuleType) -> list[type[Task]]:
     kinds = [kind for _, kind in inspect.getmembers(module, inspect.isclass) if issubclass(kind, Task)]
-    return {kind.__name__: _as_task(kind, kind.__name__) for kind in kinds if kind.__module__ == module.__name__}
+    return [kind for kind in kinds if kind.__module__ == module.__name__]
 
 
 def source_of(task: Task) -> str | None:
@@ -209,6 +217,9 @@ def _import(name: str, place: str) -> ModuleType:
     except ValueError:
         raise
     except ModuleNotFoundError as error:
+        if place.endswith(".py"):
+            raise ValueError(f"task {name!r}: {place} cannot be imported: {error}. Install it, or correct the "
+                             "file.") from error
         raise ValueError(f"task {name!r}: {error}. Give package.module:TASK or path/to/file.py:TASK.") from error
     except Exception as error:
         raise ValueError(f"task {name!r}: {place} cannot be imported: {type(error).__name__}: {error}. Correct the "

@@ -1,0 +1,116 @@
+"""Check a task of a user's own before anything is compiled: trace its methods, and look at what they return."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import traceback
+from collections.abc import Mapping
+from functools import lru_cache
+from types import FunctionType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.tasks.base import Task, World
+from whill_mjx.tasks.terms import Moment
+from whill_mjx.world.scene import Footprint
+
+METHODS = ("sample_world", "goal", "rewards", "endings", "observations")
+"""What a task may define itself."""
+ALIKE = 0.85
+"""Similarity (`difflib`) from which the name of a method is taken for a misspelling of one of METHODS."""
+
+
+@lru_cache(maxsize=64)
+def check_task(task: Task) -> None:
+    """Raise ValueError, in one line, where a method of a task fails or does not return what its step needs.
+
+    Nothing is computed: the methods are traced for shapes and types. The tasks of this package are passed over; their
+    tests hold them to the same.
+    """
+    if type(task).__module__.startswith("whill_mjx."):
+        return
+    _check_names(type(task))
+    world = _traced(task, "sample_world", _abstract((), jax.dtypes.prng_key))
+    if not isinstance(world, World):
+        raise _wrong(task, "sample_world", f"returns {type(world).__name__}", "a World(scene, start)")
+    if jnp.shape(world.start) != (3,):
+        raise _wrong(task, "sample_world", f"start has shape {jnp.shape(world.start)}", "(3,): x, y [m], yaw [rad]")
+    goal = _traced(task, "goal", world.scene)
+    if getattr(goal, "shape", None) != (2,):
+        raise _wrong(task, "goal", f"returns {_named(goal)}", "an array (2,): x, y [m]")
+    moment = _moment(world)
+    _check_scalars(task, "rewards", moment, "numbers", lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating))
+    _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, jnp.bool_))
+
+
+def _check_names(kind: type) -> None:
+    """Refuse a method whose name is nearly one of METHODS: the default would be used without a word."""
+    for name, value in vars(kind).items():
+        if isinstance(value, FunctionType) and name not in METHODS and not name.startswith("_"):
+            meant = difflib.get_close_matches(name, METHODS, 1, ALIKE)
+            if meant and meant[0] not in vars(kind):
+                raise ValueError(f"task {kind.__name__}: its method {name!r} is never called; {meant[0]!r} would be. "
+                                 f"Call it so, or _{name} if it is another.")
+
+
+def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -> None:
+    terms = _traced(task, method, moment)
+    if not isinstance(terms, Mapping):
+        raise _wrong(task, method, f"returns {_named(terms)}", f"a dict of {what} by name")
+    for name, value in terms.items():
+        if getattr(value, "shape", None) != () or not fits(value.dtype):
+            raise _wrong(task, method, f"{name!r} is {_named(value)}", f"one of the {what}, of shape ()")
+
+
+def _traced(task: Task, method: str, argument: Any) -> Any:
+    """What a method returns for an argument, as shapes."""
+    try:
+        return jax.eval_shape(getattr(task, method), argument)
+    except Exception as error:
+        said = str(error).strip().split("\n")[0].rstrip(".")
+        raise ValueError(f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct "
+                         f"the method{_hint(error)}.") from error
+
+
+def _hint(error: Exception) -> str:
+    traced = isinstance(error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError))
+    return " (it is traced: jax.numpy for numpy, jnp.where for if)" if traced else ""
+
+
+def _line(task: Task, error: Exception) -> str:
+    """Where in the task's own file an error arose."""
+    try:
+        own = inspect.getfile(type(task))
+    except (OSError, TypeError):
+        return ""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
+    return f", line {lines[-1]}" if lines else ""
+
+
+def _wrong(task: Task, method: str, found: str, needed: str) -> ValueError:
+    return ValueError(f"task {task.name!r}: {method}: {found}; it must be {needed}. Correct the method.")
+
+
+def _named(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{value.dtype} of shape {value.shape}"
+    return type(value).__name__
+
+
+def _abstract(shape: tuple[int, ...], dtype: Any) -> Any:
+    if dtype is jax.dtypes.prng_key:
+        return jax.eval_shape(jax.random.key, 0)
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _moment(world: World) -> Moment:
+    """A moment of a world, as shapes."""
+    number, flag, pair = (_abstract(shape, kind) for shape, kind in (((), float), ((), bool), ((2,), float)))
+    body = Footprint(*[number] * len(Footprint.__dataclass_fields__))
+    return Moment(
+        scene=world.scene, pose=_abstract((3,), float), twist=pair, body=body, command=pair, previous_command=pair,
+        goal_distance=number, previous_goal_distance=number, collided=flag, reached=flag, diverged=flag, time_s=number,
+    )  # fmt: skip
