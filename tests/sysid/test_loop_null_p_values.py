@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from sysid.errors.noise import Whitener
-from sysid.logs.log import Command
+from sysid.logs.log import Command, Start
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import Leftover, Reference, expected_without, mean_by_day
 from sysid.missing.evidence import Evidence, column_layout
@@ -48,7 +48,7 @@ def day(rng, trials=slice(None)):
 def drive(course):
     """A trial that is told from others by its manoeuvre only."""
     still = np.zeros(2)
-    return SimpleNamespace(manoeuvre=f"m{course}", command=Command(still, still, still), odometry=None,
+    return SimpleNamespace(manoeuvre=f"m{course}", command=Command(still, still, still), odometry=None, start=Start(),
                            ground_truth=None)
 
 
