@@ -139,6 +139,7 @@ class EpisodeServer:
 
         class Server(socketserver.ThreadingTCPServer):
             allow_reuse_address = True
+            request_queue_size = 128  # more at once wait a second for their next try
             daemon_threads = True
             address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
 
