@@ -23,7 +23,7 @@ LONGEST = 3600.0  # s of drive that are compared
 ROUNDED = 0.02  # s that times of two tables may differ by, row by row, where they are compared row by row
 NEAR = 0.25
 """Distance of two commands (root mean square over a drive), as a share of the larger one, at which a model still leaves
-nearly the same of both. What it leaves grows at least in proportion to the command: three quarters of it are common."""
+nearly the same of both. The error grows at least in proportion to the command: three quarters of it are common."""
 GLANCE = 0.5  # s between the instants at which drives are compared first
 
 
