@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
