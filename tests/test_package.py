@@ -40,7 +40,7 @@ def test_each_console_script_listens_for_signals_before_its_slow_imports(name, m
     module = SCRIPTS[name].split(":")[0]
     path = ROOT / f"{module.replace('.', '/')}.py"
     statements = [ast.unparse(node) for node in ast.parse(path.read_text()).body]
-    (place,) = (number for number, text in enumerate(statements) if text.startswith("if starts(__name__):\n    listen()"))
+    (place,) = (k for k, text in enumerate(statements) if text.startswith("if starts(__name__):\n    listen()"))
     slow = re.compile(r"(import|from) (?!__future__|whill_mjx\.io\.(command_line|heartbeat)\b)([a-z_]+)")
     before = {match[3] for text in statements[:place] if (match := slow.match(text))}
     assert before <= set(sys.stdlib_module_names)

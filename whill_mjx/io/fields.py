@@ -18,6 +18,7 @@ import numpy as np
 LONGEST_TEXT = 400  # characters of a name or a description
 SHOWN = 60  # characters of a value in an error
 SPEED = 20.0  # m/s and rad/s; more is km/h, mm/s or deg/s
+DAY = 86_400.0  # s that a trial may last: replays and grids take memory by the second
 REMEDY = "Correct it, in SI units."
 
 
@@ -293,7 +294,7 @@ DATASET = (
 """dataset.toml of a driving log."""
 
 COLUMNS = {field.name: field for field in (
-    Field("t", "s", -1e7, 1e7, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
+    Field("t", "s", -DAY, DAY, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
                                       "divide milli- or nanoseconds."),
     Field("x", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("y", "m", -1e6, 1e6, remedy="Convert it to metres."),
