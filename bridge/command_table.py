@@ -97,8 +97,11 @@ def read_commands(path: Path) -> np.ndarray:
             raise ValueError(f"{path}, line {number}: t goes from {rows[-1][0]:g} to {row[0]:g}; it must increase. "
                              "Sort the rows.")
         rows.append(row)
-    if len(rows) < 2 or rows[-1][0] - rows[0][0] > LONGEST:
-        raise ValueError(f"{path}: {len(rows)} rows; a manoeuvre has at least 2 and lasts at most {LONGEST:g} s. "
+    if len(rows) < 2:
+        raise ValueError(f"{path}: has {'no row' if not rows else 'a single row'} of commands; a manoeuvre has at "
+                         "least 2. Give the whole file.")
+    if rows[-1][0] - rows[0][0] > LONGEST:
+        raise ValueError(f"{path}: lasts {rows[-1][0] - rows[0][0]:g} s; a manoeuvre lasts at most {LONGEST:g} s. "
                          "Split it.")
     return np.array(rows)
 
@@ -129,7 +132,7 @@ def _number(cell: str) -> float:
 
 def _shown(cells: list[str]) -> str:
     text = ",".join(cells)
-    return ascii(text if len(text) <= 60 else text[:57] + "...")
+    return ascii(text if len(text) <= 60 else text[:57] + "...")[1:-1]
 
 
 def make_table(rows: np.ndarray, low: tuple[float, float], high: tuple[float, float], slew: tuple[float, float],

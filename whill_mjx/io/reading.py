@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.io.fields import Field, check, shown
+from whill_mjx.io.fields import Field, check, counted, shown
 
 MB = 1_000_000
 TOML_BYTES = MB // 2  # a vehicle file has 5 kB
@@ -171,8 +171,9 @@ def read_csv(path: str | Path, fields: Sequence[Field], missing: str, see: str =
             raise
         lines.append(line)
     if len(lines) < 2:
-        raise ValueError(f"{path}: {len(lines)} rows of data; at least 2 are needed. Delete the empty file or record "
-                         "it again.")
+        rows_there = counted(len(lines), "row")
+        raise ValueError(f"{path}: {rows_there} of data; at least 2 are needed. Delete the empty file or record it "
+                         "again.")
     table = np.frombuffer(values).reshape(len(lines), len(fields))
     found = {field.name: table[:, column].copy() for column, field in enumerate(fields)}
     for field in fields:
