@@ -207,7 +207,7 @@ def test_a_damaged_table_of_a_stranger(tmp_path, name):
             assert np.isfinite(trial.command.v).all() and (np.diff(trial.command.t) > 0).all()
 
     path = folder / name
-    check(path, path.read_bytes(), read)
+    check(path, path.read_bytes(), read, 15)
 
 
 @pytest.mark.parametrize("name", ["cart.urdf", "cart.xacro"])
@@ -223,7 +223,7 @@ def test_a_damaged_description_of_a_robot(tmp_path, name):
             '<collision><origin xyz="0.3 0 -0.05"/><geometry><sphere radius="0.05"/></geometry></collision></link>')
     macro = '<xacro:property name="r" value="${0.05 * 2}"/>' if name.endswith("xacro") else ""
     top = ' xmlns:xacro="http://www.ros.org/wiki/xacro"' if macro else ""
-    check(path, f'<robot name="cart"{top}>{macro}{base}{wheels}</robot>'.encode(), lambda: load_robot(path), 15)
+    check(path, f'<robot name="cart"{top}>{macro}{base}{wheels}</robot>'.encode(), lambda: load_robot(path), 6)
 
 
 def test_damaged_statistics_of_a_vehicle_file(tmp_path):

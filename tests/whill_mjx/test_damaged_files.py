@@ -117,7 +117,7 @@ def test_a_damaged_map_that_is_imported(tmp_path):
         except OptionError as error:
             raise ValueError(*error.args) from None
 
-    check(path, good, read, 15)
+    check(path, good, read, 6)
     assert not list(tmp_path.glob(".*"))
 
 

@@ -242,7 +242,7 @@ class _State:
     before: dict[int, Any] = {}
     """Handlers that were there before."""
     wakeup: tuple[int, int] | None = None
-    held: set[signal.Signals] | set[int] | None = None
+    held: Any = None
     """Mask of signals before a fork that is under way."""
     leaving = threading.Lock()
 
