@@ -64,6 +64,7 @@ def small_device(monkeypatch):
     monkeypatch.setattr(host_replay, "fits", lambda obs_bytes, device: obs_bytes < 50 * 4 * 16 * 16 * 3)
 
 
+@pytest.mark.long
 def test_a_run_on_too_small_a_device_goes_on_from_its_checkpoint_bit_for_bit(small_device, tmp_path, capsys):
     straight = train(ENV, CONFIG, tmp_path / "straight", 300, 0, **QUIET)
     assert "kept in the host's" in capsys.readouterr().err
