@@ -23,7 +23,7 @@ from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
-from whill_mjx.evaluation.rollouts import CHANNELS, rollout
+from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
 from whill_mjx.io.video import write_h264
@@ -282,7 +282,8 @@ def swerving():
 
     driver = Driver("swerving", begin, lambda turn, state, image, key: (turn, jnp.stack([1.0, turn])))
     keys = jax.random.split(jax.random.key(5), 8)
-    recorded = jax.jit(lambda params: rollout(course.env, params, keys, driver, frames=True))(course.vehicles(keys))
+    view = View(frames=True)
+    recorded = jax.jit(lambda params: rollout(course.env, params, keys, driver, view=view))(course.vehicles(keys))
     whole = jax.device_get(recorded)
     episodes = Episodes(whole.trace, whole.ends, whole.scene, keys, course.env.model.config.control_dt)
     return course, episodes, whole.frames
