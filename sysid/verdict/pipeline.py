@@ -54,7 +54,7 @@ def find_missing(
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
     base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths)
+    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths, reference.gyro)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
     noise = compared(drives, at, reference, config.thresholds.alpha)
@@ -66,7 +66,7 @@ def find_missing(
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width)
+        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     searched, nulls = time.perf_counter(), None
