@@ -135,6 +135,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "detectable": detectable(result, days),
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
+        "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
@@ -374,6 +375,8 @@ def summary(report: dict[str, Any]) -> str:
                 if "trajectory" in metrics:
                     lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} m where only what was "
                                  "named may move")
+    if report["floor"] is not None and report["floor"]["sentence"]:
+        lines.append(f"  changed: {report['floor']['sentence']}")
     moved = shifts(report["base"])
     if moved:
         lines.append(f"  base parameters further than from day to day: {'; '.join(moved)}")

@@ -19,6 +19,7 @@ from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from sysid.verdict.alone import judged, stands_alone
+from sysid.verdict.floor import floor_change
 from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
@@ -84,7 +85,8 @@ def find_missing(
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise)
+    floor = floor_change(reference, outcome.base, outcome.excess[0], config.thresholds.alpha)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result

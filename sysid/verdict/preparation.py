@@ -15,7 +15,7 @@ from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call
 from sysid.missing.fit_statistics import FittedVehicle
-from sysid.missing.reference import make_reference, of_vehicle
+from sysid.missing.reference import BLOCK, make_reference, of_vehicle
 from sysid.missing.signatures import PARTS
 from sysid.missing.wander import estimate
 from sysid.replay.models import gyro_effects, with_effects
@@ -78,7 +78,8 @@ def days_of(references: Sequence[Log]) -> tuple[Log, ...]:
         if repeated(trials) or len(trials) < BLOCKS * LEAST_WINDOWS:
             days.append(log)
             continue
-        days += [replace(log, name=f"{log.name}, block {number}", trials=tuple(trials[i] for i in part))
+        days += [replace(log, name=f"{log.name}, block {number}", fields={**log.fields, BLOCK: number},
+                         trials=tuple(trials[i] for i in part))
                  for number, part in enumerate(np.array_split(np.arange(len(trials)), BLOCKS), start=1)]
     return tuple(days)
 
