@@ -5,7 +5,8 @@
 `ladder` (drive_norlab, skid-steered robot): the base model with a turn efficiency is fitted to steps of 6 s on asphalt,
 gravel and sand; then the loop names an effect, the vehicle with it is fitted, and the loop goes on from there until it
 names none. Each rung is scored on steps that were never fitted, with all parameters refitted, and as `alone` with those
-of the named effect alone: the rest is gained by base parameters that moved beside it. `peers` (`measured_peers`) says
+of the named effect alone: the rest is gained by base parameters that moved beside it. `laws` (`measured_laws`): what
+each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
 asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one, and what is held out
 of them is predicted by the reference vehicle with that change alone. `halves` of the asphalt run against one another
@@ -31,6 +32,7 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
+from benchmarks.measured_laws import ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.log import Log, Prediction, Trial
@@ -74,7 +76,8 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/measured."""
-    parts: tuple[Literal["ladder", "peers", "change", "mrclam"], ...] = ("ladder", "peers", "change", "mrclam")
+    parts: tuple[Literal["ladder", "laws", "peers", "change", "mrclam"], ...] = (
+        "ladder", "laws", "peers", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
     windows: Annotated[int, COUNT] = 96
@@ -254,6 +257,27 @@ def ladder(settings: Benchmark) -> None:
     record("measured", CLAIM, figures, replacing="ladder_")
 
 
+def laws(settings: Benchmark) -> None:
+    """What each law adds to the fitted base model, named or not."""
+    log = drive_log(settings, tuple(TRAIN))
+    bench = make_bench(log, settings.physics_dt, 7 if settings.quick else 15)
+
+    def found(name: str, compute: Callable[[], dict[str, list[float]]]) -> dict[str, list[float]]:
+        done = kept(settings, f"law_{name}")
+        return (keep(settings, f"law_{name}", {"errors": compute()}) if done is None else done)["errors"]
+
+    rows = ablate(bench, errors, found)
+    figures: dict[str, Any] = {}
+    trials = list(rows["base"])
+    for name, one in rows.items():
+        stem = f"law_{name.replace(' ', '_')}"
+        figures |= mean_errors(stem, one)
+        if name != "base":
+            figures |= gained(f"{stem}_gain", trials, rows["base"], one, 0)
+    show(figures)
+    record("measured", CLAIM, figures, replacing="law_")
+
+
 def peers(settings: Benchmark) -> None:
     """What models of the commands alone predict, fitted to all training steps."""
     log = drive_log(replace(settings, windows=MANY), tuple(TRAIN))
@@ -403,10 +427,9 @@ def report(loops: list[dict[str, Any]]) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"ladder": (ladder, "drive_norlab"), "peers": (peers, "drive_norlab"), "change": (change, "drive_norlab"),
-             "mrclam": (mrclam, "mrclam")}
+    parts = {"ladder": ladder, "laws": laws, "peers": peers, "change": change, "mrclam": mrclam}
     for name in settings.parts:
-        part, folder = parts[name]
+        part, folder = parts[name], "mrclam" if name == "mrclam" else "drive_norlab"
         if not (settings.shared / "data" / "measured" / folder).is_dir():
             print(f"{name}: {settings.shared / 'data' / 'measured' / folder} is not there, left out")
             continue

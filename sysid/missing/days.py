@@ -65,6 +65,8 @@ class Reference:
     """(C,) noise of the drives in question over that of the reference days."""
     simulated: bool = False
     """Whether `leftovers` are drawn from what a vehicle file says of its fit: there are no reference days."""
+    blocks: bool = False
+    """Whether the days are blocks of one run."""
 
     @property
     def channels(self) -> int:

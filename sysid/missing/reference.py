@@ -92,14 +92,15 @@ def make_reference(
         factors = fit_roughness(left, drives.features.mask, roughness(at, drives.features.width, spec.track))
         drives = drives.weighted(at, factors, spec.track)
         whitener = fit_whitener(left, drives.mask)
-    spread, remark = _spread(space, u, days, known, all(BLOCK in log.fields for log in logs))
+    blocks = all(BLOCK in log.fields for log in logs)
+    spread, remark = _spread(space, u, days, known, blocks)
     leftovers = tuple(Leftover(trial, int(day[i]), left[i], drives.mask[i]) for i, trial in enumerate(trials))
     if known:
         whitener = fit_whitener(np.stack([one.series - expected_without(leftovers, one) for one in leftovers]),
                                 drives.mask)
     params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
     return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
-                     known, remark)
+                     known, remark, blocks=blocks)
 
 
 def of_vehicle(

@@ -5,6 +5,9 @@ changes is in there: how well a difference of the wheels turns the vehicle, how 
 parameters are estimated from the drives alone, and each is compared with its spread over the reference days and with
 its error. One that differs by more than chance (Bonferroni over all of them) makes a change of floor; the others are
 its members where they differ by more than twice their spread.
+
+Where the days are blocks of one run, drives as long as several blocks are compared as a mean of so many: blocks differ
+by what their commands are and by noise, which both average out over a run.
 """
 
 from __future__ import annotations
@@ -78,13 +81,16 @@ class FloorChange:
         return f"another floor (p {self.p:.2g}): {', '.join(parts)}"
 
 
-def floor_change(reference: Reference, base: Refit, excess: float, alpha: float) -> FloorChange | None:
+def floor_change(
+    reference: Reference, base: Refit, excess: float, alpha: float, trials: int | None = None
+) -> FloorChange | None:
     """Change of the floor from the reference days to the drives of a base fit; None where nothing could show it.
 
     Args:
         base: the base model fitted to the drives within its spread.
         excess: squared white residual of that fit over its number, less 1.
         alpha: p-value below which the floor is another one.
+        trials: number of the drives; they count as one day by default.
     """
     space = reference.space
     index = [i for i, name in enumerate(space.names) if name in FLOOR]
@@ -95,7 +101,7 @@ def floor_change(reference: Reference, base: Refit, excess: float, alpha: float)
     information = np.einsum("bni,bnj->ij", slopes, slopes) + np.eye(size) / WEAK_PRIOR**2
     error = np.linalg.inv(information) * (1 + max(excess, 0.0))
     moved = base.u - reference.u + np.linalg.solve(information, np.einsum("bni,bn->i", slopes, base.residual))
-    total = np.sqrt(np.diag(reference.spread + error))
+    total = np.sqrt(np.diag(_of_means(reference, trials) * reference.spread + error))
     away = moved / total
     freedom = len(reference.days) - 1 + ASSUMED_DAYS
     each = 2 * stats.t.sf(np.abs(away[index]), freedom)
@@ -107,6 +113,15 @@ def floor_change(reference: Reference, base: Refit, excess: float, alpha: float)
     members = tuple(Member(space.names[i], float(before[i]), float(after[i]), float(np.sqrt(error[i, i]) * slope[i]),
                            float(away[i])) for i in far)
     return FloorChange(members, p, len(index), p < alpha)
+
+
+def _of_means(reference: Reference, trials: int | None) -> float:
+    """Share of a new day's covariance that the difference of the drives from the reference has."""
+    days = len(reference.days)
+    if not reference.blocks or trials is None:
+        return 1.0
+    worth = max(trials / (len(reference.leftovers) / days), 1.0)  # blocks that the drives are as long as
+    return (1 / worth + 1 / days) / (1 + 1 / days)
 
 
 def on_floor(params: Any, change: FloorChange) -> Any:

@@ -68,6 +68,16 @@ def test_what_no_floor_changes_is_no_other_floor():
     assert not found.named and found.said() == ""
 
 
+def test_a_run_is_compared_with_blocks_of_another_as_a_mean_of_blocks():
+    random = np.random.default_rng(5)
+    known = replace(reference(random), blocks=True)
+    known = replace(known, leftovers=known.leftovers * (8 * DAYS))  # eight windows in each block
+    fit = drives_on(known, random, np.zeros(4))
+    away = [floor_change(known, replace(fit, u=fit.u + [0, 0.05, 0, 0]), 0.0, ALPHA, trials).members[0].away
+            for trials in (8, 64)]
+    assert 1.5 < away[1] / away[0] < 2.3  # (1 + 1/6) over (1/8 + 1/6), and the error of the fit
+
+
 def test_without_reference_days_or_a_share_that_turns_nothing_shows_a_floor():
     random = np.random.default_rng(3)
     known = reference(random)
