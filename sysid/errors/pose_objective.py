@@ -271,7 +271,8 @@ class Objective:
                        xp.broadcast_to(odometry_weight, simulated.odometry.shape)], [
             (simulated.pose - measured.pose) * pose_weight, (simulated.odometry - measured.odometry) * odometry_weight]
         if rate_weight is not None:
-            rates = xp.diff(simulated.gyro - measured.gyro, axis=2) * rate_weight
+            turn: Any = simulated.gyro
+            rates = xp.diff(turn - measured.gyro, axis=2) * rate_weight
             shown, left = [*shown, xp.broadcast_to(rate_weight, rates.shape)], [*left, rates]
         weights, residual = flat(*shown) > 0, flat(*left)
         residual = xp.where(bad, HUGE * weights, residual)
@@ -279,7 +280,7 @@ class Objective:
         if derivative is not None:
             slopes = [derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None]]
             if rate_weight is not None:
-                slopes.append(np.diff(derivative.gyro, axis=2) * rate_weight[..., None])
+                slopes.append(np.diff(np.asarray(derivative.gyro), axis=2) * rate_weight[..., None])
             jacobian = flat(*slopes)
             jacobian = np.where(bad[..., None] | ~np.isfinite(jacobian), 0.0, jacobian)
         return self._solve_start(simulated, residual, jacobian)

@@ -61,7 +61,7 @@ class CourseReplay:
                         pose_index=jnp.asarray(every), pose_weight=jnp.asarray(last, float_type),
                         odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
         if batch.gyro_index is not None:
-            whole = whole.replace(gyro_index=jnp.asarray(every), gyro_weight=jnp.asarray(last, float_type))
+            whole = replace(whole, gyro_index=jnp.asarray(every), gyro_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
         if batch.gyro_index is not None:

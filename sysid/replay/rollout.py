@@ -110,7 +110,7 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
         return batch, Measured(pose, pose_mask, odometry, odometry_mask)
     gyro_t, gyro, gyro_mask = padded([trial.gyro for trial in trials], 1)
     gyro_index, gyro_weight = _grid(gyro_t, record, records)
-    batch = batch.replace(gyro_index=jnp.asarray(gyro_index), gyro_weight=jnp.asarray(gyro_weight, floats_type))
+    batch = replace(batch, gyro_index=jnp.asarray(gyro_index), gyro_weight=jnp.asarray(gyro_weight, floats_type))
     return batch, Measured(pose, pose_mask, odometry, odometry_mask, gyro, gyro_mask, gyro_t)
 
 
@@ -303,15 +303,17 @@ class PathReplay:
 
 def simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
     """Replay one trial of a batch with one parameter set."""
-    has_gyro = one.gyro_index is not None
-    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few, has_gyro)
+    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few, one.gyro_index is not None)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]
         return before + weight[:, None] * (after - before)
 
+    turned = None
+    if one.gyro_index is not None and one.gyro_weight is not None:
+        turned = at(one.gyro_index, one.gyro_weight, TURN)
     return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
-                     path[-1, 8], at(one.gyro_index, one.gyro_weight, TURN) if has_gyro else None)
+                     path[-1, 8], turned)
 
 
 def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
