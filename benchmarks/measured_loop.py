@@ -39,10 +39,11 @@ from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
+from sysid.logs.pose_lag import pose_lag
 from sysid.missing.catalogue import PARAMETER
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
-from sysid.verdict.late_pose import NAME
+from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
@@ -63,7 +64,7 @@ MANY = 10**6  # steps: all
 TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
 SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
 DEAD = {"command_dead_zone"}
-FLOOR_MODEL = ("turn_efficiency", "turn_lag")
+FLOOR_MODEL = ("turn_efficiency", "turn_lag", "pose_delay")
 """What the base model of `change` has besides the physical preset."""
 LAWS = {"motor_line", "turn_lag", "turn_efficiency_speed", "turning_slip", "side_slip"}
 LONGEST, LARGEST = 0.3, 0.1
@@ -306,13 +307,22 @@ def floors(settings: Benchmark) -> Prepared:
     """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
     config = change_config(settings)
     asphalt = drive_log(settings, ("asphalt",))
-    reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True))
+    reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
+                              start=floor_start(asphalt))
     return prepare(reference, asphalt.spec, config)
 
 
 def change_config(settings: Benchmark) -> LoopConfig:
-    """The base model with what turns a skid-steered robot, and how late."""
-    return LoopConfig(physics_dt=settings.physics_dt, quick=settings.quick, with_effects=FLOOR_MODEL)
+    """The delay of the outside pose is held: the gyro determines it."""
+    return LoopConfig(physics_dt=settings.physics_dt, quick=settings.quick, held=(PARAMETER,))
+
+
+def floor_start(log: Log) -> Any:
+    """The base model with what turns a skid-steered robot, how late, and how late its outside pose is."""
+    start = with_effects(preset_params(log.spec, "physical"), FLOOR_MODEL)
+    trials = log.training
+    lag = pose_lag(trials, [part.tolist() for part in np.array_split(np.arange(len(trials)), 8)], yaw_rates(log))
+    return set_values(start, [PARAMETER], jnp.array([0.0 if lag is None else lag.delay]))
 
 
 def one_change(settings: Benchmark, name: str, log: Log, ready: Callable[[], Prepared]) -> dict[str, Any]:
@@ -373,7 +383,7 @@ def halves(settings: Benchmark, number: int) -> bool:
         first = log.select(lambda trial: (tenth[trial.name] - number) % 10 < 5)
         second = log.select(lambda trial: (tenth[trial.name] - number) % 10 >= 5)
         config = change_config(settings)
-        done = keep(settings, name, verdict_of(find_missing(second, (first,), config)))
+        done = keep(settings, name, verdict_of(find_missing(second, (first,), config, start=floor_start(first))))
     report([done])
     return done["verdict"] == "named" or bool(done["floor"] and done["floor"]["name"])
 
