@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.gyro import told_sign
-from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
+from sysid.logs.log import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
@@ -212,7 +212,7 @@ def _drive_windows(path: Path, run: str, chained: bool
                 wheel_omega[rows]).sum() < MOVING:
             continue
         trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
-                            breaks=tuple(breaks)))
+                            breaks=tuple(breaks), gyro=GyroStream.of_rates(t, gyro[rows].ravel())))
         rates[name] = t, gyro[rows].ravel()
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
     if sign != 1.0:

@@ -300,6 +300,7 @@ COLUMNS = {field.name: field for field in (
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),
     Field("v", "m/s", -SPEED, SPEED, remedy="Convert it to m/s: is it in km/h or mm/s?"),
     Field("omega", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
+    Field("gyro", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
 )}  # fmt: skip
 """Columns of the CSV files of a driving log."""
 
