@@ -484,11 +484,12 @@ class _Log:
         kept: list[str] = []
         if not parallel.is_first_process():
             return
-        for text in path.read_text().splitlines() if path.exists() else []:
+        for text in path.read_text(errors="replace").splitlines() if path.exists() else []:
             try:
                 line = json.loads(text)
-            except ValueError:
-                continue  # cut off by the kill
+                pretrain.position(config, line)
+            except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+                continue  # cut off by the kill, or damaged
             if pretrain.position(config, line) <= place and text not in kept[-1:]:
                 kept.append(text)
                 self.last = line

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
+from whill_mjx.io.command_line import listen, refusing, starts
 
-from whill_mjx.io.command_line import listen, refusing
-
-if __name__ == "__main__":
+if starts(__name__):
     listen()
+
+import numpy as np
 
 from sysid import command_line
 from sysid.logs.coverage import Blind

@@ -28,10 +28,11 @@ from whill_mjx.io.command_line import (
     listen,
     refusing,
     run,
+    starts,
 )
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
     say_loading()
 

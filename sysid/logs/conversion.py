@@ -147,7 +147,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    notes += write_dataset(config.out, spec, drives, config.held_out, more)
+    notes += write_dataset(config.out, spec, drives, config.held_out, more, config.source)
     log = load_log(config.out)
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
@@ -382,12 +382,13 @@ def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
 
 def write_dataset(
     folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
-    more: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] | None = None, source: Path | None = None,
 ) -> list[str]:
     """Write the trials that the loader accepts into a dataset folder; an existing dataset keeps its fields and trials.
 
     Args:
         more: further fields of a new dataset.toml.
+        source: what they come from, for errors.
 
     Returns:
         Notes on the trials that were left out.
@@ -419,7 +420,8 @@ def write_dataset(
         missing = sorted(set(held_out) & set(refused))
         if not accepted or missing:
             reason = notes[0] if not missing else f"{missing[0]} is held out, but it is {notes[0]}"
-            raise ValueError(f"{reason.removeprefix('left out: ')} Nothing was written.")
+            came = f"{source}: made into a trial, " if source else ""
+            raise ValueError(f"{came}{reason.removeprefix('left out: ')} Nothing was written.")
         if not known:
             write_fields(partial, spec, held_out, more)
             spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))

@@ -28,7 +28,7 @@ from sysid.logs.log import Command, GyroStream, Log, OdometryStream, PoseStream,
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
-from whill_mjx.io.fields import shown
+from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
@@ -368,7 +368,7 @@ def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
         times.append(row[index["ros_time"]])
         states.append(row[index["calib_state"]] == "calib")
     if len(times) < 2:
-        raise ValueError(f"{path}: {len(times)} rows of data; at least 2 are needed. {CONVERT}.")
+        raise ValueError(f"{path}: {counted(len(times), 'row')} of data; at least 2 are needed. {CONVERT}.")
     return columns, times, states
 
 

@@ -139,8 +139,9 @@ def read_bag(
                          "repairs one.") from None
     streams = {}
     for stream, topic in chosen.items():
+        if len(rows[stream]) < 2:
+            raise _too_few(path, topic, len(rows[stream]), stream)
         table = np.array([values for _, _, values in rows[stream]], float)
-        table = table.reshape(len(rows[stream]), -1)
         unset = np.isinf(table).any(axis=1)
         finite = np.isfinite(table).all(axis=1) | (short_type(known[topic]) == "JointState") & ~unset
         if unset.all() and len(unset):
@@ -158,8 +159,7 @@ def read_bag(
             notes.append(f"{topic}: {len(times)} usable messages; it is left out")
             continue
         if len(times) < 2:
-            raise ValueError(f"{path}: topic {topic} has {len(times)} usable messages; at least 2 are needed. Name "
-                             f"another topic with {OPTIONS[stream]}, or '' to go without.")
+            raise _too_few(path, topic, len(times), stream)
         values = table[finite]
         if values.shape[1] != len(COLUMNS[stream]):
             kind = short_type(known[topic])
@@ -169,6 +169,11 @@ def read_bag(
                              "Ask the driver for 20 ms (publish_interval_ms)")
         streams[stream] = BagStream(topic, known[topic], times, stamps, values)
     return Bag(path, streams, notes)
+
+
+def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
+    return ValueError(f"{path}: topic {topic} has {count} usable messages; at least 2 are needed. Name another topic "
+                      f"with {OPTIONS[stream]}, or '' to go without.")
 
 
 def _of_wheels(

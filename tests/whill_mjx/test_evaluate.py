@@ -216,7 +216,9 @@ def test_sweeps_are_read_and_bad_ones_refused():
     for text, message in (
         ("wind=1", "unknown axis"), ("wing.span=1", "no effect"), ("body.colour=1", "no parameter"),
         ("light=", "no axis"),
-        ("light=-1", "not negative"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"), ("light=a", "could not"),
+        ("light=-1", "light is -1.0; it must lie within 0 to 100"), ("light=0:1:1001", "more than 1000"),
+        ("latency_s=99", "within 0 to 10"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
+        ("light=a", "could not"),
         ("light=1 light=2", "twice"), ("light=1 start_y=1 start_x=1", "one or two"), ("", "0 axes"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):

@@ -14,6 +14,7 @@ from dreamer import checkpoint
 from dreamer.progress import Progress
 from dreamer.train import TrainingOptions, in_thread
 from whill_mjx.io.folders import write_whole
+from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
 
 SHOWN = ("success", "return")
@@ -150,13 +151,7 @@ def _first_state(env: Any, config: PpoConfig, out: Path, iterations: int, seed: 
 
 def _keep_lines(path: Path, env_steps: int) -> None:
     """Drop the lines of a log that a resumed run is about to write again, and one that a kill has cut off."""
-    kept = []
-    for text in path.read_text().splitlines() if path.exists() else []:
-        try:
-            if json.loads(text)["env_steps"] <= env_steps:
-                kept.append(text)
-        except (ValueError, KeyError, TypeError):
-            continue
+    kept = [text for text, line in read_lines(path) if line["env_steps"] <= env_steps]
     write_whole(path, "".join(text + "\n" for text in kept))
 
 

@@ -222,7 +222,7 @@ def with_settings(learner: Any, settings: Sequence[str]) -> Any:
             raise ValueError(f"{text!r} changes no setting of the learner; these are: {', '.join(sorted(known))}.")
         try:
             found = json.loads(value)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{text!r}: give NAME=VALUE, the value as in JSON: 0.1, true or [1, 2].") from error
         changes[name] = tuple(found) if isinstance(found, list) else found
         if not _alike(changes[name], getattr(learner, name)):
