@@ -104,7 +104,7 @@ def drive_pictures(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
     entries = [("measured", MEASURED), *((text, style[name][0]) for name, text in names.items())]
     return legend(entries) + charts(items, f"Drive {shown['trial']} ({kind}), {CHANNEL_WORDS[shown['channel']]}. All "
                                            "start at the measured start and get the recorded commands, nothing else. "
-                                           "Half of the drives of its kind have a larger error at first.")
+                                           "Chosen because its error is the median one.")
 
 
 def drive_table(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
