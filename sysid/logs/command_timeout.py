@@ -98,7 +98,7 @@ def timeout_stops(trial: Trial) -> list[Stop]:
     t, found = rates[0], []
     for k in np.flatnonzero(gaps > max(QUIET * float(np.median(gaps)), SETTLED)):
         begin, end = float(command.t[k]), float(command.t[k + 1])
-        channel, asked = _asked(trial, k, rates)
+        channel, asked = _asked(trial, int(k), rates)
         before, inside = (t >= begin) & (t <= begin + SETTLED), (t > begin) & (t < end)
         if abs(asked) < 1.0 or not before.any() or inside.sum() < 5:
             continue
