@@ -12,12 +12,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from sysid.logs import lerobot
 from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
-from sysid.logs.text_files import integrate_speeds, read_drives, text_files
+from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
 from whill_mjx.io.command_line import Range
 from whill_mjx.io.fields import COLUMNS
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -35,9 +36,13 @@ class ConvertConfig:
     """Options of the command."""
 
     source: Path
-    """ROS bag, CSV or TUM file, folder of one of them, or a measured set."""
+    """ROS bag, CSV or TUM file, folder of one of them, LeRobotDataset, or a measured set."""
     out: Path = Path("runs/dataset")
     """Dataset folder; made where it does not exist, else the trials are added."""
+    to: Literal["dataset", "lerobot"] = "dataset"
+    """What is written: a driving-log dataset, or a LeRobotDataset v3 of a driving-log dataset."""
+    fps: Annotated[int | None, Range(1, 1000)] = None
+    """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
     wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
@@ -112,10 +117,20 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
-    if not bags and not is_known(config.source) and text_files(config.source):
+    held_out = config.held_out
+    if lerobot.is_lerobot(config.source):
+        episodes = lerobot.read(config.source)
+        spec = _spec(config, episodes.spec)
+        found = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
+                            (spec.wheel_radius, spec.track), config.input == "wheels")
+        drives, said, fields = _text_drives(found, config)
+        notes, more = [*episodes.notes, *said], more | fields
+        held_out = held_out or (() if (config.out / "dataset.toml").exists() else episodes.held_out)
+    elif not bags and not is_known(config.source) and text_files(config.source):
         spec = _spec(config)
-        drives, notes, found = _text_drives(config, spec)
-        more |= found
+        drives, notes, fields = _text_drives(read_drives(
+            config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels"), config)
+        more |= fields
     elif bags:
         spec = _spec(config)
         wheels = config.input == "wheels"
@@ -143,11 +158,11 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
-    unknown = sorted(set(config.held_out) - {drive.name for drive in drives})
+    unknown = sorted(set(held_out) - {drive.name for drive in drives})
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    notes += write_dataset(config.out, spec, drives, config.held_out, more, config.source)
+    notes += write_dataset(config.out, spec, drives, held_out, more, config.source)
     log = load_log(config.out)
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
@@ -173,11 +188,12 @@ def _bags_drives(
     return drives, notes, refused
 
 
-def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive], list[str], dict[str, Any]]:
-    """Trials of CSV and TUM files, notes, and what dataset.toml says of them."""
+def _text_drives(
+    found: Sequence[TextDrive], config: ConvertConfig
+) -> tuple[list[Drive], list[str], dict[str, Any]]:
+    """Trials of drives out of columns, notes, and what dataset.toml says of them."""
     drives: list[Drive] = []
     notes: list[str] = []
-    found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
         raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
@@ -451,9 +467,12 @@ def _write_accepted(folder: Path, drives: Sequence[Drive]) -> tuple[list[str], d
     return accepted, refused
 
 
-def _spec(config: ConvertConfig) -> VehicleSpec:
+def _spec(config: ConvertConfig, noted: VehicleSpec | None = None) -> VehicleSpec:
+    """Nominal geometry: as the options say, else as the source notes it."""
     changes = {key: value for key in ("wheel_radius", "track", "mass")
                if (value := getattr(config, key)) is not None}
+    if noted is not None and config.vehicle == ConvertConfig.vehicle:
+        return replace(noted, **changes)
     if config.vehicle in SPECS:
         return replace(find_spec(config.vehicle), **changes)
     missing = [key for key in ("wheel_radius", "track") if key not in changes]
