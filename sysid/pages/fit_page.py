@@ -60,7 +60,7 @@ def summary(report: dict[str, Any]) -> str:
     dataset = report["dataset"]
     notes = dataset.get("notes") or []
     limits = [note for note in notes if note.startswith(("not fitted", "the log has no commands"))]
-    parts = [paragraph(headline(report), "lead"), *(paragraph(f"{note[0].upper()}{note[1:]}.") for note in limits),
+    parts = [*(paragraph(f"{note[0].upper()}{note[1:]}.") for note in limits),
              paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} trials "
                        f"fitted, {len(dataset['held_out'])} held out. Model: {report['model']['preset']} with "
                        f"{', '.join(report['model']['effects'])}.")]

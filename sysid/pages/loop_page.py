@@ -35,7 +35,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
         sections.append(Section("Noise of the sensors", noise(report)))
     sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
     page = html_page(f"{report['dataset']['name']}: {report['verdict']}", sections,
-                     f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}")
+                     f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}",
+                     kind="Missing effect", lead=f"{report['verdict'].capitalize()}: {report['reason']}.")
     write_text(out / "report.html", page)
     return out / "report.html"
 
@@ -43,8 +44,7 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
 def verdict(report: dict[str, Any]) -> str:
     """The verdict in words, and the effects."""
     missing = report["missing"]
-    parts = [paragraph(f"{report['verdict'].capitalize()}: {report['reason']}."),
-             paragraph(f"Asked: {report['question']}. {report['remark'][:1].upper()}{report['remark'][1:]}."),
+    parts = [paragraph(f"Asked: {report['question']}. {report['remark'][:1].upper()}{report['remark'][1:]}."),
              paragraph(f"The squared residual exceeds the noise by {missing['excess_before']:.0%} before and by "
                        f"{missing['excess_after']:.0%} after. p-value that nothing is missing: "
                        f"{missing['p_value']:.2g}.")]

@@ -100,7 +100,7 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
         sections: more sections, shown first.
     """
-    from sysid.pages.fit_page import fit_sections
+    from sysid.pages.fit_page import fit_sections, headline
     from sysid.pages.series import FILE, load, replay
     from whill_mjx.io.html import html_page
 
@@ -110,7 +110,8 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series = load(run) if (run / FILE).is_file() else replay(run, report)
     try:
         page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
-                         [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
+                         [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}",
+                         kind="Fit", lead=headline(report))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise ValueError(f"{run / 'report.json'}: is not whole, or not of this {FILE} ({type(error).__name__}: "
                          f"{str(error)[:160]}). {AGAIN}") from error

@@ -171,8 +171,9 @@ def test_held_out_trials_and_other_manoeuvres_are_drawn_first():
 
 def test_text_is_escaped_and_titles_that_repeat_get_their_own_anchor():
     page = html_page("a < b", [Section("Same", table(["x"], [["<i>"], [Cell(0.5, "bad")], [None]])),
-                               Section("Same", "")])
+                               Section("Same", "")], kind="<b>", lead="x & <script>")
     check(page)
+    assert "<script>" not in page and "x &amp; &lt;script&gt;" in page and "&lt;b&gt;" in page
     assert "&lt;i&gt;" in page and 'class="n bad"' in page and page.count('id="same"') == 1
 
 
