@@ -28,6 +28,7 @@ from sysid.logs.log import Log
 from sysid.logs.next_drives import NextDrive, next_drives
 from whill_mjx.io.command_line import POSITIVE, Range
 from whill_mjx.io.folders import claim_folder
+from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
 SCRIPTS = ("next_1.csv", "next_2.csv", "next_3.csv")
@@ -89,7 +90,7 @@ def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDr
 
     paths = [folder / name for name in (*OUTPUTS[:4], *SCRIPTS[: len(drives)])]
     write_text(paths[0], text(found) + "\n")
-    write_report(paths[1], found)
+    write_report(paths[1], {**stamp("sysid-inspection"), **found})
     write_plot(paths[2], log, found)
     write_page(paths[3], found, paths[2])
     for path, drive in zip(paths[4:], drives, strict=True):

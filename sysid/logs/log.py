@@ -17,6 +17,7 @@ import numpy as np
 
 from whill_mjx.io import fields as tables
 from whill_mjx.io.folders import RUN_FILE
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
@@ -360,6 +361,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     """Checked fields of a dataset.toml."""
     content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
                               "see docs/log_format.md.", "Strings need quotes, decimals a point.")
+    content = upgraded("driving-log-dataset", content)
     schema = next(field for field in tables.DATASET if field.name == "schema")
     tables.check(str(path), schema, content.get("schema"))  # before the fields, which follow from it
     return tables.check_table(str(path), tables.DATASET, content)

@@ -14,6 +14,7 @@ from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.pages.series import TrialSeries
 from whill_mjx.io.fields import Field, check_table, shown
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.html import Section
 from whill_mjx.io.reading import read_json
 from whill_mjx.logs.dataset import write_text
@@ -85,6 +86,7 @@ def read_report(run: Path) -> dict[str, Any]:
     """Content of RUN/report.json; FileNotFoundError, ValueError where it is missing or none of a fit."""
     path = Path(run) / "report.json"
     report = read_json(path, "missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.", AGAIN)
+    report = upgraded(KIND, report)
     if report.get("kind") != KIND or report.get("schema") != SCHEMA:
         raise ValueError(f"{path}: kind {shown(report.get('kind'))}, schema {shown(report.get('schema'))}; this "
                          f"program reads {KIND!r}, schema {SCHEMA}. {AGAIN}")

@@ -35,7 +35,8 @@ ENDINGS = {
 CAPTIONS = {
     "reward_curve": "reward and success during the training", "drives": "drives of the final evaluation, from above",
     "failures": "drives that failed, from above", "paths": "drives from above",
-    "camera": "what the camera saw, and the view from above", "prediction": "what the camera saw (top), what the world model predicts, and the difference",
+    "camera": "what the camera saw, and the view from above",
+    "prediction": "what the camera saw (top), what the world model predicts, and the difference",
     "trajectories": "measured and fitted paths", "errors": "errors of each trial", "yaw": "measured and fitted yaw",
     "inspect": "sampling, excitation and replicates",
 }  # fmt: skip
