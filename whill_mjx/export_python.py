@@ -216,6 +216,9 @@ def _expression(equation: Any, operands: list[str]) -> str:
             return operands[0]
         if after == "f":
             return f"xp.where({operands[0]}, 1.0, 0.0)" if before == "b" else f"{operands[0]} * 1.0"
+        if before == "b":
+            kind = np.dtype(params["new_dtype"]).name
+            return f"xp.where({operands[0]}, numpy.{kind}(1), numpy.{kind}(0))"
     if name not in OPERATIONS:
         raise ValueError(f"the vehicle's step needs the operation {name!r}, which has no counterpart in numpy. Leave "
                          "out the effect that uses it.")
