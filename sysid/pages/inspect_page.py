@@ -68,8 +68,8 @@ def next_drives(drives: list[dict[str, Any]]) -> str:
 
 def streams(found: dict[str, Any]) -> str:
     """How regularly each stream was sampled, and how the clocks differ."""
-    rows = [[STREAMS.get(name, name), one["samples"], one["rate"], 1e3 * one["jitter"], 1e3 * one["longest"],
-             Cell(one["gaps"], "warn" if one["gaps"] else ""), f"{one['missing']:.1%}",
+    rows = [[STREAMS.get(name, name), one["samples"], one["rate"], round(1e3 * one["jitter"], 2),
+             round(1e3 * one["longest"], 1), Cell(one["gaps"], "warn" if one["gaps"] else ""), f"{one['missing']:.1%}",
              "–" if not np.isfinite(one["held"]) else f"{one['held']:.1%}"] for name, one in found["streams"].items()]
     late = [[name.replace("ground_truth", "outside pose"), channel, 1e3 * one["delay"],
              1e3 * one["error"] if one["trials"] > 1 else None, one["gain"], one["trials"]]

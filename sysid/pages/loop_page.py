@@ -36,9 +36,15 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections += [Section("Base parameters", base(report)), Section("Fixed beforehand", fixed(report))]
     page = html_page(f"{report['dataset']['name']}: {report['verdict']}", sections,
                      f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}",
-                     kind="Missing effect", lead=f"{report['verdict'].capitalize()}: {report['reason']}.")
+                     kind="Missing effect", lead=meaning(report))
     write_text(out / "report.html", page)
     return out / "report.html"
+
+
+def meaning(report: dict[str, Any]) -> str:
+    """One sentence: the verdict, the effects that were named, and why."""
+    names = " and ".join(dict.fromkeys(one["name"] for one in report["effects"]))
+    return f"{report['verdict'].capitalize()}{f' {names}' if names else ''}: {report['reason']}."
 
 
 def verdict(report: dict[str, Any]) -> str:

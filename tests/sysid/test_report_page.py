@@ -92,6 +92,8 @@ def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run
                  "Fisher information", "0.02000", "2 of 3", "figure_eight_1 (held out)",
                  "sysid sources SHA-256", "toy & <co>"):
         assert word in text, word
+    header = text.partition("</header>")[0]
+    assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and "m before the fit" in header
     report = read_report(run)
     assert report["dataset"]["sha256"] in text and report["code"]["sysid sources SHA-256"] in text
     assert not list(run.glob("*.tmp"))

@@ -34,7 +34,7 @@ table { border-collapse: collapse; font-size: .86rem; margin: .5rem 0; }
 th, td { padding: .18rem .6rem; border-bottom: 1px solid #e6e6e6; text-align: left; vertical-align: middle; }
 th { font-weight: 600; border-bottom: 1px solid #9a9a9a; white-space: nowrap; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; } th.n { text-align: right; }
-caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; }
+caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; max-width: min(62rem, calc(100vw - 1.7rem)); }
 td.i { white-space: nowrap; }
 td.differs { background: #fff3d1; } td.differs:first-child { border-left: .25rem solid #e0a014; }
 details { margin: .6rem 0; } summary { cursor: pointer; color: #1f5f9f; }
@@ -50,11 +50,12 @@ svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opaci
 @media (max-width: 640px) { body { font-size: 14px; padding: 0 .8rem 1.5rem; } h1 { font-size: 1.25rem; }
   h2 { font-size: 1.1rem; margin-top: 1.6rem; } .charts { display: block; } .charts svg { width: 100%; }
   nav a { padding: .25rem 0; } th, td { padding: .25rem .4rem; } figure { margin: .4rem 0; }
-  ul { padding-left: 1.2rem; } }
+  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } }
 @media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
   nav, video { display: none; }
   h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }
-  table { font-size: 8pt; } a { color: inherit; text-decoration: none; } th, td { white-space: normal !important; } }
+  table { font-size: 8pt; } a { color: inherit; text-decoration: none; } th { white-space: normal; }
+  .legend { break-after: avoid; } }
 """
 
 
