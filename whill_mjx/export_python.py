@@ -266,7 +266,7 @@ def _key(name: str) -> str:
 
 def _head(spec: VehicleSpec, effects: Sequence[str], dt: float, about: dict[str, tuple[float, str]]) -> str:
     table = "\n".join(f"    {name!r}: ({value!r}, {unit!r})," for name, (value, unit) in about.items())
-    return f'''"""The vehicle {spec.name!r}: one physics step of {dt:g} s, with its effects, in numpy alone.
+    return f'''"""One physics step of {dt:g} s of a vehicle (NAME below), with its effects, in numpy alone.
 
     state = start(count=1000)                      # 1000 vehicles at rest at the origin
     for _ in range(200):
@@ -281,6 +281,7 @@ Made by `python -m whill_mjx.export_python` (whill-mjx {__version__}) from the s
 
 import numpy
 
+NAME = {spec.name!r}
 DT = {dt!r}
 """Time of one step [s]."""
 EFFECTS = {tuple(effects)!r}

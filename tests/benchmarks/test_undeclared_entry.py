@@ -36,7 +36,7 @@ def outside(tmp_path):
 
 
 def small(work, *method):
-    return Entry(method, nulls=1, effects=("command_delay",), days=2, replicates=1, manoeuvres=("straight",), work=work)
+    return Entry(method, nulls=1, effects=("command_delay",), days=1, replicates=1, manoeuvres=("straight",), work=work)
 
 
 def test_a_method_from_outside_the_project_is_entered_and_goes_on_where_it_was(tmp_path, outside, capsys):

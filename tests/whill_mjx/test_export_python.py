@@ -60,6 +60,14 @@ def test_the_file_imports_numpy_alone(exported):
     assert names == {"numpy"} and not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
 
 
+def test_the_name_of_a_vehicle_stays_text():
+    spec, params = preset("whill_cr")
+    name = '"""\nraise SystemExit\n"""'
+    space: dict = {}
+    exec(vehicle_source(dataclasses.replace(spec, name=name), params), space)
+    assert space["NAME"] == name
+
+
 def test_many_vehicles_at_once_drive_as_one_by_one(exported):
     start, step, pose = (exported[3][name] for name in ("start", "step", "pose"))
     yaw, v = np.array([0.0, 1.0]), np.array([0.5, -0.3])
@@ -77,7 +85,7 @@ def test_arrays_of_another_module_give_the_same_drive(exported, module):
     xp = pytest.importorskip(module, reason=f"{module} is not installed")
     start, step, odometry = (exported[3][name] for name in ("start", "step", "odometry"))
     other, own = start(count=2, xp=xp), start(count=2)
-    for _ in range(5):
+    for _ in range(2):
         other, own = step(other, 0.6, 0.4, xp=xp), step(own, 0.6, 0.4)
     np.testing.assert_allclose(np.array([np.asarray(one) for one in odometry(other)]), odometry(own), atol=1e-5)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import re
 import shutil
 import socket
@@ -247,3 +248,39 @@ def test_pages_fit_a_telephone_in_a_real_browser(tmp_path):
     assert len(measured) == 2
     for scroll, width, charts in measured:
         assert scroll <= width <= 390 and charts >= 3
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_real_browser_loads_a_live_page_again_when_its_run_changes(tmp_path):
+    folder, loads = training(tmp_path / "run"), queue.Queue()
+
+    class Watched(Site):
+        def page(self):
+            loads.put(None)
+            return super().page()
+
+    server = make_server(Watched([folder], every_s=0.05), 0)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    browser = subprocess.Popen(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
+         f"--user-data-dir={tmp_path / 'profile'}", f"http://127.0.0.1:{server.server_address[1]}/"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+    try:
+        loads.get(timeout=60)
+        for step in range(600):  # until the browser has seen a change; its first question may come after one
+            with (folder / "metrics.jsonl").open("a") as file:
+                file.write(json.dumps({"env_steps": 900 + step}) + "\n")
+            try:
+                loads.get(timeout=0.2)
+                break
+            except queue.Empty:
+                continue
+        else:
+            pytest.fail("the browser did not load the page again")
+    finally:
+        browser.terminate()
+        browser.wait()
+        server.shutdown()
+        thread.join()
+        server.server_close()

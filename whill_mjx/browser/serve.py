@@ -31,15 +31,15 @@ setInterval(async () => {
     seen = now;
   } catch (error) { document.title = "(stopped) " + document.title.replace(/^\\(stopped\\) /, ""); }
 }, EVERY_MS);
-""".replace("EVERY_MS", f"{1000 * EVERY_S:.0f}")
+"""
 
 
 class Site:
     """The runs of some paths as they are now."""
 
-    def __init__(self, paths: Sequence[Path], embed: int = MEDIA_BYTES) -> None:
-        """Remember what to show; nothing is read yet."""
-        self._paths, self._embed = list(paths), embed
+    def __init__(self, paths: Sequence[Path], embed: int = MEDIA_BYTES, every_s: float = EVERY_S) -> None:
+        """Remember what to show, and how often a browser asks whether it has changed; nothing is read yet."""
+        self._paths, self._embed, self._every_s = list(paths), embed, every_s
         self._lock = threading.Lock()
         self._made, self._page = "", ""
         self._runs: list[Run] = []
@@ -62,7 +62,7 @@ class Site:
             now = self.version()
             if now != self._made:
                 self._runs = read_runs(find_runs(self._paths))
-                self._page = runs_page(self._runs, self._address, self._embed, _head())
+                self._page = runs_page(self._runs, self._address, self._embed, _head(self._every_s))
                 self._made = now
             return self._page
 
@@ -126,8 +126,9 @@ def _handler(site: Site) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
-def _head() -> str:
+def _head(every_s: float) -> str:
     """The page's own script, and a policy that allows no other."""
-    known = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
+    script = SCRIPT.replace("EVERY_MS", f"{1000 * every_s:.0f}")
+    known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = html.escape(f"{POLICY}; script-src 'sha256-{known}'; connect-src 'self'")
-    return f'<meta http-equiv="Content-Security-Policy" content="{policy}"><script>{SCRIPT}</script>'
+    return f'<meta http-equiv="Content-Security-Policy" content="{policy}"><script>{script}</script>'
