@@ -62,7 +62,7 @@ def test_the_file_imports_numpy_alone(exported):
 
 def test_the_name_of_a_vehicle_stays_text():
     spec, params = preset("whill_cr")
-    name = '"""\nraise SystemExit\n"""'
+    name = '"""; raise SystemExit #'
     space: dict = {}
     exec(vehicle_source(dataclasses.replace(spec, name=name), params), space)
     assert space["NAME"] == name
