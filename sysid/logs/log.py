@@ -18,6 +18,7 @@ import numpy as np
 from sysid.logs.gyro import with_sign
 from whill_mjx.io import fields as tables
 from whill_mjx.io.folders import RUN_FILE
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
@@ -50,7 +51,7 @@ class Command:
 
     @property
     def table(self) -> np.ndarray:
-        """(T, 3) of t, v and omega."""
+        """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
         return np.column_stack([self.t, self.v, self.omega])
 
 
@@ -60,14 +61,14 @@ class OdometryStream:
 
     t: np.ndarray  # (T,) s
     x: np.ndarray | None  # (T,) m, from the trial's start
-    y: np.ndarray | None
+    y: np.ndarray | None  # (T,) m
     yaw: np.ndarray | None  # (T,) rad, unwrapped
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
     @property
     def values(self) -> np.ndarray:
-        """(T, 5) of x, y, yaw, v and omega; nan where not logged."""
+        """(T, 5) of x, y [m], yaw [rad], v [m/s] and omega [rad/s]; nan where not logged."""
         absent = np.full(len(self.t), np.nan)
         pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
         return np.stack([*pose, self.v, self.omega], axis=-1)
@@ -79,12 +80,12 @@ class PoseStream:
 
     t: np.ndarray  # (T,) s
     x: np.ndarray  # (T,) m
-    y: np.ndarray
+    y: np.ndarray  # (T,) m
     yaw: np.ndarray  # (T,) rad, unwrapped
 
     @property
     def values(self) -> np.ndarray:
-        """(T, 3) of x, y and yaw."""
+        """(T, 3) of x, y [m] and yaw [rad]."""
         return np.stack([self.x, self.y, self.yaw], axis=-1)
 
 
@@ -145,13 +146,19 @@ class Trial:
     """One drive (or one window of a longer one)."""
 
     name: str
+    """Of its folder, or of the window."""
     manoeuvre: str
     """Trials of one manoeuvre with equal commands are replicates."""
     command: Command
+    """What the vehicle was told."""
     odometry: OdometryStream | None
+    """What it reported; None where that was not logged."""
     ground_truth: PoseStream | None
+    """Its pose as measured from outside; None where that was not logged."""
     start: Start
+    """Pose and speed at t = 0."""
     held_out: bool = False
+    """Whether a fit must not look at it."""
     group: str = ""
     """Terrain or robot; part of a selection."""
     breaks: tuple[tuple[float, float], ...] = ()
@@ -170,18 +177,26 @@ class Log:
     """All trials of one vehicle."""
 
     name: str
+    """Of its folder."""
     spec: VehicleSpec
+    """Nominal vehicle that was driven."""
     trials: tuple[Trial, ...]
+    """All drives, training and held out."""
     sha256: str
+    """Over names and contents of its files."""
     notes: tuple[str, ...] = ()
+    """What its reader found worth saying."""
     fields: dict[str, Any] = field(default_factory=dict)
+    """Content of dataset.toml."""
 
     @property
     def training(self) -> tuple[Trial, ...]:
+        """The trials that are fitted."""
         return tuple(trial for trial in self.trials if not trial.held_out)
 
     @property
     def held_out(self) -> tuple[Trial, ...]:
+        """The trials that are kept aside."""
         return tuple(trial for trial in self.trials if trial.held_out)
 
     def select(self, keep: Callable[[Trial], bool]) -> Log:
@@ -395,6 +410,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     """Checked fields of a dataset.toml."""
     content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
                               "see docs/log_format.md.", "Strings need quotes, decimals a point.")
+    content = upgraded("driving-log-dataset", content)
     schema = next(field for field in tables.DATASET if field.name == "schema")
     tables.check(str(path), schema, content.get("schema"))  # before the fields, which follow from it
     return tables.check_table(str(path), tables.DATASET, content)
