@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint clean
+.PHONY: train test test-quick test-long lint docs notebooks clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -35,6 +35,11 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(call beating,$(PIP) install -c constraints.txt -e ".[dev$(COMMA)ros]")
 	@touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "Installing what the site needs (MkDocs, jupytext) into $(VENV): once, some seconds."
+	$(call beating,$(PIP) install -c constraints.txt -e ".[docs]")
+	@touch $@
+
 train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
 
@@ -51,6 +56,15 @@ test-long: $(VENV)/.installed-dev
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy whill_mjx sysid dreamer bridge benchmarks
+
+# The site in build/site: every link and picture is checked, and a broken one fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/site/index.html."
+
+# The tutorials as notebooks in build/notebooks.
+notebooks: $(VENV)/.installed-docs
+	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
 
 clean:
 	rm -rf $(VENV)
