@@ -1,12 +1,13 @@
-# Two commands: `make train` and `make test`. Both install everything they need into .venv first.
+# `make train`, `make test` and `make loop`. They install everything they need into .venv first.
 PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
+LOOP ?= runs/loop
 BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint clean
+.PHONY: train loop test test-quick test-long lint clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -37,6 +38,10 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
+
+# Drive, record, fit, find what is missing, drive again, train, drive: over ROS 2, on the contact plant.
+loop: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30

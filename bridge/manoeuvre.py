@@ -3,7 +3,8 @@
     python -m bridge.manoeuvre command.csv --space 6 4 --dataset logs/monday --trial circle --repeat 3
 
 Before anything moves, the commands are checked against the limits and the path against the free floor. The vehicle
-stands until an operator arms it (a message on bridge/rearm, or Enter in this terminal), once for each replicate.
+stands until an operator arms it (a message on bridge/rearm, or Enter in this terminal), once for each replicate. With
+`--ros-args -p use_sim_time:=true` the manoeuvre runs in simulated time, such as that of `bridge.simulate --clock`.
 Whatever stops `bridge.drive` stops a manoeuvre too. A stopped replicate is put aside and begins again from its start.
 """
 
@@ -13,6 +14,7 @@ import os
 import select
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,9 @@ class Player:
 
     def __init__(self, table: CommandTable, safety: SafetyConfig, repeat: int = 1) -> None:
         self.table, self.repeat = table, repeat
+        self.clock: Callable[[float], float] = lambda now: now
+        """Seconds of the clock that the table counts in, from the steady time; simulated time may be another one. What
+        stops the vehicle is always timed by the steady clock."""
         self.supervisor = Supervisor(safety)
         self.driven = 0
         """Replicates driven to their end."""
@@ -60,21 +65,24 @@ class Player:
     def on_tick(self, now: float) -> Command | None:
         """Return the next row of the table where it is due, zero where the vehicle must stand."""
         supervisor = self.supervisor
-        if self.elapsed is not None and not supervisor.may_drive:
-            self.elapsed, self.aborted = None, self.aborted + 1
-            return self._send(supervisor.tick(now))
+        if self.elapsed is not None:
+            command = supervisor.tick(now)  # sees that the rows have stopped, too
+            if not supervisor.may_drive:
+                self.elapsed, self.aborted = None, self.aborted + 1
+                return self._send(command)
         if self.finished:
             return self._send(supervisor.tick(now))
-        if now < self._due:
+        at = self.clock(now)
+        if at < self._due:
             return None
-        self._due = now + PERIOD if now - self._due > PERIOD else self._due + PERIOD
+        self._due = at + PERIOD if at - self._due > PERIOD else self._due + PERIOD
         self._rows += 1
         supervisor.frame(now, now, self._rows)
         if not supervisor.may_drive:
             return self._send(supervisor.tick(now))
         if self.elapsed is None:
-            self._began = now
-        self.elapsed = now - self._began
+            self._began = at
+        self.elapsed = at - self._began
         if self.elapsed >= self.table.seconds:
             self.elapsed, self.driven = None, self.driven + 1
             supervisor.latch(FINISHED if self.finished else BACK)
@@ -102,6 +110,10 @@ class ManoeuvreNode(VehicleNode):
         self._driven_before = 0
         self.failure = ""
         """Why the drive ended early, such as a full disk."""
+        self._simulated = 0.0
+        if ros.uses_simulated_time(node):
+            player.clock = lambda _: self._simulated
+            ros.subscribe_clock(node, self._on_clock)
         ros.steady_timer(node, PERIOD / 2, self._on_progress)
         self.start()
 
@@ -112,12 +124,17 @@ class ManoeuvreNode(VehicleNode):
             self._over_since = time.monotonic()
         return bool(self.failure) or time.monotonic() - self._over_since > 1.0
 
+    def _on_clock(self, seconds: float) -> None:
+        """Take the simulated time, and send the row that is due."""
+        self._simulated = seconds
+        self._on_input(time.monotonic())
+
     def details(self) -> dict[str, Any]:
         """Return the progress of the manoeuvre."""
         player = self.player
         return {"manoeuvre": {"replicate": min(player.driven + 1, player.repeat), "of": player.repeat,
                               "elapsed": player.elapsed, "seconds": player.table.seconds,
-                              "aborted": player.aborted}}
+                              "driven": player.driven, "aborted": player.aborted}}
 
     @property
     def _recording(self) -> TrialWriter | None:

@@ -23,7 +23,7 @@ from typing import IO, Any
 from bridge import ros
 from bridge.commands import CommandListener
 from bridge.options import Parser, in_range
-from bridge.streams import Stream
+from bridge.streams import DEPTH, Stream
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
@@ -153,8 +153,8 @@ class TrialWriter:
             if self._waiting is not None:
                 self._add("command", t, *self._waiting)
         t = round(t - self._origin, 6)
-        if t <= self._last.get(stream, -math.inf):
-            return  # two messages within a microsecond
+        if t < 0 or t <= self._last.get(stream, -math.inf):
+            return  # stamped before the first pose, or two messages within a microsecond
         self._last[stream] = t
         self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1
@@ -177,7 +177,7 @@ def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
         'reference_point = "drive axle centre"\n'
         f"odometry = {toml_text(options.odometry_topic)}\n"
         f"ground_truth = {toml_text(options.ground_truth_topic)}\n"
-        "held_out = []   # trials to be predicted, never fitted\n"
+        f"held_out = [{', '.join(map(toml_text, options.held_out))}]   # trials to be predicted, never fitted\n"
     )
     temporary = path.with_name(".dataset.toml.tmp")
     temporary.write_text(text, encoding="utf-8")
@@ -189,8 +189,34 @@ def toml_text(text: str) -> str:
     return '"' + "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in text) + '"'
 
 
+class StampedListener(CommandListener):
+    """Hears commands with their own time."""
+
+    def __init__(self, node: Any, topic: str, on_command: Callable[[float, float, float], None]) -> None:
+        """Listen in the type that the base hears; `on_command` gets the stamp [s], 0 where there is none, v, omega."""
+        self._on_stamped = on_command
+        super().__init__(node, topic, "auto", lambda v, omega: on_command(0.0, v, omega))
+
+    def _open(self, kind: str) -> None:
+        if kind != "TwistStamped":
+            super()._open(kind)
+            return
+        from geometry_msgs.msg import TwistStamped
+
+        def heard(message: Any) -> None:
+            planar = message.twist
+            self._on_stamped(ros.stamp_seconds(message.header.stamp), planar.linear.x, planar.angular.z)
+
+        self.kind = kind
+        ros.subscribe_own(self.node, TwistStamped, self.name, heard, ros.best_effort(DEPTH))
+
+
 class RecordNode:
-    """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
+    """Writes the streams of the graph to one trial.
+
+    Times are those of receipt on the steady clock. With `--time stamp` they are the messages' own; a command without
+    one has the node's time at its receipt.
+    """
 
     def __init__(self, node: Any, writer: TrialWriter | None, options: argparse.Namespace, seconds: float = 0.0
                  ) -> None:
@@ -203,7 +229,8 @@ class RecordNode:
         """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
         self._seconds = seconds
-        self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
+        self._node, self._by_stamp = node, options.time == "stamp"
+        self._commands = StampedListener(node, options.command_topic, self._on_command)
         self.streams = [Stream(node, Odometry, options.odometry_topic, self._on_odometry),
                         Stream(node, Odometry, options.ground_truth_topic, self._on_ground_truth),
                         Stream(node, Imu, options.imu_topic, self._on_imu)]
@@ -226,21 +253,30 @@ class RecordNode:
     def _flush(self) -> None:
         self._write(lambda writer: writer.flush())
 
-    def _on_command(self, v: float, omega: float) -> None:
-        now = time.monotonic()
-        self._write(lambda writer: writer.command(now, v, omega))
+    def _time(self, stamp: float) -> float:
+        """Return the time that a message of this stamp gets."""
+        if not self._by_stamp:
+            return time.monotonic()
+        return stamp or self._node.get_clock().now().nanoseconds * 1e-9
+
+    def _on_command(self, stamp: float, v: float, omega: float) -> None:
+        t = self._time(stamp)
+        self._write(lambda writer: writer.command(t, v, omega))
 
     def _on_odometry(self, message: Any) -> None:
-        now, speed, stamp = time.monotonic(), message.twist.twist, ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.odometry(now, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
+        speed, stamp = message.twist.twist, ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.odometry(t, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
-        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.ground_truth(now, *planar_pose(message), stamp))
+        stamp = ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.ground_truth(t, *planar_pose(message), stamp))
 
     def _on_imu(self, message: Any) -> None:
-        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.imu(now, message.angular_velocity.z, stamp))
+        stamp = ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.imu(t, message.angular_velocity.z, stamp))
 
     def _write(self, write: Callable[[TrialWriter], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
@@ -322,6 +358,10 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
+    parser.add_argument("--time", choices=("receipt", "stamp"), default="receipt",
+                        help="what `t` is: when a message came, or its own stamp, for sensors that share one clock")
+    parser.add_argument("--held-out", nargs="+", default=[], metavar="TRIAL",
+                        help="trials that dataset.toml names as never to be fitted")
     parser.add_argument("--vehicle", default="WHILL Model CR")
     parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
     parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")

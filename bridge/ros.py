@@ -172,6 +172,18 @@ def clock_publisher(node: Any) -> Callable[[int, int], None]:
     return publish
 
 
+def uses_simulated_time(node: Any) -> bool:
+    """Return whether the node's time is that on /clock (`--ros-args -p use_sim_time:=true`)."""
+    return bool(node.get_parameter("use_sim_time").value)
+
+
+def subscribe_clock(node: Any, callback: Callable[[float], None]) -> None:
+    """Call with the seconds of each message on /clock."""
+    from rosgraph_msgs.msg import Clock
+
+    node.create_subscription(Clock, "/clock", lambda message: callback(stamp_seconds(message.clock)), best_effort())
+
+
 def transform_publisher(node: Any) -> Callable[[Any], None]:
     """Return a function that publishes an odometry's pose on /tf; it does nothing where tf2_msgs is not installed."""
     try:

@@ -124,6 +124,7 @@ class ChairSimulator:
         env, params = environment.make_env(
             make_task(task, **fields), vehicle, height=size[0], width=size[1], observations={}
         )  # the camera alone, whatever the task observes
+        self.env, self.params = env, params
         self.period = float(env.model.config.control_dt)
         self._low = np.array([env.task.v_min, -env.task.omega_max])
         self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
