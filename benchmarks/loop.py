@@ -200,7 +200,9 @@ class Loop:
             os.replace(self.out / ".drives_again.tmp", more)
         start = proposed["start"]
         place = {"x": start["x"], "y": start["y"], "yaw": start["heading"]}
-        plan = Plan("proposed", commands, min(proposed["replicates"], 3), place)
+        fitted = (self.options.days_of or self.out) / "fit" / "vehicle.toml"
+        check = ("--vehicle-file", str(fitted)) if fitted.exists() else ()
+        plan = Plan("proposed", commands, min(proposed["replicates"], 3), place, check)
         self.drive("proposed", more, [plan], self.seed, self.options.draw)
         return f"{proposed['name']}, {plan.replicates} times, to separate {' and '.join(proposed['splits'])}"
 

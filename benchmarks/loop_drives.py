@@ -201,5 +201,5 @@ def _port(here: Station, process: subprocess.Popen[bytes]) -> int:
 
 def last_line(log: Path) -> str:
     """The last line of a log that is not empty."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line.strip() for line in log.read_text(errors="replace").replace("\r", "\n").splitlines() if line.strip()]
     return lines[-1] if lines else "nothing was printed"

@@ -23,11 +23,13 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.fitted_reach import simulate_reach
 from bridge.options import Parser, in_range, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
 
+NAME = "bridge.manoeuvre"
 BACK = "bring the vehicle back to its start, then arm"
 FINISHED = "all replicates are driven"
 WIDEST = (2.0, 4.0)
@@ -180,7 +182,7 @@ def _enter_was_pressed() -> bool:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = Parser(prog="bridge.manoeuvre", description="Drive a command file and record it.")
+    parser = Parser(prog=NAME, description="Drive a command file and record it.")
     parser.add_argument("commands", type=Path, help="CSV file with the columns t,v,omega")
     parser.add_argument("--space", type=in_range(1e-3, 1e3), nargs=2, required=True, metavar=("LENGTH", "WIDTH"),
                         help="free floor [m]; nothing else may stand or walk on it")
@@ -188,6 +190,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="of the vehicle around its drive-axle centre [m]; default: a WHILL with its rider's feet")
     parser.add_argument("--uncertainty", type=in_range(1e-3, 0.999), default=0.15,
                         help="how much faster or slower the vehicle may be than commanded; default 0.15")
+    parser.add_argument("--vehicle-file", type=Path, metavar="FILE",
+                        help="vehicle file of sysid.fit: the path is simulated for vehicles drawn from its intervals, "
+                             "in place of --uncertainty")
+    parser.add_argument("--draws", type=whole(1, 10_000), default=64, help="how many; default 64")
     parser.add_argument("--slew", type=in_range(1e-3, 1e3), nargs=2, metavar=("V", "OMEGA"), default=(1.0, 2.0),
                         help="steepest change of the commands [m/s2, rad/s2]; default 1 2")
     parser.add_argument("--repeat", type=whole(), default=1, help="replicates, each of them armed by an operator")
@@ -210,7 +216,15 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
     """
     low, high = limits((-WIDEST[0], -WIDEST[1]), WIDEST, options)
     table = make_table(read_commands(options.commands), low, high, tuple(options.slew), str(options.commands))
-    place = check_space(reach_of(table, options.radius, options.uncertainty), tuple(options.space))
+    if options.vehicle_file is None:
+        place = check_space(reach_of(table, options.radius, options.uncertainty), tuple(options.space))
+    else:
+        print(f"{NAME}: simulating the manoeuvre with {options.vehicle_file} ...", file=sys.stderr)
+        fitted = simulate_reach(table, options.vehicle_file, options.radius, options.draws)
+        try:
+            place = f"{check_space(fitted.widest, tuple(options.space))} In simulation {fitted}."
+        except ValueError as error:
+            raise ValueError(f"{options.commands}: in simulation {fitted}. So {error}") from None
     safety = SafetyConfig(low=low, high=high, hold_zeros=BASES[options.base].hold_zeros, frame_age=0.25,
                           stamp_age=math.inf, require_arm=True, auto_resume=False)
     return table, safety, place
@@ -231,12 +245,12 @@ def main(arguments: list[str] | None = None) -> int:
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
-        print(f"bridge.manoeuvre: {error}", file=sys.stderr)
+        print(f"{NAME}: {error}", file=sys.stderr)
         return 2
-    print(f"bridge.manoeuvre: {place}", file=sys.stderr)
+    print(f"{NAME}: {place}", file=sys.stderr)
     if options.check:
         return 0
-    print(f"bridge.manoeuvre: {table.seconds:.0f} s, {options.repeat} times. Arm each with Enter, or with a message on "
+    print(f"{NAME}: {table.seconds:.0f} s, {options.repeat} times. Arm each with Enter, or with a message on "
           f"{ros.REARM_TOPIC}.", file=sys.stderr)
     with ros.node_session(ros.MANOEUVRE_NAME, ros_arguments, options.realtime) as node:
         player = Player(table, safety, options.repeat)
@@ -246,7 +260,7 @@ def main(arguments: list[str] | None = None) -> int:
         finally:
             manoeuvre.close()
     if manoeuvre.failure:
-        print(f"bridge.manoeuvre: {manoeuvre.failure}", file=sys.stderr)
+        print(f"{NAME}: {manoeuvre.failure}", file=sys.stderr)
         return 4
     return 0 if player.finished else 3
 
