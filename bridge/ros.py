@@ -106,18 +106,22 @@ def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any],
 
 
 def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
-                              lost: Callable[[Any], None], **callbacks: Any) -> Any:
-    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription."""
+                              lost: Callable[[Any], None], raw: bool = False, **callbacks: Any) -> Any:
+    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription.
+
+    With `raw` the callback gets the serialised message.
+    """
+    more = {"raw": True} if raw else {}
     try:
         from rclpy.event_handler import UnsupportedEventTypeError
     except ImportError:  # Humble
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
         events = subscription_events(message_lost=lost, **callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
 
 
 def is_reliable(policy: Any) -> bool:
