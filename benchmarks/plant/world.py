@@ -16,7 +16,8 @@ from benchmarks.plant.base import TICK
 from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.make import plan
 from benchmarks.plant.online import OnlinePlant
-from bridge.simulate import ChairSimulator, Frame
+from bridge.simulate import ChairSimulator
+from bridge.simulated import Frame
 
 
 class ContactVehicle(ChairSimulator):
