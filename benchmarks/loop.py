@@ -215,7 +215,8 @@ class Loop:
         """Train a policy in the vehicle that was found."""
         steps = () if self.options.steps is None else ("--steps", str(self.options.steps))
         self.command("train", "whill_mjx.train", "--out", self.out / "train", "--vehicle",
-                     self.last_loop / "vehicle.toml", "--preset", self.options.preset, "--videos", "0", "--episodes", "20", *steps)
+                     self.last_loop / "vehicle.toml", "--preset", self.options.preset, "--videos", "0", "--episodes",
+                     "20", *steps)
         return "train/policy"
 
     def do_drive(self) -> str:

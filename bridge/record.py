@@ -119,8 +119,10 @@ class TrialWriter:
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""
-        for file in (*self._files.values(), *([self._mcap] if self._mcap else [])):
+        for file in self._files.values():
             file.flush()
+        if self._mcap is not None:
+            self._mcap.flush()
 
     def close(self) -> Path:
         """End the recording: give the trial its name and return its folder.

@@ -129,12 +129,15 @@ def _extent(scene: Any) -> tuple[np.ndarray, np.ndarray]:
 def _touched(scene: Any, x: Any, y: Any) -> Any:
     """Return (N,) whether the cells around places are occupied."""
     import jax
+    import jax.numpy as jnp
 
     from whill_mjx.world.collision import obstacles_of, touches
     from whill_mjx.world.scene import Footprint
 
+    yaw, half, height = (jnp.asarray(value) for value in (0.0, CELL / 2, SCAN_HEIGHT))
+
     def one(x: Any, y: Any) -> Any:
-        return touches(Footprint(x, y, 0.0, CELL / 2, CELL / 2, SCAN_HEIGHT), obstacles_of(scene, x, y))
+        return touches(Footprint(x, y, yaw, half, half, height), obstacles_of(scene, x, y))
 
     return jax.vmap(one)(x, y)
 
