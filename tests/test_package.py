@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 import whill_mjx
 from whill_mjx.io.command_line import starts
@@ -85,3 +88,61 @@ def test_the_source_archive_holds_what_a_developer_needs(needed):
     lines = (ROOT / "MANIFEST.in").read_text().splitlines()
     taken = {word for line in lines if line.startswith(("include", "graft")) for word in line.split()[1:]}
     assert needed in taken and (ROOT / needed).exists()
+
+
+def test_every_place_that_names_the_version_names_the_same():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "bridge" / "setup.cfg")
+    package = re.search(r"<version>(.*?)</version>", (ROOT / "bridge" / "package.xml").read_text())
+    readme = re.search(r"version\s*= \{(.*?)\}", (ROOT / "README.md").read_text())
+    assert {str(citation["version"]), setup["metadata"]["version"], package[1], readme[1]} == {whill_mjx.__version__}
+    assert re.fullmatch(r"\d+\.\d+\.\d+", whill_mjx.__version__)
+
+
+def test_readme_and_citation_file_cite_the_same():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    readme = (ROOT / "README.md").read_text().partition("## Cite")[2]
+    [paper] = citation["references"]
+    wanted = [citation["title"], citation["authors"][0]["name"], paper["title"], paper["institution"]["name"],
+              *(f"{one['given-names']} {one['family-names']}" for one in paper["authors"])]  # fmt: skip
+    assert not [text for text in wanted if text not in readme]
+    assert citation["cff-version"] == "1.2.0" and citation["license"] == PROJECT["project"]["license"]
+
+
+def test_each_package_ships_its_type_information():
+    data = PROJECT["tool"]["setuptools"]["package-data"]
+    for package in ("whill_mjx", "sysid", "dreamer", "bridge"):
+        assert (ROOT / package / "py.typed").read_text() == "" and "py.typed" in data[package]
+
+
+def test_templates_of_issues_ask_for_what_is_needed():
+    forms = [path for path in sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")) if path.stem != "config"]
+    assert len(forms) == 3
+    for path in forms:
+        form = yaml.safe_load(path.read_text())
+        assert form["name"] and form["description"]
+        assert any(part.get("validations", {}).get("required") for part in form["body"])
+
+
+def test_hooks_run_what_make_lint_runs():
+    [local] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    entries = [hook["entry"] for hook in local["hooks"]]
+    lint = re.findall(r"\$\(BIN\)/python (-m (?:ruff|mypy) [^\n]*)", (ROOT / "Makefile").read_text())
+    assert len(lint) == 2
+    for line in lint:
+        assert any(line.removesuffix(" .") in entry for entry in entries)
+
+
+def test_the_image_is_built_of_files_that_exist():
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
+    assert {"pyproject.toml", "constraints.txt", "whill_mjx", "sysid", "dreamer", "bridge"} <= set(copied)
+    assert all((ROOT / name).exists() for name in copied)
+
+
+def test_pins_of_several_pythons_become_one_list():
+    merged = runpy.run_path(str(ROOT / ".ci" / "constraints.py"))["merged"]
+    text = merged({"3.12": {"a": "2", "b": "1", "c": "3"}, "3.11": {"a": "1", "b": "1"}, "3.13": {"a": "2", "b": "1",
+                                                                                                "c": "3"}})  # fmt: skip
+    assert text.splitlines()[1:] == ["a==1; python_version < '3.12'", "a==2; python_version >= '3.12'", "b==1", "c==3"]

@@ -49,6 +49,7 @@ from whill_mjx.evaluation.novelty import largest_surprise, limits
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.folders import Claim, claim_folder, write_whole
+from whill_mjx.io.formats import stamp
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
@@ -537,8 +538,8 @@ def evaluate_policy(
             write_prediction(options.out / "prediction.gif", preset, vehicle, result.params, options.videos, key)
         except ImportError as error:
             say(f"prediction.gif is left out: {error}. Install the base package to draw it.")
-    return {"task": plain(preset.task), "learner": options.learner, "seed": options.seed,
-            "env_steps": result.env_steps, "updates": result.updates, **summary}
+    return {**stamp("whill-mjx-evaluation"), "task": plain(preset.task), "learner": options.learner,
+            "seed": options.seed, "env_steps": result.env_steps, "updates": result.updates, **summary}
 
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:

@@ -40,9 +40,9 @@ SPELLED = {
 }
 STREAM_WORDS = {
     "command": ("cmd", "command", "commands", "commanded", "desired", "des", "ref", "reference", "setpoint", "target",
-                "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested"),
+                "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested", "action"),
     "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc",
-                 "fb", "reported"),
+                 "fb", "reported", "state"),
     "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
                      "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
 }
@@ -216,6 +216,10 @@ def _quantity(words: list[str]) -> str | None:
         angle = re.search(r"angle|pos|position|enc(oder)?$|ticks", text) and not re.search(r"vel|speed|rpm", text)
         return f"{side}_angle" if angle else side
     last = words[-1]
+    if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
+        return {"x": "v", "y": None, "z": None}.get(match[1], "omega")
+    if match := re.fullmatch(r"(?:\w+ )?(x|y|theta|yaw|heading) (?:pos|position)", text):
+        return match[1] if match[1] in "xy" else "yaw"
     if re.search(r"(orientation|quat\w*|rotation|^q) [wxyz]$", text):
         return f"q{last}"
     if last in "xyz" and re.search(r"angular|gyro|rate|^w |omega", text):

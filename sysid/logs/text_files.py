@@ -65,6 +65,14 @@ def read_drives(
             groups += [(table.stem, [table]) for table in tables]
         else:
             groups.append((files[0].absolute().parent.name, tables))
+    return join_drives(source, groups, said, geometry, wheels)
+
+
+def join_drives(
+    source: Path, groups: Sequence[tuple[str, list[Table]]], said: Sequence[str], geometry: tuple[float, float],
+    wheels: bool = False,
+) -> list[TextDrive]:
+    """Drives of tables, by the name of each drive; otherwise as `read_drives`."""
     units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
     drives: list[TextDrive] = []
     agreed: list[str] = list(said)

@@ -306,6 +306,7 @@ COLUMNS = {field.name: field for field in (
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),
     Field("v", "m/s", -SPEED, SPEED, remedy="Convert it to m/s: is it in km/h or mm/s?"),
     Field("omega", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
+    Field("gyro", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
 )}  # fmt: skip
 """Columns of the CSV files of a driving log."""
 
@@ -333,6 +334,9 @@ TASK = (
     Field("step_reward", "-", -1e9, 1e9),
     Field("smoothness_gain", "s/rad", -1e9, 1e9),
     Field("layout", kind="text"),
+    Field("people", kind="whole", low=0, high=200, needed=False),
+    Field("people_within", "m", 0.5, 1e3, needed=False),
+    Field("yielding", "-", 0.0, 1.0, needed=False),
     Field("gates", kind="whole", low=0, high=2),
     Field("goal_x", "m", -1e3, 1e3),
     Field("gate_x", "m", -1e3, 1e3, kind="numbers", count=2),

@@ -105,7 +105,7 @@ class Stopper:
         """Good evaluations in a row at the end of what an earlier start has logged: a resumed run ends alike."""
         path, good = self._out / "metrics.jsonl", 0
         if self._success is None:
-            return good
+            return 0
         for _, line in read_lines(path):
             if "eval/success" in line and line["env_steps"] < env_steps:
                 good = good + 1 if line["eval/success"] >= self._success else 0
