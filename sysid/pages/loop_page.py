@@ -153,7 +153,7 @@ def errors(report: dict[str, Any]) -> str:
                                rows, words))
     parts.append(paragraph("Usual error: root mean square over a drive, averaged over drives. As it was: nothing has "
                            "moved. Refitted: base parameters moved, held by their day-to-day spread. Effect alone: "
-                           "that vehicle with the effect, and nothing else moved for it. With the effect: both together. "
+                           "that vehicle with the effect, and nothing else moved for it. With the effect: both. "
                            "Repeats: no prediction can be better than two repeats of one drive agree.", "dim"))
     return "".join(parts)
 
