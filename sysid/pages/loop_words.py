@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -157,10 +156,8 @@ def _found(report: Mapping[str, Any]) -> str:
     if report["verdict"] == "named":
         texts = []
         for one in report["effects"]:
-            law = one["equation"].replace("`", "").split(": ")[0].strip(" .")
-            if re.search(r"->|[=*^<]", law):  # an equation; the parameter's description is in words
-                known = [p for p in one["parameters"].values() if not _may_be_none(p)]
-                law = (known or list(one["parameters"].values()))[0].get("description") or ""
+            known = [p for p in one["parameters"].values() if not _may_be_none(p)] or list(one["parameters"].values())
+            law = known[0].get("description") or ""
             texts.append(f"{spoken(one['name'])}" + (f" ({law[0].lower()}{law[1:]})" if law else ""))
         return f"What explains these drives is {' and '.join(texts)}."
     where = [one["quantity"] for one in report["lives_in"][:2]]
