@@ -149,8 +149,8 @@ def errors(report: dict[str, Any]) -> str:
         if rows:
             only = ["effect alone"] if report["alone"] is not None else []
             short = {"before": "as it was", "refitted": "refitted", "after": "with the effect"}
-            parts.append(table(["usual error", *(short[key] for key in names), *only, "repeats differ by", "not worse in"],
-                               rows, words))
+            header = ["usual error", *(short[key] for key in names), *only, "repeats differ by", "not worse in"]
+            parts.append(table(header, rows, words))
     parts.append(paragraph("Usual error: root mean square over a drive, averaged over drives. As it was: nothing has "
                            "moved. Refitted: base parameters moved, held by their day-to-day spread. Effect alone: "
                            "that vehicle with the effect, and nothing else moved for it. With the effect: both. "
