@@ -16,7 +16,7 @@ from sysid.replay.models import Model, function_model, with_effects
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams
 
-DT = 0.01  # s
+DT = 0.005  # s; halves of the usual intervals between samples are multiples of it
 NOTE = ("the log has no commands: measured wheel speeds are the input. Radius and track are effective ones, slip and "
         "scrub included; drive, delays of commands and their scale are left out. The outside pose's delay is how much "
         "older it is than the wheel speeds, which a filter may have made old themselves")
