@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from whill_mjx.io.command_line import listen, refusing
+from whill_mjx.io.command_line import listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 from sysid import command_line

@@ -83,7 +83,8 @@ def doubts(result: Result) -> list[Doubt]:
                    "do it", f"Drive the same manoeuvres with another {each.falsifier.by} to find out.")
              for one in result.stood if one.effect in named for each in one.falsifiers
              if each.falsifier.by in LAW and each.outcome == "untold"]
-    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
+    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width,
+                            result.reference.channels)
     quantity = max(gains, key=lambda name: gains[name])
     if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
         said.append(Doubt(f"what is left is a smooth function of {quantity} more than on reference days: the form is "

@@ -63,6 +63,7 @@ SAID = "as said"  # why a column has its role where somebody gave no unit
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
+GAP = 2.0  # s without samples, over which nothing is interpolated
 
 
 @dataclass(frozen=True)
@@ -395,7 +396,7 @@ def _size_of(
     """The unit in which a signal is as large as a reference; None where they are not alike or no unit fits."""
     if reference is None:
         return None
-    t = np.arange(max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]), 0.05)
+    t = _grid(mine[0], max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]))
     if len(t) < 40:
         return None
     ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
@@ -412,10 +413,18 @@ def _size_of(
 
 def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rate of a signal (T,) over 0.2 s, at 20 Hz."""
-    grid = np.arange(t[0] + 0.1, t[-1] - 0.1, 0.05)
+    grid = _grid(t, t[0] + 0.1, t[-1] - 0.1)
     if len(grid) < 2:
         return t[:1], np.zeros(1)
     return grid, (np.interp(grid + 0.1, t, values) - np.interp(grid - 0.1, t, values)) / 0.2
+
+
+def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Times at 20 Hz from `begin` to `end`, but for gaps of more than GAP in the samples' times (T,)."""
+    inside = np.unique(np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])) if end > begin else np.zeros(0)
+    pieces = [np.arange(one[0], one[-1], 0.05) for one in np.split(inside, np.flatnonzero(np.diff(inside) > GAP) + 1)
+              if len(one)]  # fmt: skip
+    return np.concatenate([*pieces, np.zeros(0)])
 
 
 def _way(x: tuple[np.ndarray, np.ndarray] | None, y: tuple[np.ndarray, np.ndarray] | None

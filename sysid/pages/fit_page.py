@@ -62,7 +62,7 @@ def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
     held, train = report["summary"]["held_out"], report["summary"]["training"]
     dataset = report["dataset"]
     notes = dataset.get("notes") or []
-    parts = [paragraph(" ".join(lead(report)), "lead"), *(paragraph(f"{note[0].upper()}{note[1:]}.")
+    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:]}.")
                                                           for note in notes if _is_limit(note))]
     shown = shown_drive(series_paths(series, list(REPLAY_WORDS)))
     if shown is not None:

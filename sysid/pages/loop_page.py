@@ -39,14 +39,15 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
         sections.append(Section("Evidence", evidence(report)))
     if report["verdict"] != "named":
         sections.append(Section("What these drives would have shown", detectable(report)))
-    page = html_page(title(report), sections, f"{report['dataset']['name']}, {report['dataset']['vehicle']}")
+    page = html_page(title(report), sections, f"{report['dataset']['name']}, {report['dataset']['vehicle']}",
+                     kind="Missing effect", lead=lead(report)[0])
     write_text(out / "report.html", page)
     return out / "report.html"
 
 
 def found(report: dict[str, Any]) -> str:
     """Three sentences, what to do about doubts, and one drive before and after."""
-    parts = [paragraph(" ".join(lead(report)), "lead")]
+    parts = [paragraph(" ".join(lead(report)[1:]))]
     if report["advice"]:
         parts += [heading("Before you rely on it"), bullets(report["advice"])]
     if text := report["noise_sentence"]:

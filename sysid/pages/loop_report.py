@@ -61,6 +61,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from sysid.errors.noise_level import said
@@ -156,6 +157,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "detectable": detectable(result, days),
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
+        "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
@@ -166,7 +168,7 @@ def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Pred
 
     drives, values = drives_of(result, trials, vehicle)
     simulated = drives.replay(values[None])
-    return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
+    return predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
 
 
 def predicts_well(trials: tuple[Trial, ...], rows: list[dict[str, Any]]) -> bool:
@@ -400,6 +402,8 @@ def summary(report: dict[str, Any], width: int = 100) -> str:
         lines += [f"  {name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
                   for name, p in one["parameters"].items()]
         lines += [f"  {text}" for text in not_determined(one["parameters"])]
+    if report["floor"] is not None and report["floor"]["sentence"]:
+        lines.append(f"  changed: {report['floor']['sentence']}")
     moved = shifts(report["base"])
     if moved:
         lines += ["  base parameters further than from day to day:", *(f"    {one}" for one in moved)]
@@ -462,7 +466,8 @@ def where_it_lives(result: Result) -> list[dict[str, Any]]:
     """Quantities by the share of the systematic residual that they predict on other drives, best first."""
     residual, excess = result.search.final.residual, result.search.excess[1]
     beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
-    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
+    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width,
+                            result.reference.channels)
     out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
     return sorted(out, key=lambda one: -one["share"])
 

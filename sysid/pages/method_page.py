@@ -19,7 +19,8 @@ def write_method(out: Path, report: dict[str, Any]) -> Path:
         sections.append(Section("Noise of the sensors", noise(report)))
     sections += [Section("Base parameters", base(report)), Section("Thresholds and settings", fixed(report))]
     page = html_page(f"Method: {title(report)}", sections,
-                     f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}")
+                     f"data SHA-256 {report['dataset']['sha256'][:16]}, manifest {report['manifest']['sha256'][:16]}",
+                     kind="Missing effect", lead=f"{report['verdict'].capitalize()}: {report['reason']}.")
     write_text(out / "method.html", page)
     return out / "method.html"
 

@@ -156,6 +156,7 @@ def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, slopin
         sloping.prepared.without(("slop",))
 
 
+@pytest.mark.long
 def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sloping):
     result = find_missing(drives["sloping"], (), replace(CONFIG, refit_nulls=4), reference=sloping.prepared)
     assert result.search.verdict == "named"

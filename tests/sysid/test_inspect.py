@@ -273,8 +273,11 @@ def test_replicate_spread_is_the_deviation_between_drives():
     assert group.spread["ground_truth.x"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_command_writes_text_json_and_picture(tmp_path, capsys):
+def test_the_command_writes_page_text_json_and_picture(tmp_path, capsys):
     main(InspectConfig(CHAIR, out=tmp_path / "seen"))
+    page = (tmp_path / "seen" / "inspect.html").read_text()
+    assert "9 trials of differential-drive powered chair, 214 s: nothing looks wrong" in page.partition("</header>")[0]
+    assert "data:image/png" in page and "next_1.csv" in page
     printed = capsys.readouterr().out
     assert "What this log cannot determine" in printed and "figure_eight_1*" in printed
     found = json.loads((tmp_path / "seen" / "inspect.json").read_text())
