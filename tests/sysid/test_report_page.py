@@ -93,7 +93,7 @@ def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run
                  "sysid sources SHA-256", "toy & <co>"):
         assert word in text, word
     header = text.partition("</header>")[0]
-    assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and "m before the fit" in header
+    assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and '<p class="lead">' in header
     report = read_report(run)
     assert report["dataset"]["sha256"] in text and report["code"]["sysid sources SHA-256"] in text
     assert not list(run.glob("*.tmp"))
