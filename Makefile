@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint coverage constraints release clean
+.PHONY: train test test-quick test-long lint docs notebooks coverage constraints release clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -33,6 +33,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "Installing what the tests need (pytest, ruff, mypy, ROS 2 messages) into $(VENV): once, about a minute."
 	$(call beating,$(PIP) install -c constraints.txt -e ".[dev$(COMMA)ros]")
+	@touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "Installing what the site needs (MkDocs, jupytext) into $(VENV): once, some seconds."
+	$(call beating,$(PIP) install -c constraints.txt -e ".[docs]")
 	@touch $@
 
 train: $(VENV)/.installed
@@ -78,6 +83,15 @@ VERSIONS ?= 3.11 3.12 3.13
 release: $(VENV)/.installed-dev
 	$(PIP) install -q -c constraints.txt build
 	.ci/release $(BIN)/python $(VERSIONS)
+
+# The site in build/site: every link and picture is checked, and a broken one fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/site/index.html."
+
+# The tutorials as notebooks in build/notebooks.
+notebooks: $(VENV)/.installed-docs
+	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
 
 clean:
 	rm -rf $(VENV) build

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
+from whill_mjx.io.command_line import listen, refusing, starts
 
-from whill_mjx.io.command_line import listen, refusing
-
-if __name__ == "__main__":
+if starts(__name__):
     listen()
+
+import numpy as np
 
 from sysid import command_line
 from sysid.logs.coverage import Blind
@@ -55,6 +55,9 @@ class InspectConfig:
     """Length and width of the free floor for the next drives [m]."""
     v_max: Annotated[float | None, POSITIVE] = None
     """Fastest speed of the next drives [m/s]; by default half of the vehicle's, at most 0.5 m/s."""
+    radius: Annotated[float | None, POSITIVE] = None
+    """Reach of the vehicle around its drive-axle centre in the next drives [m], rider's feet included; by default that
+    of its nominal body."""
 
 
 def inspect_robot(config: InspectConfig) -> dict[str, Any]:
@@ -121,11 +124,13 @@ def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDriv
     from sysid.pages.report import plain
 
     found = inspect(log)
-    drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max)
+    drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max, config.radius)
     found["next_drives"] = [
         {"file": OUTPUTS[3 + k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
          "v": float(np.abs(one.command.v).max()), "omega": float(np.abs(one.command.omega).max()),
-         "length_width": list(one.size), "start": list(one.start)} for k, one in enumerate(drives)]
+         "floor": list(one.floor), "radius": one.radius, "drive_it": f"python -m bridge.manoeuvre "
+         f"{(config.out or Path()) / OUTPUTS[3 + k]} --space {config.space[0]:g} {config.space[1]:g} "
+         f"--radius {one.radius:g} --check"} for k, one in enumerate(drives)]
     print(json.dumps(plain(found), indent=1) if config.json else text(found))
     return found, drives
 

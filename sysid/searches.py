@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
+from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import ast
 import configparser
+import os
 import re
 import runpy
+import signal
+import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -13,6 +18,7 @@ import pytest
 import yaml
 
 import whill_mjx
+from whill_mjx.io.command_line import starts
 
 pytestmark = pytest.mark.quick
 ROOT = Path(__file__).parent.parent
@@ -30,6 +36,38 @@ def test_each_console_script_starts_a_function_of_a_module_that_python_m_runs_to
     assert needed == 0, f"{SCRIPTS[name]} is called without arguments."
     started = [node for node in tree.body if isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)]
     assert any(f"{function}()" in ast.unparse(node) for node in started)  # another may listen before the slow imports
+
+
+@pytest.mark.parametrize("name", sorted(name for name in SCRIPTS if not name.startswith("bridge-")))
+def test_each_console_script_listens_for_signals_before_its_slow_imports(name, monkeypatch):
+    module = SCRIPTS[name].split(":")[0]
+    path = ROOT / f"{module.replace('.', '/')}.py"
+    statements = [ast.unparse(node) for node in ast.parse(path.read_text()).body]
+    (place,) = (k for k, text in enumerate(statements) if text.startswith("if starts(__name__):\n    listen()"))
+    slow = re.compile(r"(import|from) (?!__future__|whill_mjx\.io\.(command_line|heartbeat)\b)([a-z_]+)")
+    before = {match[3] for text in statements[:place] if (match := slow.match(text))}
+    assert before <= set(sys.stdlib_module_names)
+    for argv, expected in (([f"/usr/bin/{name}"], True), (["pytest"], False), ([], False)):
+        monkeypatch.setattr(sys, "argv", argv)
+        assert starts(module) == expected
+    assert starts("__main__")
+
+
+def test_a_signal_ends_a_console_script_that_still_imports(tmp_path):
+    script = tmp_path / "sysid-fit"
+    script.write_text("import sys\nfrom sysid.fit import cli\nsys.exit(cli())\n")  # as an installer writes it
+    child = subprocess.Popen([sys.executable, str(script), "--help"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                             text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    while child.poll() is None and not listens(child.pid):
+        time.sleep(0.001)
+    child.send_signal(signal.SIGTERM)
+    assert child.communicate()[1] == "stopped before the work began. (SIGTERM)\n" and child.returncode == 130
+
+
+def listens(pid):
+    """Whether a process has a handler for SIGTERM, as the operating system has it."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return bool(int(re.search(r"SigCgt:\s*(\w+)", status)[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 def test_every_command_that_readme_shows_has_a_console_script():

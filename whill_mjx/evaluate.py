@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run, starts
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
     say_loading()
 

@@ -28,10 +28,11 @@ from whill_mjx.io.command_line import (
     listen,
     refusing,
     run,
+    starts,
 )
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
     say_loading()
 
@@ -39,7 +40,7 @@ import jax
 
 from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy, export_sensing
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
@@ -421,14 +422,16 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
         options.out,
         stopper.total_steps(preset.total_steps),
         options.seed,
-        eval_fn=keep_best(options.out, preset, evaluate),
-        eval_ahead=lambda params: evaluate(params, 0),
-        eval_every=preset.eval_every,
-        checkpoint_every_s=options.checkpoint_every_s,
-        stop=stopper,
-        devices=devices,
-        tensorboard=options.tensorboard,
-        announce=stage,
+        TrainingOptions(
+            eval_fn=keep_best(options.out, preset, evaluate),
+            eval_ahead=lambda params: evaluate(params, 0),
+            eval_every=preset.eval_every,
+            checkpoint_every_s=options.checkpoint_every_s,
+            stop=stopper,
+            devices=devices,
+            tensorboard=options.tensorboard,
+            announce=stage,
+        ),
     )
     return Trained(jax.device_get(result.agent.acting), result.env_steps, result.updates, result.wall_s)
 
@@ -454,12 +457,16 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         return mean_figures({**episodes, "return": episodes["episode_return"]})
 
     stopper = Stopper(options.out, preset.stop_success)
-    return Trained(*train_ppo(
-        functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
-        preset.eval_every, stopper, say, eval_ahead=not devices,
-        checkpoint_every_s=options.checkpoint_every_s, last_step=stopper.total_steps(preset.total_steps),
-        announce=stage, progress=True,
-    ))  # fmt: skip
+    how = TrainingOptions(
+        eval_fn=evaluate,
+        eval_ahead=None if devices else lambda params: evaluate(params, 0),
+        eval_every=preset.eval_every,
+        checkpoint_every_s=options.checkpoint_every_s,
+        stop=stopper,
+        announce=stage,
+    )
+    env, last_step = functional_env(batch, preset.safety), stopper.total_steps(preset.total_steps)
+    return Trained(*train_ppo(env, preset.ppo, options.out, preset.total_steps, options.seed, how, last_step))
 
 
 def evaluation_of(batch: BatchEnv, preset: Preset, seed: int) -> Evaluate:

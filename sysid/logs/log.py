@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.gyro import with_sign
 from whill_mjx.io import fields as tables
 from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.formats import upgraded
@@ -35,6 +36,9 @@ TIME_UNITS = (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)
 COMMAND_COLUMNS = ("t", "v", "omega")
 ODOMETRY_COLUMNS = ("t", "x", "y", "yaw", "v", "omega")
 POSE_COLUMNS = ("t", "x", "y", "yaw")
+GYRO_COLUMNS = ("t", "gyro")
+GYRO_SPACING = 0.05
+"""Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,35 @@ class PoseStream:
 
 
 @dataclass(frozen=True)
+class GyroStream:
+    """The turn of the body, added up from a yaw rate that is measured on the vehicle."""
+
+    t: np.ndarray  # (T,) s
+    turn: np.ndarray  # (T,) rad, from the first sample
+
+    @classmethod
+    def of_rates(cls, t: np.ndarray, omega: np.ndarray) -> GyroStream:
+        """That of yaw rates (T,) [rad/s], at samples that are at least `GYRO_SPACING` apart."""
+        turn = np.concatenate([[0.0], np.cumsum(np.diff(t) * (omega[1:] + omega[:-1]) / 2)])
+        kept, last = [], -np.inf
+        for i, now in enumerate(t):
+            if now - last >= GYRO_SPACING - 1e-9:
+                kept.append(i)
+                last = now
+        return cls(t[kept], turn[kept])
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 1) of the turn."""
+        return self.turn[:, None]
+
+    def until(self, end: float) -> GyroStream:
+        """The samples up to a time [s]."""
+        inside = self.t <= end
+        return GyroStream(self.t[inside], self.turn[inside])
+
+
+@dataclass(frozen=True)
 class Start:
     """Where and how fast the vehicle starts: room frame, reference point."""
 
@@ -130,6 +163,8 @@ class Trial:
     """Terrain or robot; part of a selection."""
     breaks: tuple[tuple[float, float], ...] = ()
     """Times between which the outside pose moved by an unknown amount [s]."""
+    gyro: GyroStream | None = None
+    """Turn of the body by a yaw rate measured on the vehicle, counter-clockwise."""
 
     @property
     def duration(self) -> float:
@@ -191,6 +226,8 @@ def load_log(folder: str | Path) -> Log:
                          "Correct the names, or nothing is really held out.")
     timeout = fields.get("command_timeout")
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    trials, said = with_sign(trials)
+    notes += said
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
@@ -225,7 +262,19 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
         ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
     if timeout is not None:
         command = with_timeout(command, timeout)
-    return make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
+    trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
+    return replace(trial, gyro=_read_gyro(folder / "imu.csv", trial.duration))
+
+
+def _read_gyro(path: Path, end: float) -> GyroStream | None:
+    """What a gyro turned until a time [s]; None where there is no file, or fewer than two samples in it."""
+    if not path.exists():
+        return None
+    columns = read_csv(path, GYRO_COLUMNS)
+    inside = (columns["t"] >= 0) & (columns["t"] <= end)
+    if inside.sum() < 2:
+        return None
+    return GyroStream.of_rates(columns["t"][inside], columns["gyro"][inside])
 
 
 def make_trial(
@@ -438,6 +487,7 @@ class Prediction:
 
     ground_truth: PoseStream | None
     odometry: OdometryStream | None
+    gyro: GyroStream | None = None
 
 
 def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ def mistaken(command, words, capsys):
 
 @pytest.mark.parametrize("command, words, told", [
     ("look", "--scene nope", "unknown scene 'nope' (known: corridor, "),
+    ("look", "--scene task.py", "--scene task.py: a task in a file is named too. Give task.py:CLASS."),
     ("look", "--layout nope", "--layout nope: unknown (known: randomised, fixed)"),
     ("look", "--worlds 0", "--worlds 0: must be at least 1"),
     ("look", "--steps 0", "--steps 0: must be at least 1"),
@@ -96,6 +97,9 @@ def mistaken(command, words, capsys):
     ("evaluate", "planner --sweep light=0:1:0", "light=0:1:0"),
     ("evaluate", "planner --sweep light=0:1:-4", "light=0:1:-4"),
     ("evaluate", "planner --sweep light=nan", "light=nan"),
+    ("evaluate", "planner --sweep light=0:1:1000000000", "1000000000 values are more than 1000"),
+    ("evaluate", "planner --sweep start_x=1e300", "start_x is 1e+300"),
+    ("evaluate", "planner --task task.py", "--task task.py: a task in a file is named too. Give task.py:CLASS."),
     ("evaluate", "planner --sweep yaw_scrub.nope=1", "no parameter 'nope'"),
     ("evaluate", "planner --sweep vehicle=whill_cr,nope", "unknown vehicle 'nope'"),
     ("evaluate", "planner --baselines nope", "'nope' is not NAME=VALUE"),
