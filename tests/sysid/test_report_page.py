@@ -18,9 +18,9 @@ from sysid.pages import series as series_module
 from sysid.pages.fit_page import autocorrelation, choose, worse
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
-from sysid.pages.svg import Line, bar_chart, interval_bar, line_chart
 from sysid.replay.rollout import make_batch, predictions, simulate
 from whill_mjx.io.html import Cell, Section, html_page, number, png, table
+from whill_mjx.io.svg import Line, bar_chart, interval_bar, line_chart
 
 pytestmark = pytest.mark.quick
 
