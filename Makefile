@@ -1,12 +1,13 @@
-# Two commands: `make train` and `make test`. Both install everything they need into .venv first. Others: CONTRIBUTING.md.
+# `make train`, `make test` and `make loop` install everything they need into .venv first. Others: CONTRIBUTING.md.
 PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
+LOOP ?= runs/loop
 BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint docs notebooks coverage constraints release clean
+.PHONY: train loop test test-quick test-long lint docs notebooks coverage constraints release clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -42,6 +43,10 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 
 train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
+
+# Drive, record, fit, find what is missing, drive again, train, drive: over ROS 2, on the contact plant.
+loop: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bridge.simulate import Frame
+from bridge.simulated import Frame, Grid
 
 
 class PointRobot:
@@ -14,6 +14,7 @@ class PointRobot:
     goal = 0.3
     longest = 100
     intrinsics = (60.0, 60.0, 32.0, 32.0)
+    grid = Grid(np.array([[False, False, True], [False] * 3]), 0.5, -1.0, 0.0)
 
     def __init__(self, task="", vehicle=None):
         self.reset(0)
