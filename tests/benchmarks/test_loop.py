@@ -67,7 +67,10 @@ def test_a_day_is_driven_over_ros_recorded_exactly_and_not_driven_twice(tmp_path
     assert all(0.049 < b - a < 0.051 for a, b in zip(times, times[1:], strict=False)) and len(times) > 80
     with open(trial / "command.csv", newline="") as file:
         turns = [float(row["omega"]) for row in csv.DictReader(file)]
+        file.seek(0)
+        sent = [float(row["t"]) for row in csv.DictReader(file)]
     assert max(turns) > 0.6 and turns[0] == turns[-1] == 0
+    assert all(0.0499 < b - a < 0.0501 for a, b in zip(sent, sent[1:], strict=False))  # none late, none missing
     before = trial.stat().st_mtime_ns
     main(options)
     assert trial.stat().st_mtime_ns == before and capsys.readouterr().out.count("days ...") == 1
