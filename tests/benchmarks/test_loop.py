@@ -6,9 +6,11 @@ import json
 
 import pytest
 
+from benchmarks import loop_figures
 from benchmarks.loop import Options, main
 from benchmarks.loop_figures import removed, summary
 from benchmarks.loop_page import write_page
+from whill_mjx.io.command_line import OptionError
 
 TINY = {"manoeuvres": ("turn",), "seconds": 3.0, "days": 1, "replicates": 1}
 
@@ -42,6 +44,20 @@ def test_an_effect_is_named_by_its_class_or_by_what_covers_it(tmp_path):
     right = summary(finished(tmp_path / "a", verdict("slope", ["slope", "supply_sag"], 0.2, 0.1, 0.0)))
     wrong = summary(finished(tmp_path / "b", verdict("slope", ["slope"], 0.2, 0.1, 0.0)))
     assert right["loop"]["named"] and not wrong["loop"]["named"]
+
+
+@pytest.mark.quick
+def test_figures_of_several_runs_count_the_named_draws_and_keep_the_verdicts(tmp_path, monkeypatch):
+    kept = {}
+    monkeypatch.setattr(loop_figures, "record", lambda stem, claim, figures: kept.update(figures))
+    right = finished(tmp_path / "a", verdict("supply_sag", ["supply_sag"], 0.11, 0.03, 0.01))
+    wrong = finished(tmp_path / "b", verdict("slope", ["slope"], 0.11, 0.09, 0.01))
+    main(Options(collect=(right, wrong)))
+    assert kept["loop_named"]["value"] == 1 and kept["loop_named"]["named"] == [1.0, 0.0]
+    assert kept["loop_heldout_removed"]["repeats"] == pytest.approx([0.8, 0.2])
+    assert "loop_named_of_10" not in kept
+    with pytest.raises(OptionError, match="has no verdict"):
+        main(Options(collect=(tmp_path,)))
 
 
 @pytest.mark.quick
