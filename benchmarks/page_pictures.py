@@ -173,7 +173,7 @@ def fleet(out: Path, count: int = 12, steps: int = 150) -> None:
     from whill_mjx.vehicle.kinematics import reference_pose
 
     env, params = make_env("doorway", height=80, width=80)
-    chairs = make_batch(env, params, count=count, spread=0.2)
+    chairs = make_batch(env, params, count=count, spread=0.1)
     task = env.task
 
     def aim(state: Any) -> Any:
