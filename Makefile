@@ -1,4 +1,4 @@
-# Two commands: `make train` and `make test`. Both install everything they need into .venv first.
+# Two commands: `make train` and `make test`. Both install everything they need into .venv first. Others: CONTRIBUTING.md.
 PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint docs notebooks clean
+.PHONY: train test test-quick test-long lint coverage constraints release docs notebooks clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -66,5 +66,32 @@ docs: $(VENV)/.installed-docs
 notebooks: $(VENV)/.installed-docs
 	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
 
+# Lines and branches that the suite runs; a page in build/coverage.
+coverage: $(VENV)/.installed-dev
+	$(PIP) install -q -c constraints.txt pytest-cov
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+
+# Renew constraints.txt: the newest versions that pyproject.toml allows, for every Python of PYTHONS. Then run the tests.
+PYTHONS ?= python3.11 python3.12 python3.13
+constraints:
+	mkdir -p build/constraints
+	rm -f build/constraints/freeze-*
+	for python in $(PYTHONS); do \
+		version=$$($$python -c 'import sys; print("%d.%d" % sys.version_info[:2])') || exit 1; \
+		rm -rf build/constraints/venv && $$python -m venv build/constraints/venv || exit 1; \
+		echo "Python $$version: installing the newest versions."; \
+		build/constraints/venv/bin/pip install -q ".[dev$(COMMA)ros$(COMMA)docs]" pytest-cov || exit 1; \
+		build/constraints/venv/bin/pip freeze --exclude whill-mjx > build/constraints/freeze-$$version || exit 1; \
+	done
+	rm -rf build/constraints/venv
+	$(firstword $(PYTHONS)) .ci/constraints.py build/constraints/freeze-*
+	git diff --stat constraints.txt
+
+# Wheels and source archives in dist/, tried in clean environments of Python 3.11 to 3.13 (VERSIONS=3.12 for one).
+VERSIONS ?= 3.11 3.12 3.13
+release: $(VENV)/.installed-dev
+	$(PIP) install -q -c constraints.txt build
+	.ci/release $(BIN)/python $(VERSIONS)
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) build

@@ -21,7 +21,7 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
-from bridge.options import Parser, in_range, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
@@ -199,6 +199,7 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
     return table, safety, place
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Drive until all replicates are done, SIGTERM or Ctrl-C.
 

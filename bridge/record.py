@@ -22,7 +22,7 @@ from typing import IO, Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.options import Parser, in_range
+from bridge.options import Parser, ends_at_ctrl_c, in_range
 from bridge.streams import Stream
 
 COLUMNS = {
@@ -289,7 +289,7 @@ def is_running(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:
+    except (OSError, OverflowError):  # somebody else's, or no number that a process can have: left alone
         return True
     return True
 
@@ -356,6 +356,7 @@ def main_recover(dataset: Path) -> int:
     return 0
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Record until the time is over, SIGTERM or Ctrl-C.
 

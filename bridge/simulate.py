@@ -13,6 +13,7 @@ it stops, forgets, and no frame of an episode can reach the next one.
 import argparse
 import array
 import ast
+import contextlib
 import importlib
 import math
 import os
@@ -29,7 +30,7 @@ import numpy as np
 
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
-from bridge.options import Parser, in_range, result_file, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
 
 RESET_SILENCE = 0.5
 MATCHING = 0.3
@@ -570,19 +571,24 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Run the node until its episodes are over, SIGTERM or Ctrl-C; return 2 where an option is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
+    compiling: Any = contextlib.nullcontext()
     if options.simulator.startswith("bridge.simulate:"):  # others may abort with it
+        from whill_mjx.io.command_line import guarded
         from whill_mjx.processor import share_results
 
         share_results()
-    try:
-        vehicle = make_vehicle(options)
-    except (ValueError, FileNotFoundError) as error:
-        print(f"bridge.simulate: {error}", file=sys.stderr)
-        return 2
+        compiling = guarded("bridge.simulate: stopped")  # a signal ends it while XLA compiles, too
+    with compiling:
+        try:
+            vehicle = make_vehicle(options)
+        except (ValueError, FileNotFoundError) as error:
+            print(f"bridge.simulate: {error}", file=sys.stderr)
+            return 2
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
         try:

@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
@@ -200,7 +200,7 @@ def _env(options: Look) -> tuple[Env, VehicleParams]:
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
-    if ":" in options.scene:
+    if ":" in options.scene or options.scene.endswith(".py"):
         named_task(options.scene, "--scene")
     elif options.scene not in (*known, "all"):
         raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import POSITIVE, Range, listen, refusing, run
+from whill_mjx.io.command_line import POSITIVE, Range, listen, refusing, run, starts
 
-listen()
+if starts(__name__):
+    listen()
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from whill_mjx.io.folders import check_place, write_whole  # noqa: E402
-from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments  # noqa: E402
-from whill_mjx.world.maps.picture import from_above  # noqa: E402
+from whill_mjx.io.folders import check_place, write_whole
+from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments
+from whill_mjx.world.maps.picture import from_above
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision, shown_units
+from whill_mjx.io.fields import counted
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
@@ -63,6 +64,14 @@ def read_drives(
             groups += [(table.stem, [table]) for table in tables]
         else:
             groups.append((files[0].absolute().parent.name, tables))
+    return join_drives(source, groups, said, geometry, wheels)
+
+
+def join_drives(
+    source: Path, groups: Sequence[tuple[str, list[Table]]], said: Sequence[str], geometry: tuple[float, float],
+    wheels: bool = False,
+) -> list[TextDrive]:
+    """Drives of tables, by the name of each drive; otherwise as `read_drives`."""
     units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
     drives: list[TextDrive] = []
     agreed: list[str] = list(said)
@@ -99,7 +108,7 @@ def read_table(path: Path) -> Table:
         if len(row) != width:
             raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save it again.")
     if len(rows) < LEAST:
-        raise ValueError(f"{path}: {len(rows)} rows; at least {LEAST} are needed. Give the whole recording.")
+        raise ValueError(f"{path}: {counted(len(rows), 'row')}; at least {LEAST} are needed. Give the whole recording.")
     numbers = {}
     if header is None:
         header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
@@ -286,7 +295,7 @@ def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> 
     later = np.append(True, np.diff(found["t"]) > 1e-6) if len(found["t"]) else np.zeros(0, bool)
     found = {key: values[later] for key, values in found.items()}
     if len(found["t"]) < 2:
-        raise ValueError(f"{file}: {stream} has {len(found['t'])} rows without an empty cell; at least 2 are needed.")
+        raise ValueError(f"{file}: {stream} needs at least 2 rows without an empty cell, and has {len(found['t'])}.")
     if {"qx", "qy", "qz", "qw"} <= set(found):
         from sysid.logs.rosbag import yaw_of
 

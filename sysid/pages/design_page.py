@@ -40,6 +40,14 @@ def text(
     return "\n".join(lines)
 
 
+def meaning(chosen: Sequence[Plan], space: Space, before: np.ndarray) -> str:
+    """One sentence: what to drive, and what becomes of the parameter that is known worst."""
+    index = int(np.argmax(before))
+    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in chosen)
+    return (f"Drive {drives} next: the uncertainty of {space.names[index]}, the largest, shrinks from "
+            f"{before[index]:.1%} to {chosen[-1].deviation[index]:.1%} of its range.")
+
+
 def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
     """Parameters that no single candidate narrows well below their bounds."""
     best = np.min([plan.deviation for plan in plans], axis=0)
@@ -76,7 +84,8 @@ def write_page(
                 + table(["manoeuvre", "seconds", "sum of variances", "volume (log)"], ranking))]
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
-                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}")
+                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}", kind="Next drive",
+                     lead=meaning(chosen, space, before))
     write_text(path, page)
     return path
 

@@ -92,6 +92,8 @@ def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run
                  "Fisher information", "0.02000", "2 of 3", "figure_eight_1 (held out)",
                  "sysid sources SHA-256", "toy & <co>"):
         assert word in text, word
+    header = text.partition("</header>")[0]
+    assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and "m before the fit" in header
     report = read_report(run)
     assert report["dataset"]["sha256"] in text and report["code"]["sysid sources SHA-256"] in text
     assert not list(run.glob("*.tmp"))
@@ -171,8 +173,9 @@ def test_held_out_trials_and_other_manoeuvres_are_drawn_first():
 
 def test_text_is_escaped_and_titles_that_repeat_get_their_own_anchor():
     page = html_page("a < b", [Section("Same", table(["x"], [["<i>"], [Cell(0.5, "bad")], [None]])),
-                               Section("Same", "")])
+                               Section("Same", "")], kind="<b>", lead="x & <script>")
     check(page)
+    assert "<script>" not in page and "x &amp; &lt;script&gt;" in page and "&lt;b&gt;" in page
     assert "&lt;i&gt;" in page and 'class="n bad"' in page and page.count('id="same"') == 1
 
 
