@@ -187,7 +187,8 @@ def worlds(task: Task, out: Path) -> None:
         seen = render(position, rotation, lens, state.scene, 240, 240, Quality(antialias=True, shadows=True))
         return seen, top_view(env, state), state.scene.marker.position[:2]
 
-    shown, others = [], []  # those whose goal the view from above shows come first
+    shown: list[np.ndarray] = []  # their goal is in the view from above
+    others: list[np.ndarray] = []
     for seed in range(50):
         seen, above, goal = (np.asarray(one) for one in draw(jax.random.key(seed)))
         column = np.hstack([seen, above, np.full((240, 8, 3), 255, np.uint8)])
