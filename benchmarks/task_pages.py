@@ -162,7 +162,9 @@ def picture(name: str, out: Path) -> None:
     from whill_mjx.tasks.tasks import TASKS
 
     with tempfile.TemporaryDirectory() as folder:
-        task = dataclasses.replace(TASKS[name], map=_map(Path(folder))) if name == "map_goal" else TASKS[name]
+        task: Any = TASKS[name]
+        if name == "map_goal":
+            task = dataclasses.replace(task, map=_map(Path(folder)))
         worlds(task, out)
 
 
