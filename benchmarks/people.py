@@ -1,4 +1,4 @@
-"""Pedestrians beside recorded ones: speeds, flow, headways; and the cost of a map with people: `python -m benchmarks.people`.
+"""Pedestrians beside recorded ones, and the cost of a map with people: `python -m benchmarks.people`.
 
 The recordings are those of ../shared/data/pedestrians: a corridor with one direction and one with two. Simulated people
 enter at the recorded times and places, and walk to where the recorded ones left. Speed and time gap are fitted to the
@@ -232,8 +232,8 @@ def main(options: Options) -> None:
         times = headways(recorded), headways(simulated)
         headway[name] = largest_gap(*times)
         print(f"{name}: {len(recorded)} people; speeds {distance[name]:.3f} apart; headway median "
-              f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, {headway[name]:.3f} apart; "
-              f"flow " + ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items()), flush=True)  # fmt: skip
+              f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, {headway[name]:.3f} "
+              f"apart; flow " + ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items()), flush=True)  # fmt: skip
         figures[f"people_headway_ratio_{name}"] = figure([float(np.median(times[1]) / np.median(times[0]))], "ratio")
     path = record("environment", CLAIM, {
         "people_speed_distance": figure([max(distance.values())], "-"),
