@@ -233,7 +233,7 @@ def main(options: Options) -> None:
         headway[name] = largest_gap(*times)
         print(f"{name}: {len(recorded)} people; speeds {distance[name]:.3f} apart; headway median "
               f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, {headway[name]:.3f} "
-              f"apart; flow " + ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items()), flush=True)  # fmt: skip
+              "apart; flow " + ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items()), flush=True)
         figures[f"people_headway_ratio_{name}"] = figure([float(np.median(times[1]) / np.median(times[0]))], "ratio")
     path = record("environment", CLAIM, {
         "people_speed_distance": figure([max(distance.values())], "-"),

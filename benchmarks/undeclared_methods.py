@@ -192,12 +192,13 @@ class Naive:
             row = dict.fromkeys(self.NAMES, np.nan)
             shift = response_shift(trial, "odometry")
             if shift:
-                row["delay"] = np.mean([one.delay for one in shift.values()])
+                row["delay"] = float(np.mean([one.delay for one in shift.values()]))
             row |= {f"gain_{name}": one.gain for name, one in shift.items()}
             own, true = trial.odometry, trial.ground_truth
-            if own is not None and true is not None and own.yaw is not None:
-                paths = [np.hypot(np.diff(one.x[::10]), np.diff(one.y[::10])).sum() for one in (own, true)]
-                turns = [float(one.yaw[-1] - one.yaw[0]) for one in (own, true)]
+            if own is not None and true is not None:
+                poses = [one.values[:, :3] for one in (own, true)]  # each (T, 3) x, y [m], yaw [rad]
+                paths = [float(np.linalg.norm(np.diff(one[::10, :2], axis=0), axis=1).sum()) for one in poses]
+                turns = [float(one[-1, 2] - one[0, 2]) for one in poses]
                 if paths[1] > 1.0:
                     row["distance"] = paths[0] / paths[1]
                     row["drift"] = (turns[1] - turns[0]) / paths[1] if abs(turns[0]) < 0.5 else np.nan
