@@ -39,10 +39,11 @@ def scene_without_people(scene: Scene) -> Scene:
 
 def scene_with_people(scene: Scene, people: People, key: jax.Array) -> Scene:
     """A scene with people in it, seen, scanned and hit; those that it has already stay."""
-    if scene.people is not None:
+    there = scene.people
+    if there is not None:
         from whill_mjx.world.people.crowd import join
 
-        scene, people = scene_without_people(scene), join(scene.people, people)
+        scene, people = scene_without_people(scene), join(there, people)
     return dataclasses.replace(scene, solids=body.added(scene.solids, people, key), people=people)
 
 
