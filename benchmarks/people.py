@@ -222,7 +222,8 @@ def main(options: Options) -> None:
     if options.fit:
         search(options.recordings)
         return
-    distance, flow, headway, figures = {}, {}, {}, {}
+    distance, headway, figures = {}, {}, {}
+    flow: dict[str, float] = {}
     for name, recording in RECORDINGS.items():
         recorded = halves(read(options.recordings, recording))[1]
         simulated = simulator(recorded, recording.walls)(recording.speed, recording.spread, GAP)
