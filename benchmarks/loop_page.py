@@ -27,8 +27,21 @@ def write_page(out: Path, last_loop: Path, found: dict[str, Any]) -> Path:
     there = [(name, text) for name, text in PAGES if (out / name).exists()]
     sections.append(Section("All reports", links(there) if there else paragraph("None was written yet.")))
     path = out / "report.html"
-    write_whole(path, html_page("The loop over ROS 2", sections, str(out)))
+    write_whole(path, html_page("The loop over ROS 2", sections, str(out), kind="Loop over ROS 2", lead=meaning(found)))
     return path
+
+
+def meaning(found: dict[str, Any]) -> str:
+    """What came of the run, in one sentence."""
+    last = found.get("loop_again") or found.get("loop")
+    if last is None:
+        return "The loop was not closed yet."
+    names = " and ".join(effect["name"] for effect in last["effects"])
+    said = f"The loop named {names}" if names else f"The verdict is {last['verdict']}"
+    right = "which is what was built in" if last["named"] else "which is not what was built in"
+    gain = last["held_out_removed"]
+    removed = "" if gain is None else f"; it removed {100 * gain:.0f} % of the error on held-out drives"
+    return f"{said}, {right}{removed}."
 
 
 def stages(found: dict[str, Any]) -> str:

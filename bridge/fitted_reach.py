@@ -64,7 +64,7 @@ def simulate_reach(table: CommandTable, vehicle: Path, radius: float, count: int
             if "No module named" in lines[-1]:
                 raise ValueError(f"--vehicle-file {vehicle}: the simulator whill_mjx is not installed here. Check the "
                                  "manoeuvre on another computer with --check, or leave the option out.")
-            raise ValueError(f"--vehicle-file {vehicle}: {lines[-1]}")
+            raise ValueError(f"--vehicle-file {vehicle}: {lines[-1].removeprefix('error: ')}")
         return reach_of_paths(read_paths(out), radius)
 
 

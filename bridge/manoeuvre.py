@@ -75,7 +75,7 @@ class Player:
         if self.finished:
             return self._send(supervisor.tick(now))
         at = self.clock(now)
-        if at < self._due:
+        if at < self._due - 1e-6:  # stamps of simulated time are not exact sums of the period
             return None
         self._due = at + PERIOD if at - self._due > PERIOD else self._due + PERIOD
         self._rows += 1
@@ -130,6 +130,7 @@ class ManoeuvreNode(VehicleNode):
         """Take the simulated time, and send the row that is due."""
         self._simulated = seconds
         self._on_input(time.monotonic())
+        self._on_progress()
 
     def details(self) -> dict[str, Any]:
         """Return the progress of the manoeuvre."""

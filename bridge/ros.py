@@ -184,10 +184,15 @@ def uses_simulated_time(node: Any) -> bool:
 
 
 def subscribe_clock(node: Any, callback: Callable[[float], None]) -> None:
-    """Call with the seconds of each message on /clock."""
+    """Call with the seconds of each message on /clock, which the node's clock shows by then."""
+    from rclpy.time import Time
     from rosgraph_msgs.msg import Clock
 
-    node.create_subscription(Clock, "/clock", lambda message: callback(stamp_seconds(message.clock)), best_effort())
+    def heard(message: Any) -> None:
+        node.get_clock().set_ros_time_override(Time.from_msg(message.clock))  # its own reader may hear it later
+        callback(stamp_seconds(message.clock))
+
+    node.create_subscription(Clock, "/clock", heard, best_effort())
 
 
 def transform_publisher(node: Any) -> Callable[[str, str, Any, float, float, float], None]:

@@ -33,10 +33,11 @@ from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
 from bridge.options import Parser, in_range, result_file, whole
 
-STEP = 0.02
-"""Seconds between two messages on /clock; commands and reports are handled at these times."""
-DUE = 0.06
-"""Simulated seconds after a command at which the driver owes the next one."""
+STEP = 0.05
+"""Seconds between two messages on /clock, two reports, and two commands of a driver.
+
+A command counts from its stamp, and time waits for the command that is due. So the same manoeuvre is always the same
+commands."""
 PATIENCE = 1.0
 """Seconds of the wall clock that simulated time waits for it."""
 BEAT = 0.1
@@ -61,6 +62,7 @@ class RobotNode:
         ros.steady_timer(node, BEAT, lambda: self._e_stop.publish(Bool(data=False)))
         self._changed = threading.Condition()
         self._base = 1.0  # a stamp of 0 means none
+        self._steps = 0
         self._last = -math.inf
         self.stopping = False
         """Set to end `serve`."""
@@ -68,7 +70,7 @@ class RobotNode:
     @property
     def now(self) -> float:
         """Simulated seconds; they never go back."""
-        return self._base + self.plant.t
+        return self._base + self._steps * STEP
 
     def calls(self) -> Calls:
         """Return the calls of episode control."""
@@ -82,7 +84,7 @@ class RobotNode:
             x, y, yaw = (number(message, name, -1e3, 1e3) for name in ("x", "y", "yaw"))
             start = x, y, yaw
         with self._changed:
-            self._base, self._last = self.now, -math.inf
+            self._base, self._last, self._steps = self.now, -math.inf, 0
             self.plant.place(index, start)
             self._changed.notify()
         return {"episode": index, "stamp": stamp_of(self.now)}
@@ -95,7 +97,7 @@ class RobotNode:
         with self._changed:
             sent = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             # a message that was on its way for a step counts from when it was sent; other clocks do not matter
-            t = sent if self.now - 2 * STEP <= sent <= self.now else self.now
+            t = sent if self.now - 1.5 * STEP <= sent <= self.now + 1e-6 else self.now
             self._last = self.now
             self.plant.command(t - self._base, message.twist.linear.x, message.twist.angular.z)
             self._changed.notify()
@@ -107,11 +109,12 @@ class RobotNode:
             due = max(due, time.monotonic() - STEP) + STEP / self.speed
             with self._changed:
                 last, until = self._last, time.monotonic() + PATIENCE
-                while self._last == last and self.now - last > DUE - 1e-9 and not self.stopping:
+                while self._last == last and self.now - last > STEP - 1e-6 and not self.stopping:
                     if not self._changed.wait(max(until - time.monotonic(), 0.0)):
                         self._last = -math.inf
                         break
-                self.plant.advance(round(STEP / TICK))
+                self._steps += 1
+                self.plant.advance(round(self._steps * STEP / TICK) - round((self._steps - 1) * STEP / TICK))
                 reports = self.plant.reports()
             self._publish(*reports)
             time.sleep(max(due - time.monotonic(), 0.0))

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision, shown_units
-from whill_mjx.io.fields import counted
+from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LEAST = 10  # rows of a stream
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+LONGEST_NAME = 200  # characters
 DAY = 86400.0  # s
 PREAMBLE = 30  # lines above the names
 BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
@@ -136,6 +137,10 @@ def read_table(path: Path) -> Table:
     numbers = {}
     if header is None:
         header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
+    odd = next((name for name in header if not name.isprintable() or len(name) > LONGEST_NAME), None)
+    if odd is not None:
+        raise ValueError(f"{path}: column {shown(odd)}: a name has at most {LONGEST_NAME} printable characters. "
+                         "Correct it.")
     for k, name in enumerate(header):
         values = _numbers([row[k] for row in rows])
         if np.isfinite(values).sum() > 2 and name.strip() and name.strip() not in numbers:

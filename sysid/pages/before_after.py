@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
-from sysid.pages.svg import Line, line_chart
 from whill_mjx.io.html import charts, legend, table
+from whill_mjx.io.svg import Line, line_chart
 
 POINTS = 240  # of a drawn path
 SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise

@@ -10,8 +10,8 @@ import numpy as np
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
-from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from whill_mjx.io.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 
 REPLAYS = ("ideal", "initial", "fitted")
 REPLAY_WORDS = {"ideal": "a vehicle that follows its commands at once", "initial": "the model before the fit",

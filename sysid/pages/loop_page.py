@@ -11,8 +11,8 @@ from sysid.logs.log import Start
 from sysid.logs.metrics import METRICS, UNITS, integrate
 from sysid.pages.before_after import drive_pictures, drive_table
 from sysid.pages.loop_words import command_of, describe_unnamed, lead, not_determined, sentence, spoken, title, vehicles
-from sysid.pages.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
+from whill_mjx.io.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
 
 METRIC_WORDS = {"trajectory": "position", "yaw": "heading", "velocity": "speed", "angular_velocity": "turning rate"}

@@ -6,9 +6,11 @@ import json
 
 import pytest
 
+from benchmarks import loop_figures
 from benchmarks.loop import Options, main
 from benchmarks.loop_figures import removed, summary
 from benchmarks.loop_page import write_page
+from whill_mjx.io.command_line import OptionError
 
 TINY = {"manoeuvres": ("turn",), "seconds": 3.0, "days": 1, "replicates": 1}
 
@@ -45,6 +47,20 @@ def test_an_effect_is_named_by_its_class_or_by_what_covers_it(tmp_path):
 
 
 @pytest.mark.quick
+def test_figures_of_several_runs_count_the_named_draws_and_keep_the_verdicts(tmp_path, monkeypatch):
+    kept = {}
+    monkeypatch.setattr(loop_figures, "record", lambda stem, claim, figures: kept.update(figures))
+    right = finished(tmp_path / "a", verdict("supply_sag", ["supply_sag"], 0.11, 0.03, 0.01))
+    wrong = finished(tmp_path / "b", verdict("slope", ["slope"], 0.11, 0.09, 0.01))
+    main(Options(collect=(right, wrong)))
+    assert kept["loop_named"]["value"] == 1 and kept["loop_named"]["named"] == [1.0, 0.0]
+    assert kept["loop_heldout_removed"]["repeats"] == pytest.approx([0.8, 0.2])
+    assert "loop_named_of_10" not in kept
+    with pytest.raises(OptionError, match="has no verdict"):
+        main(Options(collect=(tmp_path,)))
+
+
+@pytest.mark.quick
 def test_the_page_shows_the_verdict_the_truth_and_both_errors(tmp_path):
     out = finished(tmp_path, verdict("supply_sag", ["supply_sag"], 0.2, 0.05, 0.01))
     page = write_page(out, out / "loop", summary(out)).read_text()
@@ -67,7 +83,10 @@ def test_a_day_is_driven_over_ros_recorded_exactly_and_not_driven_twice(tmp_path
     assert all(0.049 < b - a < 0.051 for a, b in zip(times, times[1:], strict=False)) and len(times) > 80
     with open(trial / "command.csv", newline="") as file:
         turns = [float(row["omega"]) for row in csv.DictReader(file)]
+        file.seek(0)
+        sent = [float(row["t"]) for row in csv.DictReader(file)]
     assert max(turns) > 0.6 and turns[0] == turns[-1] == 0
+    assert all(0.0499 < b - a < 0.0501 for a, b in zip(sent, sent[1:], strict=False))  # none late, none missing
     before = trial.stat().st_mtime_ns
     main(options)
     assert trial.stat().st_mtime_ns == before and capsys.readouterr().out.count("days ...") == 1

@@ -1,6 +1,7 @@
 """A point on a plane instead of a chair: its camera image is one colour that changes as it moves."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,6 +40,15 @@ class PointRobot:
         return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
                      odometry=(self.x, self.y, self.yaw, v, omega),
                      ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 10.0, 1.0]))
+
+
+class CrashingRobot(PointRobot):
+    """Meets a wall after half a second, whatever it is told."""
+
+    def step(self, v, omega):
+        frame = super().step(0.0, 0.0)
+        hit = self.steps >= 5
+        return replace(frame, collided=hit, done=hit, terminated=hit)
 
 
 class EndlessRobot(PointRobot):

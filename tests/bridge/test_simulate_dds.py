@@ -111,6 +111,26 @@ def test_best_effort_subscribers_are_served_too(graph):
     peer.wait_until(lambda _: min(map(len, heard)) >= 3)
 
 
+def test_chairs_in_namespaces_are_driven_apart(graph):
+    peer = graph.peer()
+    for side in ("left", "right"):
+        graph.start("simulate", "--simulator", "point_robot:RovingRobot", "--wait", 0, "--ros-args", "-r",
+                    f"__ns:=/{side}", key=side)
+    left, right = (listen(peer, "nav_msgs/Odometry", f"/{side}/whill/odom") for side in ("left", "right"))
+    scan = listen(peer, "sensor_msgs/LaserScan", "/right/sensing/lidar/scan")
+    publisher, make = peer.commander(0.5, "/left/whill/controller/cmd_vel")
+    peer.repeat(publisher, 0.05, make)
+    peer.wait_until(lambda _: left and left[-1].pose.pose.position.x > 0.3 and right and scan)
+    assert {message.pose.pose.position.x for message in right} == {0.0}
+
+
+def test_a_collision_is_published_once_and_taken_back_with_the_next_episode(graph):
+    peer = graph.peer()
+    graph.start("simulate", "--simulator", "point_robot:CrashingRobot", "--wait", 0)
+    heard = listen(peer, "std_msgs/Bool", "collision_sensor", latched())
+    peer.wait_until(lambda _: [one.data for one in heard][-4:] in ([True, False] * 2, [False, True] * 2))
+
+
 def test_simulated_time_runs_at_its_speed_pauses_and_stamps_the_messages(graph):
     peer = graph.peer()
     clock = listen(peer, "rosgraph_msgs/Clock", "/clock")
