@@ -1,12 +1,13 @@
-# Two commands: `make train` and `make test`. Both install everything they need into .venv first. Others: CONTRIBUTING.md.
+# `make train`, `make test` and `make loop` install everything they need into .venv first. Others: CONTRIBUTING.md.
 PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
+LOOP ?= runs/loop
 BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint coverage constraints release docs notebooks clean
+.PHONY: train loop test test-quick test-long lint docs notebooks coverage constraints release clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -43,6 +44,10 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
 
+# Drive, record, fit, find what is missing, drive again, train, drive: over ROS 2, on the contact plant.
+loop: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.loop --out $(LOOP)
+
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30
 
@@ -56,15 +61,6 @@ test-long: $(VENV)/.installed-dev
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy whill_mjx sysid dreamer bridge benchmarks
-
-# The site in build/site: every link and picture is checked, and a broken one fails.
-docs: $(VENV)/.installed-docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "Open build/site/index.html."
-
-# The tutorials as notebooks in build/notebooks.
-notebooks: $(VENV)/.installed-docs
-	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
 
 # Lines and branches that the suite runs; a page in build/coverage.
 coverage: $(VENV)/.installed-dev
@@ -92,6 +88,15 @@ VERSIONS ?= 3.11 3.12 3.13
 release: $(VENV)/.installed-dev
 	$(PIP) install -q -c constraints.txt build
 	.ci/release $(BIN)/python $(VERSIONS)
+
+# The site in build/site: every link and picture is checked, and a broken one fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/site/index.html."
+
+# The tutorials as notebooks in build/notebooks.
+notebooks: $(VENV)/.installed-docs
+	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
 
 clean:
 	rm -rf $(VENV) build

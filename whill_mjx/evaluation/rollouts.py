@@ -15,7 +15,8 @@ from whill_mjx.evaluation.conditions import Condition, begin_under, nominal, see
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
 from whill_mjx.vehicle.types import VehicleParams
-from whill_mjx.world.scene import Scene, clearance, footprint
+from whill_mjx.world.collision import free_distance
+from whill_mjx.world.scene import Scene, footprint
 
 CHANNELS = ("x", "y", "yaw", "v", "omega", "clearance", "v_command", "omega_command", "action_v", "action_omega")
 """What a trace holds of each control period; the command and the action are those that led to it."""
@@ -217,5 +218,5 @@ def _row(env: Env, state: State, action: jax.Array) -> jax.Array:
     """One row of a trace, in the order of CHANNELS."""
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
-    near = clearance(footprint(env.model.spec, x, y, yaw), state.scene.boxes)
+    near = free_distance(footprint(env.model.spec, x, y, yaw), state.scene)
     return jnp.stack([x, y, yaw, v, omega, near, state.command[0], state.command[1], action[0], action[1]])

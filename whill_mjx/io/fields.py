@@ -300,7 +300,7 @@ DATASET = (
 
 COLUMNS = {field.name: field for field in (
     Field("t", "s", -DAY, DAY, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
-                                      "divide milli- or nanoseconds."),
+                                      "divide milli-, micro- or nanoseconds."),
     Field("x", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("y", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),
@@ -334,6 +334,9 @@ TASK = (
     Field("step_reward", "-", -1e9, 1e9),
     Field("smoothness_gain", "s/rad", -1e9, 1e9),
     Field("layout", kind="text"),
+    Field("people", kind="whole", low=0, high=200, needed=False),
+    Field("people_within", "m", 0.5, 1e3, needed=False),
+    Field("yielding", "-", 0.0, 1.0, needed=False),
     Field("gates", kind="whole", low=0, high=2),
     Field("goal_x", "m", -1e3, 1e3),
     Field("gate_x", "m", -1e3, 1e3, kind="numbers", count=2),

@@ -104,7 +104,9 @@ class Stopper:
     def _good_before(self, env_steps: float) -> int:
         """Good evaluations in a row at the end of what an earlier start has logged: a resumed run ends alike."""
         path, good = self._out / "metrics.jsonl", 0
-        for _, line in read_lines(path) if self._success is not None else []:
+        if self._success is None:
+            return 0
+        for _, line in read_lines(path):
             if "eval/success" in line and line["env_steps"] < env_steps:
                 good = good + 1 if line["eval/success"] >= self._success else 0
         return good
