@@ -86,14 +86,22 @@ def met(scene, path):
     return jax.tree.map(lambda leaf: leaf[: len(path) - 1], drive(scene, path_to_end))
 
 
+@jax.jit
+def every_gap(rounds, poses):
+    def one(rounds, pose):
+        return distances(chair(*pose), from_above(rounds)).min()
+
+    return jax.vmap(one)(rounds, poses)
+
+
 def gaps(scenes, path):
-    """(T,) distance from the vehicle to the nearest capsule of a person."""
-    shapes = from_above(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), scenes.solids.rounds))
-    count = len(path)
-    shapes = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), shapes)
-    poses = [chair(*pose) for pose in path]
-    poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    return np.asarray(jax.vmap(distances)(poses, shapes).min(-1))
+    """(T,) m from the vehicle at each pose to the nearest capsule of a person."""
+    count, path = len(path), jnp.asarray(path, jnp.float32)
+    rounds, poses = jax.tree.map(
+        lambda leaf: jnp.pad(leaf[:count], ((0, STEPS - count), *[(0, 0)] * (leaf.ndim - 1)), mode="edge"),
+        (scenes.solids.rounds, path),
+    )
+    return np.asarray(every_gap(rounds, poses))[:count]
 
 
 def test_two_who_meet_pass_each_other_and_arrive():
