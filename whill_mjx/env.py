@@ -156,15 +156,9 @@ def make_env(
     check_task(task)
     spec, params = as_vehicle(vehicle)
     chosen = task.observations() if observations is None else observations
-    if looks is None:
-        looks = task.looks if task.randomised else "plain"
-    else:
+    if looks is not None:
         random_looks = photometric = None
-    if looks not in LOOKS:
-        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
-    if looks == "rich" and not task.lane:
-        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
-                         "'rich'.")
+    looks = _looks_of(task, looks)
     env = Env(
         build_model(spec),
         task,
@@ -177,6 +171,18 @@ def make_env(
         as_sensors(chosen, known_sensors()),
     )
     return env, params
+
+
+def _looks_of(task: Task, looks: str | None) -> str:
+    """The looks asked for, or the task's own; raises ValueError where there are none such."""
+    if looks is None:
+        looks = task.looks if task.randomised else "plain"
+    if looks not in LOOKS:
+        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
+    if looks == "rich" and not task.lane:
+        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
+                         "'rich'.")
+    return looks
 
 
 def as_vehicle(

@@ -16,9 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
@@ -243,7 +243,7 @@ def record(options: Look) -> int:
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
-    if ":" in options.scene:
+    if ":" in options.scene or options.scene.endswith(".py"):
         named_task(options.scene, "--scene")
     elif options.scene not in (*known, "all"):
         raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")

@@ -38,6 +38,7 @@ class World:
     """Scene and start of one episode."""
 
     scene: Scene
+    """Boxes, goal marker and looks."""
     start: jax.Array  # (3,) x [m], y [m], yaw [rad] of the driven-axle centre
 
 
@@ -101,10 +102,13 @@ class Task:
     goal_radius: float = 1.0
     """Distance of the driven-axle centre from the goal centre that counts as arrival [m]."""
     goal_reward: float = 100.0
+    """Reward of an arrival."""
     collision_reward: float = -50.0
+    """Reward of a collision."""
     progress_gain: float = 30.0
     """Reward per metre that the distance to the goal has shrunk."""
     step_reward: float = -0.05
+    """Reward of every control period."""
     smoothness_gain: float = 1.0
     """Reward lost per rad/s that the commanded yaw rate has changed."""
     layout: str = "randomised"
