@@ -22,6 +22,8 @@ from whill_mjx.tasks.corridor import Corridor
 from whill_mjx.tasks.follow import Follow
 from whill_mjx.tasks.terms import to_body
 from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.scene import no_boxes, stack_boxes
 
 quick, long = pytest.mark.quick, pytest.mark.long
 
@@ -159,3 +161,28 @@ def test_the_person_to_follow_is_the_goal(following):
     pose = jnp.stack(reference_pose(env.model, state.vehicle.qpos))
     np.testing.assert_allclose(obs["goal"], to_body(pose, state.scene.people.position[0]), atol=1e-5)
     assert float(state.goal_distance) == pytest.approx(float(jnp.hypot(*obs["goal"])), abs=1e-4)
+
+
+@long
+def test_rich_looks_show_the_walls_of_a_map_and_take_people():
+    segments = np.array([[[1.5, 0.5], [1.5, -0.5]], [[1.5, -0.5], [1.5, 0.5]]], np.float32)
+
+    @dataclasses.dataclass(frozen=True)
+    class Walled(Corridor):
+        def sample_world(self, key):
+            world = super().sample_world(key)
+            boxes = stack_boxes([world.scene.boxes, no_boxes(8)])
+            return dataclasses.replace(
+                world, scene=dataclasses.replace(world.scene, boxes=boxes, walls=map_walls(segments, 8))
+            )
+
+    env, params = make_env(Walled(people=2), looks="rich")
+
+    @jax.jit
+    def draw(key):
+        state = reset_state(env, params, key)
+        bare = dataclasses.replace(state, scene=dataclasses.replace(state.scene, walls=None))
+        return observe(env, state), observe(env, bare)
+
+    seen, bare = (np.asarray(image).astype(int) for image in draw(jax.random.key(2)))
+    assert (np.abs(seen - bare).sum(-1) > 10).mean() > 0.1
