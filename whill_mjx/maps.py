@@ -24,11 +24,14 @@ class Import:
     """Options of the command."""
 
     file: Path
-    """nav2 map (.yaml), OpenStreetMap (.osm) or CityGML (.gml)."""
+    """nav2 map (.yaml), OpenStreetMap (.osm), CityGML (.gml), point cloud (.ply, .pcd, .npy) or mesh of a building
+    (.stl, .glb, .gltf, .obj, .ply)."""
     out: Path = Path("scene")
     """Name of what is written: OUT.png, the map from above, and OUT.npz, its walls, starts and goals."""
     cell: Annotated[float, Range(0.02, 1.0)] = 0.1
-    """Edge of a cell of a city's footprints [m]."""
+    """Edge of a cell of footprints, point clouds and meshes [m]."""
+    scale: Annotated[float, Range(1e-6, 1e3)] = 1.0
+    """Metres per unit of a point cloud or a mesh; 0.001 for millimetres."""
     width: Annotated[float, POSITIVE] = 0.9
     """Narrowest passage that the vehicle uses [m]."""
     pixels: Annotated[int, Range(100, 8000)] = 1200
@@ -40,7 +43,7 @@ def main(options: Import) -> None:
     picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
     check_place("--out", picture)
     with refusing():
-        grid = read_map(options.file, options.cell)
+        grid = read_map(options.file, options.cell, options.scale)
         made = make_map_scene(grid, Reach(passing=options.width / 2))
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
     steps, places = len(wall_segments(grid)), made.places

@@ -29,7 +29,7 @@ def scene_of(boxes):
     return Scene(boxes, marker, default_looks())
 
 
-EMPTY = scene_of(no_boxes(1))
+EMPTY = scene_of(no_boxes(2))
 WALLED = scene_of(stack_boxes([
     box(0.0, 4.1, 8.4, 0.2, 2.0, jnp.ones(3)), box(0.0, -4.1, 8.4, 0.2, 2.0, jnp.ones(3)),
     box(4.1, 0.0, 0.2, 8.0, 2.0, jnp.ones(3)), box(-4.1, 0.0, 0.2, 8.0, 2.0, jnp.ones(3)),
@@ -86,14 +86,22 @@ def met(scene, path):
     return jax.tree.map(lambda leaf: leaf[: len(path) - 1], drive(scene, path_to_end))
 
 
+@jax.jit
+def every_gap(rounds, poses):
+    def one(rounds, pose):
+        return distances(chair(*pose), from_above(rounds)).min()
+
+    return jax.vmap(one)(rounds, poses)
+
+
 def gaps(scenes, path):
-    """(T,) distance from the vehicle to the nearest capsule of a person."""
-    shapes = from_above(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), scenes.solids.rounds))
-    count = len(path)
-    shapes = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), shapes)
-    poses = [chair(*pose) for pose in path]
-    poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    return np.asarray(jax.vmap(distances)(poses, shapes).min(-1))
+    """(T,) m from the vehicle at each pose to the nearest capsule of a person."""
+    count, path = len(path), jnp.asarray(path, jnp.float32)
+    rounds, poses = jax.tree.map(
+        lambda leaf: jnp.pad(leaf[:count], ((0, STEPS - count), *[(0, 0)] * (leaf.ndim - 1)), mode="edge"),
+        (scenes.solids.rounds, path),
+    )
+    return np.asarray(every_gap(rounds, poses))[:count]
 
 
 def test_two_who_meet_pass_each_other_and_arrive():
@@ -127,6 +135,7 @@ def test_people_stay_out_of_walls_and_boxes():
     assert float(gone.sum(0)[people.there].min()) > 5.0  # nobody is stuck
 
 
+@pytest.mark.long
 def test_people_begin_apart_from_one_another_and_from_the_vehicle():
     draw = jax.jit(jax.vmap(lambda key: in_sight(key, WALLED, jnp.zeros(3), Crowd(count=6, clear=1.5, within=3.0))))
     people = draw(jax.random.split(jax.random.key(0), 50))
@@ -199,7 +208,7 @@ def test_a_vehicle_may_leave_somebody_who_touches_it():
 def test_feet_are_a_step_apart_and_stay_above_the_ground():
     steps = walked(walker([0.0, 0.0], [50.0, 0.0], speed=1.3))
     steps = jax.tree.map(lambda leaf: leaf[:60], steps)
-    start, _ = jax.vmap(body.skeleton)(steps)
+    start, _ = jax.jit(jax.vmap(body.skeleton))(steps)
     ahead = start[:, 0, 0, 0] - start[:, 0, 1, 0]
     length = float(law.step_length(jnp.array(1.3)))
     assert length == pytest.approx(0.71, abs=0.01)  # Sekiya and Nagasaki: 110 steps a minute at 1.3 m/s
@@ -211,9 +220,10 @@ def test_feet_are_a_step_apart_and_stay_above_the_ground():
 def test_a_scan_meets_a_leg_where_it_is_drawn():
     scene = scene_with_people(EMPTY, walker([2.0, 0.0], [2.0, 5.0]), jax.random.key(0))
     angle = jnp.linspace(-0.4, 0.4, 401)
-    found = first_hits(scene, 0.0, 0.0, angle, 0.3)
+    scan = jax.jit(lambda height: first_hits(scene, 0.0, 0.0, angle, height))
+    found = scan(0.3)
     shapes = from_above(scene.solids.rounds)
     nearest = float(jnp.linalg.norm(shapes.start[:2], axis=-1).min())
     assert 1.6 < float(found.min()) < 2.0 and float(found.min()) < nearest + 0.1
-    high = first_hits(scene, 0.0, 0.0, angle, 1.1)
+    high = scan(1.1)
     assert float(high.min()) == pytest.approx(2.0 - 0.115 * float(scene.people.height[0]), abs=2e-3)

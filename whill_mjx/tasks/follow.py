@@ -15,7 +15,7 @@ from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import COMMON_SWEEPS, Budget, Task, World
 from whill_mjx.tasks.parts import OBSTACLES, make_marker, room
-from whill_mjx.tasks.terms import Moment
+from whill_mjx.tasks.terms import Moment, wrap
 from whill_mjx.world.people.contact import scene_with_people
 from whill_mjx.world.people.crowd import Crowd, people_on
 from whill_mjx.world.people.law import ARRIVED
@@ -25,6 +25,8 @@ ROOM, INSIDE = 6.0, 4.5
 """Half the edge of the room, and of the square that the person stays in [m]."""
 POINTS, LEG = 12, 1.5
 """Points of the person's way, and their distance [m]."""
+SHARPEST = 1.2
+"""Largest turn of the way at one of its points, where it would leave the square [rad]."""
 AHEAD, BESIDE = 1.5, 1.2
 """Where the person begins ahead of the vehicle, and how near to the way no pillar stands [m]."""
 
@@ -71,8 +73,9 @@ class Follow(Task):
         way = [place]
         for number in range(POINTS - 1):
             inwards = jnp.arctan2(-place[1], -place[0])
-            turn = draw(-0.8, 0.8, fixed=0.7 * math.sin(number))
-            heading = jnp.where(jnp.max(jnp.abs(place)) > INSIDE - LEG, inwards, heading) + turn
+            turn = draw(-0.7, 0.7, fixed=0.3 * math.sin(number))
+            back = jnp.clip(wrap(inwards - heading), -SHARPEST, SHARPEST)
+            heading = heading + jnp.where(jnp.max(jnp.abs(place)) > INSIDE - LEG, back, turn)
             place = jnp.clip(place + LEG * jnp.stack([jnp.cos(heading), jnp.sin(heading)]), -INSIDE, INSIDE)
             way.append(place)
         route = jnp.stack(way)

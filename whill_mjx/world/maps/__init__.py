@@ -3,6 +3,7 @@
 images      image files as grey levels
 nav2        nav2's YAML and image as an occupancy grid, by nav2's rule
 footprints  buildings of OpenStreetMap and CityGML as an occupancy grid
+surfaces    point clouds and meshes as an occupancy grid
 grid        occupancy grid, borders of the free space
 straight    long straight walls from the borders of cells
 field       distance to the nearest thing

@@ -16,6 +16,7 @@ from whill_mjx.world.maps.grid import GridMap
 from whill_mjx.world.maps.nav2 import load_map
 from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
+from whill_mjx.world.maps.surfaces import CLOUDS, MESHES, load_surfaces
 from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.scene import MapWalls, Marker, Scene, default_looks, no_boxes
 
@@ -38,14 +39,20 @@ class MapScene:
     places: Places
 
 
-def read_map(path: str | Path, cell: float = 0.1) -> GridMap:
-    """Occupancy grid of a map of any known kind, by the ending of its name; footprints get cells of `cell` [m]."""
+def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap:
+    """Occupancy grid of a map of any known kind, by the ending of its name.
+
+    Footprints, point clouds and meshes get cells of `cell` [m]; `scale` is metres per unit of the last two.
+    """
     ending = Path(path).suffix.lower()
+    if ending in (*CLOUDS, *MESHES):
+        return load_surfaces(path, cell, scale)
     if ending in (".osm", ".gml", ".xml"):
         return load_footprints(path, cell)
     if ending in (".yaml", ".yml"):
         return load_map(path)
-    raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml). Give one of them.")
+    raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml, "
+                     f"{', '.join(dict.fromkeys((*CLOUDS, *MESHES)))}). Give one of them.")
 
 
 def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, seed: int = 0) -> MapScene:

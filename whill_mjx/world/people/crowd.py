@@ -10,7 +10,7 @@ from flax import struct
 
 from whill_mjx.io.fields import Field, check_fields
 
-RADIUS = 0.2
+RADIUS = 0.16
 """Radius of a person on the ground plane, as others keep clear of it [m]. Source: Xu, Chraibi and Seyfried (2021)."""
 SPEED, SPEED_SPREAD = 1.34, 0.26
 """Mean and standard deviation of the speed at which people walk freely [m/s]. Source: Weidmann (1993)."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from whill_mjx.world.people.crowd import RADIUS, People
 
-STRENGTH, REACH = 8.0, 0.1
+STRENGTH, REACH = 3.0, 0.1
 """Strength [-] and range [m] of the repulsion between people (k and D of Eq. 3)."""
 ANTICIPATION, REACTION = 1.0, 0.3
 """Time over which people look ahead, and in which they turn [s] (t_a and tau)."""
@@ -28,7 +28,9 @@ BUFFER = 0.1
 PUSH = 0.3
 """Share of the direction that then leads away from the wall."""
 ASIDE = 0.02
-"""Least play between people who pass one another [m]."""
+"""Least play between people who stand one behind the other [m]."""
+SQUEEZE = 0.2
+"""Least distance sideways at which people pass one another: they turn their shoulders [m]."""
 STEP = 0.1
 """Longest step of the model [s]."""
 ARRIVED = 0.5
@@ -186,7 +188,7 @@ def _room_among_people(people: People, way: jax.Array) -> jax.Array:
     contact = 2 * RADIUS + ASIDE
     ahead = _dot(apart, way[:, None])
     aside = apart[..., 1] * way[:, None, 0] - apart[..., 0] * way[:, None, 1]
-    meets = (ahead >= 0.0) & (jnp.abs(aside) <= contact) & people.there & ~jnp.eye(ahead.shape[0], dtype=bool)
+    meets = (ahead >= 0.0) & (jnp.abs(aside) <= SQUEEZE) & people.there & ~jnp.eye(ahead.shape[0], dtype=bool)
     return jnp.min(jnp.where(meets, _length(apart) - contact, jnp.inf), -1, initial=jnp.inf)
 
 

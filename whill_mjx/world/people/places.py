@@ -36,7 +36,7 @@ def in_sight(key: jax.Array, scene: Scene, start: jax.Array, crowd: Crowd) -> Pe
     angle_key, far_key, way_key, key = jax.random.split(key, 4)
     tried = TRIES * crowd.count
     angle = jax.random.uniform(angle_key, (tried,), maxval=2 * jnp.pi)
-    free = jnp.minimum(first_hits(scene, start[0], start[1], angle, HEIGHT) - MARGIN, crowd.within)
+    free = _free(first_hits(scene, start[0], start[1], angle, HEIGHT), crowd.within)
     far = free * jnp.sqrt(jax.random.uniform(far_key, (tried,)))
     place = start[:2] + far[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
     chosen = chosen_apart(place, far >= crowd.clear, crowd.count)
@@ -44,11 +44,21 @@ def in_sight(key: jax.Array, scene: Scene, start: jax.Array, crowd: Crowd) -> Pe
 
     angles = jax.random.uniform(way_key, (crowd.count, RAYS), maxval=2 * jnp.pi)
     x, y = (jnp.repeat(begin[:, axis], RAYS) for axis in range(2))
-    reach = jnp.minimum(first_hits(scene, x, y, angles.ravel(), HEIGHT) - MARGIN, crowd.within).reshape(-1, RAYS)
+    reach = _free(first_hits(scene, x, y, angles.ravel(), HEIGHT).reshape(-1, RAYS), crowd.within)
     best = jnp.argmax(reach, -1)[:, None]
     angle, length = (jnp.take_along_axis(leaf, best, 1)[:, 0] for leaf in (angles, reach))
     end = begin + jnp.maximum(length, 0.0)[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
     return people_on(key, crowd, jnp.stack([begin, end], 1), jnp.zeros(crowd.count, jnp.int32), there)
+
+
+def _free(hit: jax.Array, within: float) -> jax.Array:
+    """(..., R) m to walk along rays whose first hits are given, none where a ray leaves the room.
+
+    A ray that meets nothing leaves it, unless no ray of these meets anything.
+    """
+    open_ = ~jnp.isfinite(hit)
+    leaves = open_ & ~jnp.all(open_, -1, keepdims=True)
+    return jnp.where(leaves, 0.0, jnp.minimum(hit - MARGIN, within))
 
 
 def chosen_apart(place: jax.Array, fits: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:

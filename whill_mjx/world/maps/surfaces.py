@@ -1,0 +1,232 @@
+"""Point clouds (.ply, .pcd, .npy) and meshes (.stl, .glb, .gltf, .obj, .ply) of a building as an occupancy grid.
+
+A cell is OCCUPIED where something stands between `STEP` and `HEADROOM` above the floor, FREE where there is floor, and
+UNKNOWN elsewhere. The floor is level. z points up, except in glTF, whose y does.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whill_mjx.io.reading import MB, read_bytes
+from whill_mjx.world.maps.grid import FREE, OCCUPIED, UNKNOWN, GridMap
+
+CLOUDS, MESHES = (".ply", ".pcd", ".npy"), (".stl", ".glb", ".gltf", ".obj", ".ply")
+BYTES, MOST_POINTS, MAX_CELLS = 400 * MB, 50 * MB, 50 * MB
+STEP, HEADROOM = 0.12, 1.5
+"""Heights above the floor between which things are in the way [m]."""
+LEVEL = 0.05
+"""Edge of a bin of heights, when the floor is sought [m]."""
+FLAT = 0.9
+"""Least upward part of a face's normal that makes it a floor."""
+SLICES = 0.1
+"""Distance of the planes that cut a mesh [m]."""
+HOLE = 0.5
+"""Gaps of the floor that are closed: lines of a scanner lie so far apart [m]."""
+MARGIN = 0.5
+"""Around everything [m]."""
+TYPES = {("F", 4): "f4", ("F", 8): "f8", ("U", 1): "u1", ("U", 2): "u2", ("U", 4): "u4", ("I", 1): "i1", ("I", 2): "i2",
+         ("I", 4): "i4", ("U", 8): "u8", ("I", 8): "i8"}  # fmt: skip
+
+
+def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0) -> GridMap:
+    """Occupancy grid of a point cloud or a mesh.
+
+    Args:
+        path: file; its ending says of which kind.
+        resolution: edge of a cell [m].
+        scale: metres per unit of the file.
+
+    Raises:
+        ValueError: no such file, another kind of content, too large, or no floor in it; names file and remedy.
+    """
+    path = Path(path)
+    try:
+        data = read_bytes(path, BYTES, "does not exist. Give a point cloud or a mesh.")
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from None
+    ending = path.suffix.lower()
+    try:
+        points, faces = _npy(data) if ending == ".npy" else _pcd(data) if ending == ".pcd" else _by_trimesh(path, data)
+    except Exception as error:  # whatever a library says of a damaged file
+        reason = str(error).strip().splitlines()
+        raise ValueError(f"{path}: cannot be read as {ending} ({type(error).__name__}: "
+                         f"{(reason or ['no reason given'])[0][:160].rstrip('.')}). Export it again.") from None
+    points = np.asarray(points, float)[:, :3] * scale
+    if faces is None:
+        points = points[np.isfinite(points).all(1)]
+    if len(points) < 10 or not np.isfinite(points).all():
+        raise ValueError(f"{path}: has {len(points)} points, or some that are not finite. Give another file.")
+    low, high = points[:, :2].min(0) - MARGIN, points[:, :2].max(0) + MARGIN
+    size = high - low
+    if len(points) > MOST_POINTS or np.prod(np.ceil(size / resolution)) > MAX_CELLS:
+        raise ValueError(f"{path}: spans {size[0]:.0f} x {size[1]:.0f} m. Correct --scale (metres per unit), or take "
+                         "larger cells (--cell).")
+    columns, rows = np.ceil(size / resolution).astype(int)
+    if faces is None:
+        floor, solid = _of_cloud(points, low, (rows, columns), resolution)
+    else:
+        floor, solid = _of_mesh(points, faces, low, (rows, columns), resolution)
+    if not (floor & ~solid).any():
+        raise ValueError(f"{path}: has no level floor within {size[0]:.1f} x {size[1]:.1f} m. Turn it so that z points "
+                         "up, and check --scale (metres per unit).")
+    cells = np.full((rows, columns), UNKNOWN, np.uint8)
+    cells[floor] = FREE
+    cells[solid] = OCCUPIED
+    return GridMap(cells, resolution, (float(low[0]), float(low[1]), 0.0))
+
+
+def _npy(data: bytes) -> tuple[np.ndarray, None]:
+    array = np.load(io.BytesIO(data), allow_pickle=False)
+    if array.ndim != 2 or array.shape[1] < 3 or not np.issubdtype(array.dtype, np.number):
+        raise ValueError(f"an array of {array.dtype} of shape {array.shape}; (N, 3) numbers are needed")
+    return array, None
+
+
+def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
+    """Corners and faces of a mesh, or the points of a cloud and None."""
+    import trimesh
+
+    kind = path.suffix.lower()[1:]
+    # A .gltf and an .obj name other files beside them.
+    if kind in ("gltf", "obj"):
+        loaded: Any = trimesh.load(path, process=False)
+    else:
+        loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False)
+    if isinstance(loaded, trimesh.Scene):
+        loaded = loaded.to_mesh() if loaded.geometry else None
+    if loaded is None:
+        raise ValueError("there is no geometry in it")
+    points = np.asarray(loaded.vertices, float)
+    if kind in ("glb", "gltf"):  # y is up
+        points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
+    faces = getattr(loaded, "faces", None)
+    return points, None if faces is None or not len(faces) else np.asarray(faces)
+
+
+def _pcd(data: bytes) -> tuple[np.ndarray, None]:
+    """Points of a PCD file of version 0.7: ascii, binary or binary_compressed."""
+    header: dict[str, list[str]] = {}
+    place = 0
+    while "DATA" not in header:
+        end = data.index(b"\n", place)
+        words = data[place:end].decode("ascii").split()
+        place = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
+    kinds = [TYPES[kind, int(size)] for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    number = int(header["POINTS"][0])
+    if not 0 <= number <= MOST_POINTS:
+        raise ValueError(f"it announces {number} points")
+    # Fields of padding share one name.
+    names = [f"{index}_{name}" for index, name in enumerate(header["FIELDS"])]
+    wanted = [names[header["FIELDS"].index(axis)] for axis in "xyz"]
+    if header["DATA"][0] == "ascii":
+        first = np.cumsum([0, *counts])
+        columns = [int(first[names.index(name)]) for name in wanted]
+        rows = np.loadtxt(io.BytesIO(data[place:]), ndmin=2, max_rows=number, usecols=columns)
+        return rows, None
+    dtype = np.dtype([(name, kind, (count,)) for name, kind, count in zip(names, kinds, counts, strict=True)])
+    if header["DATA"][0] == "binary":
+        table = np.frombuffer(data, dtype, number, place)
+        return np.stack([table[name][:, 0] for name in wanted], 1).astype(float), None
+    packed, unpacked = np.frombuffer(data, "<u4", 2, place)
+    raw = _lzf(data[place + 8 : place + 8 + packed], int(unpacked))
+    found, place = {}, 0
+    for name, kind, count in zip(names, kinds, counts, strict=True):  # field after field
+        size = number * count * np.dtype(kind).itemsize
+        found[name] = np.frombuffer(raw, kind, number * count, place).reshape(number, count)[:, 0]
+        place += size
+    return np.stack([found[name] for name in wanted], 1).astype(float), None
+
+
+def _lzf(data: bytes, size: int) -> bytes:
+    """Unpack LZF, as PCD files are packed."""
+    if size > 1000 * MB:
+        raise ValueError(f"it announces {size / MB:.0f} MB")
+    out, place = bytearray(), 0
+    while place < len(data):
+        control = data[place]
+        place += 1
+        if control < 32:
+            out += data[place : place + control + 1]
+            place += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += data[place]
+            place += 1
+        start = len(out) - ((control & 31) << 8) - data[place] - 1
+        place += 1
+        if start < 0:
+            raise ValueError("its packed data are damaged")
+        for index in range(start, start + length + 2):
+            out.append(out[index])
+    if len(out) != size:
+        raise ValueError("its packed data are damaged")
+    return bytes(out)
+
+
+def _of_cloud(points: np.ndarray, low: np.ndarray, shape: Any, resolution: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cells (rows, columns) that are floor, and those in which something stands."""
+    from scipy.ndimage import binary_closing
+
+    column, row = ((points[:, :2] - low) / resolution).astype(int).T
+    flat = row * shape[1] + column
+    order = np.lexsort((points[:, 2], flat))
+    first = order[np.flatnonzero(np.diff(flat[order], prepend=-1))]
+    level = _most_common(points[first, 2], np.ones(len(first)))  # most cells have their lowest point on the floor
+    above = points[:, 2] - level
+    floor, solid = np.zeros(shape, bool), np.zeros(shape, bool)
+    floor.ravel()[flat[np.abs(above) <= STEP]] = True
+    solid.ravel()[flat[(above > STEP) & (above < HEADROOM)]] = True
+    reach = max(1, round(HOLE / resolution / 2))
+    disc = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach + 0.5
+    return binary_closing(np.pad(floor, reach), disc)[reach:-reach, reach:-reach], solid
+
+
+def _of_mesh(
+    points: np.ndarray, faces: np.ndarray, low: np.ndarray, shape: Any, resolution: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells (rows, columns) that are floor, and those in which something stands."""
+    import cv2
+    import trimesh
+
+    corners = points[faces]  # (F, 3, 3)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1) / 2
+    up = normal[:, 2] > FLAT * 2 * np.maximum(area, 1e-12)
+    floor, solid = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    if not up.any():
+        return floor > 0, solid > 0
+    level = _most_common(corners[up, :, 2].mean(1), area[up])
+    ground = corners[up & (np.abs(corners[:, :, 2].mean(1) - level) <= STEP)]
+    for triangle in np.rint(((ground[:, :, :2] - low) / resolution - 0.5) * 256).astype(np.int32):
+        cv2.fillConvexPoly(floor, triangle, 1, shift=8)
+    heights = np.arange(STEP + SLICES / 2, HEADROOM, SLICES)
+    mesh = trimesh.Trimesh(points, faces, process=False)
+    cuts = trimesh.intersections.mesh_multiplane(mesh, [0.0, 0.0, level], [0.0, 0.0, 1.0], heights)
+    for lines, to_world in zip(cuts[0], cuts[1], strict=True):
+        if not len(lines):
+            continue
+        ends = lines.reshape(-1, 2)
+        ends = (to_world @ np.column_stack([ends, np.zeros(len(ends)), np.ones(len(ends))]).T).T[:, :2]
+        places = np.rint(((ends.reshape(-1, 2, 2) - low) / resolution - 0.5) * 256).astype(np.int32)
+        cv2.polylines(solid, list(places), False, 1, shift=8)
+    return floor > 0, solid > 0
+
+
+def _most_common(height: np.ndarray, weight: np.ndarray) -> float:
+    """The lowest height [m] at which at least half as much lies as at the commonest one: ceilings are above."""
+    lowest = height.min()
+    index = ((height - lowest) / LEVEL).astype(int)
+    amount = np.bincount(index, weight)
+    both = amount + np.append(amount[1:], 0.0)  # a floor may lie on the border of two bins
+    first = int(np.argmax(both >= 0.5 * both.max()))
+    chosen = (index == first) | (index == first + 1)
+    return float(np.average(height[chosen], weights=weight[chosen]))
