@@ -1,4 +1,4 @@
-# whill-mjx with JAX for CPUs, or for NVIDIA GPUs with --build-arg EXTRA=[cuda].
+# whill-mjx with JAX for CPUs, or for NVIDIA GPUs with --build-arg EXTRA=[cuda]. The tests check its files, and build no image.
 #
 #     docker build -t whill-mjx .
 #     docker run --rm -v "$PWD/runs:/work/runs" whill-mjx python -m whill_mjx.train --out runs/train

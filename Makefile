@@ -76,7 +76,7 @@ constraints:
 		version=$$($$python -c 'import sys; print("%d.%d" % sys.version_info[:2])') || exit 1; \
 		rm -rf build/constraints/venv && $$python -m venv build/constraints/venv || exit 1; \
 		echo "Python $$version: installing the newest versions."; \
-		build/constraints/venv/bin/pip install -q ".[dev$(COMMA)ros]" pytest-cov || exit 1; \
+		build/constraints/venv/bin/pip install -q ".[dev$(COMMA)ros$(COMMA)docs]" pytest-cov || exit 1; \
 		build/constraints/venv/bin/pip freeze --exclude whill-mjx > build/constraints/freeze-$$version || exit 1; \
 	done
 	rm -rf build/constraints/venv

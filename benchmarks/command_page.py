@@ -14,7 +14,8 @@ PACKAGES = {"whill_mjx": "Simulator and training", "sysid": "Identification", "b
 MORE = {
     "whill_mjx.train": "training.md", "whill_mjx.evaluate": "evaluate.md", "whill_mjx.maps": "maps.md",
     "whill_mjx.look": "tutorials/1_look_and_drive.md", "whill_mjx.drive": "tutorials/1_look_and_drive.md",
-    "whill_mjx.export_mjcf": "howto/export.md", "sysid.fit": "fit.md", "sysid.close_loop": "close_loop.md",
+    "whill_mjx.export_mjcf": "howto/export.md", "whill_mjx.export_python": "howto/export.md",
+    "whill_mjx.view": "view.md", "sysid.fit": "fit.md", "sysid.close_loop": "close_loop.md",
     "sysid.inspect": "sysid_tools.md#inspect", "sysid.convert": "sysid_tools.md#convert",
     "sysid.design": "sysid_tools.md#design", "sysid.report": "sysid_tools.md#report",
     "sysid.paper": "sysid_tools.md#the-papers-experiment", "sysid.searches": "sysid_tools.md#which-search",

@@ -9,8 +9,8 @@ of the named effect alone: the rest is gained by base parameters that moved besi
 each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
 asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one, and what is held out
-of them is predicted by the reference vehicle with that change alone. `halves` of the asphalt run against one another
-say how often that is false. `mrclam` (five nearly ideal robots): verdicts with
+of them is predicted by the reference vehicle with that change alone. `floors` asks the same of gyro and wheels without
+a model, and of halves of one run how often that is false. `mrclam` (five nearly ideal robots): verdicts with
 the base model's delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
@@ -35,6 +35,7 @@ from benchmarks.harness import figure, record
 from benchmarks.measured_laws import ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
+from sysid.logs.floor import BLOCKS, Measured, in_blocks, sums_of
 from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
@@ -43,6 +44,8 @@ from sysid.logs.pose_lag import pose_lag
 from sysid.missing.catalogue import PARAMETER
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
+from sysid.verdict.floor import FloorChange, compared
+from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import prepare, reference_for
@@ -57,6 +60,7 @@ from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
 HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.667-1", "sand": "warthog_sand_2"}
+OTHER_RUNS = ("warthog_2023", "husky_steps_000_133")
 ROBOTS = (1, 2, 3, 4, 5)
 BLOCK = 5  # steps that follow one another and are drawn together
 DRAWS = 4000
@@ -77,8 +81,8 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/measured."""
-    parts: tuple[Literal["ladder", "laws", "peers", "change", "mrclam"], ...] = (
-        "ladder", "laws", "peers", "change", "mrclam")
+    parts: tuple[Literal["ladder", "laws", "peers", "floors", "change", "mrclam"], ...] = (
+        "ladder", "laws", "peers", "floors", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
     windows: Annotated[int, COUNT] = 96
@@ -89,8 +93,6 @@ class Benchmark:
     """Loops at most, one after the other."""
     physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
-    halves: Annotated[int, NOT_NEGATIVE] = 10
-    """Ways to cut the asphalt run into two halves, of ten, that `change` judges against one another."""
     quick: bool = False
     """Loops of `change` with fewer iterations and nulls."""
 
@@ -303,7 +305,48 @@ def mean_errors(stem: str, rows: dict[str, list[float]]) -> dict[str, Any]:
     return {f"{stem}_position": figure([position], "m"), f"{stem}_yaw": figure([yaw], "rad")}
 
 
-def floors(settings: Benchmark) -> Prepared:
+def floors(settings: Benchmark) -> None:
+    """What the gyro and the wheels alone say of the floor: gravel and both sand runs against asphalt, and halves of
+    each run against one another, ten cuts in turn (its tenths are consecutive)."""
+    folder, alpha = settings.shared / "data" / "measured" / "drive_norlab", Thresholds().alpha
+    sums = {run: [one for trial in load_drive(folder, (run,), chained=True).trials if (one := sums_of(trial))]
+            for run in (*RUNS, *OTHER_RUNS)}
+    asphalt = in_blocks(sums[RUNS[0]])
+    figures: dict[str, Any] = {}
+    named: list[bool] = []
+    for run in RUNS[1:]:
+        found = between(asphalt, in_blocks(sums[run]), alpha)
+        print(f"{run}: {found.said() or 'the same floor'}; class {', '.join(found.classes)}", flush=True)
+        named.append(found.named)
+        stem = f"floor_{run.removeprefix('warthog_')}"
+        figures[f"{stem}_p"] = figure([found.p], "-")
+        for member in found.members:
+            key = f"{stem}_{member.quantity.name.replace(' ', '_').replace(chr(39), '')}"
+            figures[key] = figure([member.after], member.quantity.unit)
+    figures["floor_named"] = figure([float(sum(named))], f"of {len(named)} runs")
+    false = {run: 0 for run in sums}
+    for run, each in sums.items():
+        for cut in range(10):
+            second = (10 * np.arange(len(each)) // len(each) - cut) % 10 >= 5
+            first, other = (in_blocks([one for one, inside in zip(each, second == side, strict=True) if inside])
+                            for side in (False, True))
+            false[run] += between(first, other, alpha).named
+    print(f"halves of one run taken for two floors, of 10: {false}", flush=True)
+    figures["floor_false_asphalt"] = figure([float(false[RUNS[0]])], "of 10 halves of the asphalt run")
+    figures["floor_false"] = figure([float(sum(false.values()))], f"of {10 * len(false)} halves of {len(false)} runs")
+    show(figures)
+    record("measured", CLAIM, figures, replacing="floor_")
+
+
+def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> FloorChange:
+    """The change of floor from one set of blocks to another."""
+    assert theirs is not None and mine is not None
+    found = compared(theirs, mine, 2 * (BLOCKS - 1), alpha)
+    assert found is not None
+    return found
+
+
+def asphalt_vehicle(settings: Benchmark) -> Prepared:
     """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
     config = change_config(settings)
     asphalt = drive_log(settings, ("asphalt",))
@@ -341,8 +384,8 @@ def one_change(settings: Benchmark, name: str, log: Log, ready: Callable[[], Pre
 
 
 def change(settings: Benchmark) -> None:
-    """What changed from asphalt to gravel and to the two sand runs, and from one half of the asphalt to the other."""
-    ready = lru_cache(maxsize=1)(partial(floors, settings))
+    """What changed from asphalt to gravel and to the two sand runs."""
+    ready = lru_cache(maxsize=1)(partial(asphalt_vehicle, settings))
     figures: dict[str, Any] = {}
     named = 0
     for name in ("warthog_gravel", "warthog_sand_1", "warthog_sand_2"):
@@ -358,9 +401,6 @@ def change(settings: Benchmark) -> None:
         sure = figures[f"changed_{short}_position_gain_low"]["value"] > 0
         named += bool(loop["floor"] and loop["floor"]["name"]) and sure
     figures["changed_named"] = figure([float(named)], "of 3 runs")
-    if settings.halves:
-        false = [halves(settings, number) for number in range(settings.halves)]
-        figures["changed_false"] = figure([float(sum(false))], f"of {settings.halves} halves of the asphalt run")
     show(figures)
     record("measured", CLAIM, figures, replacing="changed_")
 
@@ -369,23 +409,6 @@ def run_log(settings: Benchmark, run: str) -> Log:
     """Steps of one run, its last third held out."""
     log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", (run,), chained=True)
     return thin(without_lost(split(log, (f"{run}:0-0.667",), (f"{run}:0.667-1",))), settings.windows)
-
-
-def halves(settings: Benchmark, number: int) -> bool:
-    """Whether anything is named of one half of the asphalt run against the other: five of its ten tenths, in turn."""
-    name = f"asphalt_half_{number}"
-    done = kept(settings, name)
-    if done is None:
-        run = "warthog_asphalt_a"
-        log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", (run,), chained=True)
-        log = without_lost(split(log, (run,), ()))
-        tenth = {trial.name: 10 * i // len(log.trials) for i, trial in enumerate(log.trials)}
-        first = log.select(lambda trial: (tenth[trial.name] - number) % 10 < 5)
-        second = log.select(lambda trial: (tenth[trial.name] - number) % 10 >= 5)
-        config = change_config(settings)
-        done = keep(settings, name, verdict_of(find_missing(second, (first,), config, start=floor_start(first))))
-    report([done])
-    return done["verdict"] == "named" or bool(done["floor"] and done["floor"]["name"])
 
 
 def is_false(loop: dict[str, Any], fastest: float) -> bool:
@@ -437,7 +460,7 @@ def report(loops: list[dict[str, Any]]) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"ladder": ladder, "laws": laws, "peers": peers, "change": change, "mrclam": mrclam}
+    parts = {"ladder": ladder, "laws": laws, "peers": peers, "floors": floors, "change": change, "mrclam": mrclam}
     for name in settings.parts:
         part, folder = parts[name], "mrclam" if name == "mrclam" else "drive_norlab"
         if not (settings.shared / "data" / "measured" / folder).is_dir():

@@ -144,7 +144,7 @@ def naming(out: Path) -> None:
     one = random.chisquare(1, 4000)
     best = random.chisquare(1, (4000, 50)).max(1)
     figure, axes = plt.subplots(figsize=(7.4, 3.2), constrained_layout=True)
-    bins = np.linspace(0, 32, 81)
+    bins = np.linspace(0, 32, 81).tolist()
     axes.hist(one, bins, density=True, color="0.75", label="one effect, chosen beforehand")
     axes.hist(best, bins, density=True, color="tab:blue", alpha=0.7, label="the best of 50 effects")
     limit = np.quantile(best, 0.995)
@@ -170,11 +170,12 @@ def fleet(out: Path, count: int = 12, steps: int = 150) -> None:
 
     from whill_mjx import make_batch, make_env
     from whill_mjx.look import top_view
+    from whill_mjx.tasks.doorway import Doorway
     from whill_mjx.vehicle.kinematics import reference_pose
 
-    env, params = make_env("doorway", height=80, width=80)
-    chairs = make_batch(env, params, count=count, spread=0.2)
-    task = env.task
+    env, params = make_env(Doorway(), height=80, width=80)
+    chairs = make_batch(env, params, count=count, spread=0.1)
+    task = Doorway()
 
     def aim(state: Any) -> Any:
         """Action towards the door, through it, and on to the marker."""

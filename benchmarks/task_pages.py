@@ -20,7 +20,6 @@ from whill_mjx.io.folders import write_whole
 from whill_mjx.tasks.base import Task
 
 DOCS = Path(__file__).parent.parent / "docs"
-NAMES = ("obstacle_course", "corridor", "point_goal", "map_goal", "doorway", "docking")
 TERMS = {
     "goal": "{goal_reward:g} in the period in which the vehicle arrives",
     "collision": "{collision_reward:g} in the period in which it touches something",
@@ -28,6 +27,8 @@ TERMS = {
     "time": "{step_reward:g} in every control period",
     "smoothness": "-{smoothness_gain:g} for each rad/s by which the commanded yaw rate changed",
     "alignment": "-{alignment_gain:g} per rad off the dock's direction, in every period within 1 m of the dock",
+    "distance": "{near_reward:g} in every period at the best distance from the person, {keep:g} m; less elsewhere",
+    "lost": "{collision_reward:g} in the period in which the person is lost",
 }
 """What a term of the reward pays, by its name."""
 ENDINGS = {
@@ -35,10 +36,22 @@ ENDINGS = {
     "success": "the driven-axle centre is within {goal_radius:g} m of the goal",
     "timeout": "{max_steps} control periods ({seconds:g} s) are over; the episode is *truncated*",
     "diverged": "the physics failed; this never counts as a success",
+    "lost": "the person is more than {lost_at:g} m away",
 }
-DOCKED = "the vehicle stands within {goal_radius:g} m of the dock and {heading_tolerance:g} rad of its direction"
+SUCCESS = {
+    "docking": "the vehicle stands within {goal_radius:g} m of the dock and {heading_tolerance:g} rad of its direction",
+    "follow": "the person has stopped at the end of their way, and the vehicle is within {goal_radius:g} m",
+}
+"""Where success is something else than to be near the goal."""
 LIMITS = ("v_min", "v_max", "omega_max", "max_steps", "goal_radius", "goal_reward", "collision_reward",
           "progress_gain", "step_reward", "smoothness_gain")  # fmt: skip
+
+
+def names() -> list[str]:
+    """Names of the tasks of this package."""
+    from whill_mjx.tasks.tasks import TASKS
+
+    return sorted(name for name in TASKS if type(TASKS[name]).__module__.startswith("whill_mjx."))
 
 
 def field_texts(kind: type) -> dict[str, str]:
@@ -88,7 +101,8 @@ def terms_of(task: Task) -> tuple[list[str], list[str]]:
     from whill_mjx.tasks.base import Task as Base
     from whill_mjx.tasks.check import _moment
 
-    moment = _moment(jax.eval_shape(Base().sample_world, jax.random.key(0)))
+    source = Base() if task.name == "map_goal" else task  # without a map there is no world
+    moment = _moment(jax.eval_shape(source.sample_world, jax.random.key(0)))
     return [*jax.eval_shape(task.rewards, moment)], [*jax.eval_shape(task.endings, moment)]
 
 
@@ -100,7 +114,7 @@ def page(name: str) -> str:
     kind, fields = type(task), {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
     words = {**fields, "seconds": task.max_steps / 10}
     rewards, endings = terms_of(task)
-    said = {**ENDINGS, "success": DOCKED if name == "docking" else ENDINGS["success"]}
+    said = {**ENDINGS, "success": SUCCESS.get(name, ENDINGS["success"])}
     texts = field_texts(kind)
     own = [field for field in fields if field not in LIMITS and field in texts and field != "action_repeat"]
     gym = "".join(part.title() for part in name.split("_"))
@@ -148,7 +162,9 @@ def picture(name: str, out: Path) -> None:
     from whill_mjx.tasks.tasks import TASKS
 
     with tempfile.TemporaryDirectory() as folder:
-        task = dataclasses.replace(TASKS[name], map=_map(Path(folder))) if name == "map_goal" else TASKS[name]
+        task: Any = TASKS[name]
+        if name == "map_goal":
+            task = dataclasses.replace(task, map=_map(Path(folder)))
         worlds(task, out)
 
 
@@ -173,12 +189,13 @@ def worlds(task: Task, out: Path) -> None:
         seen = render(position, rotation, lens, state.scene, 240, 240, Quality(antialias=True, shadows=True))
         return seen, top_view(env, state), state.scene.marker.position[:2]
 
-    columns: list[np.ndarray] = []
+    shown: list[np.ndarray] = []  # their goal is in the view from above
+    others: list[np.ndarray] = []
     for seed in range(50):
         seen, above, goal = (np.asarray(one) for one in draw(jax.random.key(seed)))
-        if len(columns) < 3 and 1.0 < goal[0] < 6.5 and abs(goal[1]) < 2.0:  # what the view from above shows
-            columns.append(np.hstack([seen, above, np.full((240, 8, 3), 255, np.uint8)]))
-    sheet = np.hstack(columns)[:, :-8, ::-1]
+        column = np.hstack([seen, above, np.full((240, 8, 3), 255, np.uint8)])
+        (shown if 1.0 < goal[0] < 6.5 and abs(goal[1]) < 2.0 else others).append(column)
+    sheet = np.hstack([*shown, *others][:3])[:, :-8, ::-1]
     cv2.imwrite(str(out), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}")
 
@@ -208,7 +225,7 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=("page", "picture"))
-    parser.add_argument("--tasks", nargs="+", choices=NAMES, default=NAMES, help="only these")
+    parser.add_argument("--tasks", nargs="+", choices=names(), default=names(), help="only these")
     given = parser.parse_args()
     for name in given.tasks:
         if given.what == "page":

@@ -33,6 +33,14 @@ TUTORIALS = ROOT / "docs" / "tutorials"
 NUMBERED = "[0-9]_*.md"
 BLOCK = re.compile(r"((?:^<!--.*?-->\n)*)^```(python|sh)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
+KERNEL = """---
+jupyter:
+  kernelspec: {name: python3, display_name: Python 3, language: python}
+---
+
+"""
+"""Head of a notebook's text: else jupytext takes the language of most blocks, which may be sh."""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -177,7 +185,7 @@ def notebook_text(page: Path) -> str:
     )
     home = "```python\n%cd ../..\n```\n"  # the pages count from the root of the repository
     title, _, rest = text.partition("\n")
-    return f"{title}\n\n{home}{rest}"
+    return f"{KERNEL}{title}\n\n{home}{rest}"
 
 
 def write_notebooks(out: Path) -> list[Path]:
@@ -192,7 +200,6 @@ def write_notebooks(out: Path) -> list[Path]:
     written = []
     for page in pages():
         notebook = jupytext.reads(notebook_text(page), fmt="md")
-        notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
         path = out / f"{page.stem}.ipynb"
         jupytext.write(notebook, path)
         written.append(path)

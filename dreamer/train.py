@@ -366,7 +366,7 @@ def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
         return
     try:
         begun = json.loads(path.read_text())["seed"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return  # the checkpoint has the configuration, and its keys those of the seed
     asked = seed if isinstance(seed, int) else list(seed)
     if begun != asked:

@@ -31,8 +31,7 @@ from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
-SCRIPTS = ("next_1.csv", "next_2.csv", "next_3.csv")
-OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "inspect.html", *SCRIPTS)
+OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "next_1.csv", "next_2.csv", "next_3.csv", "inspect.html")
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,12 @@ def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDr
     from sysid.pages.report import write_report
     from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv, write_text
 
-    paths = [folder / name for name in (*OUTPUTS[:4], *SCRIPTS[: len(drives)])]
+    paths = [folder / name for name in (*OUTPUTS[: 3 + len(drives)], OUTPUTS[-1])]
     write_text(paths[0], text(found) + "\n")
     write_report(paths[1], {**stamp("sysid-inspection"), **found})
     write_plot(paths[2], log, found)
-    write_page(paths[3], found, paths[2])
-    for path, drive in zip(paths[4:], drives, strict=True):
+    write_page(paths[-1], found, paths[2])
+    for path, drive in zip(paths[3:-1], drives, strict=True):
         write_csv(path, COMMAND_HEADER, drive.command.table)
     return paths
 
@@ -127,7 +126,7 @@ def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDriv
     found = inspect(log)
     drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max, config.radius)
     found["next_drives"] = [
-        {"file": SCRIPTS[k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
+        {"file": OUTPUTS[3 + k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
          "v": float(np.abs(one.command.v).max()), "omega": float(np.abs(one.command.omega).max()),
          "floor": list(one.floor), "radius": one.radius, "drive_it": f"python -m bridge.manoeuvre "
          f"{(config.out or Path()) / OUTPUTS[3 + k]} --space {config.space[0]:g} {config.space[1]:g} "

@@ -35,7 +35,8 @@ def callables():
         if inspect.isclass(thing):
             for name, member in vars(thing).items():
                 function = getattr(member, "__func__", getattr(member, "fget", member))
-                if not name.startswith("_") and inspect.isfunction(function):
+                field = name in getattr(thing, "__dataclass_fields__", {})  # a function as its default
+                if not name.startswith("_") and not field and inspect.isfunction(function):
                     yield f"{label}.{name}", function, inspect.getdoc(member) or ""
         elif inspect.isfunction(thing):
             yield label, thing, inspect.getdoc(thing) or ""

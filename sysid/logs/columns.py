@@ -55,7 +55,8 @@ QUANTITY_WORDS = {
           "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
 }
-TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime")
+TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime", "date", "datetime",
+              "uhrzeit", "datum")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
 SAID = "as said"  # why a column has its role where somebody gave no unit

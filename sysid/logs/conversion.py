@@ -121,16 +121,17 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if lerobot.is_lerobot(config.source):
         episodes = lerobot.read(config.source)
         spec = _spec(config, episodes.spec)
-        found = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
+        found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
                             (spec.wheel_radius, spec.track), config.input == "wheels")
         drives, said, fields = _text_drives(found, config)
-        notes, more = [*episodes.notes, *said], more | fields
+        notes, more = [*episodes.notes, *left, *said], more | fields
         held_out = held_out or (() if (config.out / "dataset.toml").exists() else episodes.held_out)
     elif not bags and not is_known(config.source) and text_files(config.source):
         spec = _spec(config)
-        drives, notes, fields = _text_drives(read_drives(
-            config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels"), config)
-        more |= fields
+        found, left = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track),
+                                  config.input == "wheels")
+        drives, said, fields = _text_drives(found, config)
+        notes, more = [*left, *said], more | fields
     elif bags:
         spec = _spec(config)
         wheels = config.input == "wheels"

@@ -24,7 +24,8 @@ import numpy as np
 
 from sysid.logs.columns import Table
 from sysid.logs.log import Log, OdometryStream, PoseStream, Trial, command_in_force, read_fields, spec_from_fields
-from whill_mjx.io.reading import read_json
+from whill_mjx.io.fields import shown
+from whill_mjx.io.reading import LONGEST_REASON, read_json
 from whill_mjx.logs.dataset import write_fields, write_json
 from whill_mjx.vehicle.specs import VehicleSpec
 
@@ -41,6 +42,7 @@ FEATURES = {
     "observation.ground_truth": ("ground_truth", ("x [m]", "y [m]", "yaw [rad]")),
 }
 """Feature -> stream and names of its parts, as they are written."""
+WIDEST = 10_000  # numbers of a feature in a row
 NEEDED = "{what} needs the package pyarrow, for its parquet files. Install it: pip install 'whill-mjx[lerobot]'."
 AGAIN = "Record or download the dataset again."
 
@@ -70,6 +72,14 @@ def read(path: Path) -> Episodes:
         ValueError: naming the file, the rule and the remedy; also where pyarrow is not installed.
     """
     pq = _parquet(f"{path}: reading a LeRobotDataset")
+    try:
+        return _read(pq, path)
+    except (KeyError, IndexError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {str(error)[:LONGEST_REASON]}"
+        raise ValueError(f"{path}: {INFO} and the files beside it do not go together ({reason}). {AGAIN}") from None
+
+
+def _read(pq: Any, path: Path) -> Episodes:
     info = read_json(path / INFO, "missing.", AGAIN)
     parts = _parts(path, info)
     files = sorted((path / "data").glob("*/*.parquet"))
@@ -170,6 +180,9 @@ def _parts(path: Path, info: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
         shape = list(about.get("shape") or [1])
         if about.get("dtype") not in NUMBERS or len(shape) != 1 or name in COUNTERS:
             continue
+        if not isinstance(shape[0], int) or not 0 < shape[0] <= WIDEST:
+            raise ValueError(f"{path / INFO}: the shape of {shown(name)} is {shown(shape)}; at most {WIDEST} numbers "
+                             f"are read. {AGAIN}")
         names = about.get("names")
         if isinstance(names, dict):  # {"motors": [...]} of version 2
             lists = [one for one in names.values() if isinstance(one, list)]
@@ -212,7 +225,7 @@ def _task_names(pq: Any, path: Path) -> dict[int, str]:
         try:
             rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
             return {int(row["task_index"]): str(row["task"]) for row in rows}
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, RecursionError):
             raise ValueError(f"{file}: is no list of tasks. {AGAIN}") from None
     return {}
 
@@ -230,8 +243,9 @@ def _trial_names(pq: Any, path: Path) -> dict[int, str]:
 def _held_out(info: Mapping[str, Any], numbers: Sequence[int]) -> set[int]:
     """Episodes of splits that are not for training; none where there is no other split."""
     splits = info.get("splits")
-    ranges = {name: match for name, text in splits.items() if (match := re.fullmatch(r"(\d+):(\d+)", str(text)))} if (
-        isinstance(splits, dict)) else {}
+    texts = splits if isinstance(splits, dict) else {}
+    ranges = {name: match for name, text in texts.items()
+              if (match := re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)))}  # fmt: skip
     return {number for name, match in ranges.items() if name != "train" and "train" in ranges
             for number in numbers if int(match[1]) <= number < int(match[2])}
 

@@ -37,10 +37,6 @@ LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
 WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
 BLOCK = "block"
 """Field of a log that is one part of a long run."""
-MIDDLE = 0.907
-"""Median of chi squared with seven degrees of freedom, over these: of the variances of eight blocks."""
-LEAST_SCALE = 0.1
-"""Least share of `ASSUMED_SPREAD` that blocks of one run may bring it down to."""
 LEAST_DRAWN = 24
 """Drives that are simulated, at least, to show the noise that a vehicle file states."""
 
@@ -93,7 +89,7 @@ def make_reference(
         drives = drives.weighted(at, factors, spec.track)
         whitener = fit_whitener(left, drives.mask)
     blocks = all(BLOCK in log.fields for log in logs)
-    spread, remark = _spread(space, u, days, known, blocks)
+    spread, remark = _spread(space, u, days, known)
     leftovers = tuple(Leftover(trial, int(day[i]), left[i], drives.mask[i]) for i, trial in enumerate(trials))
     if known:
         whitener = fit_whitener(np.stack([one.series - expected_without(leftovers, one) for one in leftovers]),
@@ -198,14 +194,8 @@ def _of_gyro(space: Space) -> np.ndarray:
     return np.array([name.startswith("gyro_bias.") for name in space.names], bool)
 
 
-def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool, blocks: bool = False
-            ) -> tuple[np.ndarray, str]:
-    """Covariance of a new day's parameters and what it rests on.
-
-    Args:
-        blocks: the days are parts of one run. Then only the proportions of the assumed spread are kept, and their
-            common size is what the blocks show: half of the parameters wander by less.
-    """
+def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool) -> tuple[np.ndarray, str]:
+    """Covariance of a new day's parameters and what it rests on."""
     if not known:
         return np.diag(np.where(_of_gyro(space), expected_sd(space), WEAK_PRIOR) ** 2), (
             "no reference drives: base parameters are free, so effects that they imitate (mass, track, scrub, "
@@ -217,11 +207,5 @@ def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool, blocks: 
     centred = days - days.mean(0)
     covariance = centred.T @ centred
     count = len(days) - 1
-    if blocks:
-        ratio = float(np.median(np.diag(covariance) / count / np.diag(assumed))) / MIDDLE
-        scale = float(np.clip(np.sqrt(ratio), LEAST_SCALE, 1.0))
-        mixed = (ASSUMED_DAYS * scale**2 * assumed + covariance) / (ASSUMED_DAYS + count) * (1 + 1 / len(days))
-        return mixed, (f"spread from {len(days)} blocks of one run, with {scale * ASSUMED_SPREAD:.1%} of the values as "
-                       "prior: other days may differ by more")
     mixed = (ASSUMED_DAYS * assumed + covariance) / (ASSUMED_DAYS + count) * (1 + 1 / len(days))
     return mixed, f"day-to-day spread from {len(days)} reference days, with {ASSUMED_SPREAD:.0%} of the values as prior"

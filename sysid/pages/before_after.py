@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
-from sysid.pages.series import TrialSeries
-from sysid.pages.svg import Line, line_chart
 from whill_mjx.io.html import charts, legend, table
+from whill_mjx.io.svg import Line, line_chart
 
 POINTS = 240  # of a drawn path
 SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
@@ -45,19 +44,6 @@ def replayed_paths(trials: Sequence[Trial], replays: Mapping[str, Sequence[Predi
             measured = _path(trial, channel)
             assert measured is not None
             found.append(Paths(trial.name, trial.held_out, channel, getattr(trial, channel).t, measured, paths))
-    return found
-
-
-def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[Paths]:
-    """Paths of trials of a fit whose position was measured."""
-    found = []
-    for trial in series:
-        channel = next((name for name in CHANNEL_WORDS if name in trial.channels and np.isfinite(
-            trial.channels[name].values["measured"][:, :3]).all()), None)
-        if channel is not None:
-            one = trial.channels[channel]
-            found.append(Paths(trial.name, trial.held_out, channel, one.t, one.values["measured"][:, :3],
-                               {name: one.values[name][:, :3] for name in replays}))
     return found
 
 

@@ -12,8 +12,8 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
-from sysid.pages.svg import PALETTE, Line, line_chart
 from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
+from whill_mjx.io.svg import PALETTE, Line, line_chart
 from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed

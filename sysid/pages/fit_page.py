@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
-from sysid.pages.before_after import drive_pictures, drive_table, series_paths, shown_drive
+from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
-from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from whill_mjx.io.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 
 REPLAYS = ("ideal", "initial", "fitted")
 REPLAY_WORDS = {"ideal": "a vehicle that follows its commands at once", "initial": "the model before the fit",
@@ -98,6 +98,19 @@ def lead(report: dict[str, Any]) -> list[str]:
     else:
         third = "Nothing that was fitted is left open."
     return [headline(report), second, third]
+
+
+def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[Paths]:
+    """Paths of trials of a fit whose position was measured."""
+    found = []
+    for trial in series:
+        channel = next((name for name in CHANNEL_NAMES if name in trial.channels and np.isfinite(
+            trial.channels[name].values["measured"][:, :3]).all()), None)
+        if channel is not None:
+            one = trial.channels[channel]
+            found.append(Paths(trial.name, trial.held_out, channel, one.t, one.values["measured"][:, :3],
+                               {name: one.values[name][:, :3] for name in replays}))
+    return found
 
 
 def _is_limit(note: str) -> bool:

@@ -56,14 +56,11 @@ def blind(found: dict[str, Any]) -> str:
 
 def next_drives(drives: list[dict[str, Any]]) -> str:
     """The proposed drives and their files."""
-    rows = []
-    for one in drives:
-        (length, width), (x, y, yaw) = one["length_width"], one["start"]
-        rows.append([one["file"], one["manoeuvre"].replace("_", " "), one["why"], one["seconds"], one["v"],
-                     one["omega"], f"{length:.1f} x {width:.1f}", f"{x:.1f}, {y:.1f} m, {np.rad2deg(yaw):.0f}°"])
-    header = ["file", "manoeuvre", "why", "time [s]", "to v [m/s]", "to omega [rad/s]", "room [m]", "start"]
-    return table(header, rows) + (
-        paragraph("Commands are ramped and stay within the room. Keep a hand on the stop.", "dim"))
+    rows = [[one["file"], one["manoeuvre"].replace("_", " "), one["why"], one["seconds"], one["v"], one["omega"]]
+            for one in drives]
+    header = ["file", "manoeuvre", "why", "time [s]", "to v [m/s]", "to omega [rad/s]"]
+    return table(header, rows) + paragraph("Commands are ramped and stay within the room; inspect.txt says where to "
+                                           "start. Keep a hand on the stop.", "dim")
 
 
 def streams(found: dict[str, Any]) -> str:

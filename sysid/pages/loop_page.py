@@ -11,8 +11,8 @@ from sysid.logs.log import Start
 from sysid.logs.metrics import METRICS, UNITS, integrate
 from sysid.pages.before_after import drive_pictures, drive_table
 from sysid.pages.loop_words import command_of, describe_unnamed, lead, not_determined, sentence, spoken, title, vehicles
-from sysid.pages.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
+from whill_mjx.io.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
 
 METRIC_WORDS = {"trajectory": "position", "yaw": "heading", "velocity": "speed", "angular_velocity": "turning rate"}
@@ -28,8 +28,6 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections = [Section("What was found", found(report))]
     if report["effects"]:
         sections.append(Section("How large it is", effects(report)))
-    if report["verdict"] != "named":
-        sections.append(Section("What these drives would have shown", detectable(report)))
     if report["next_manoeuvre"] is not None:
         sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
     sections += [Section("All drives", errors(report)), Section("Each manoeuvre", by_manoeuvre(report))]
@@ -39,6 +37,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
         sections.append(Section("A force without a name", wrench(report["unnamed"])))
     if report["effects"]:
         sections.append(Section("Evidence", evidence(report)))
+    if report["verdict"] != "named":
+        sections.append(Section("What these drives would have shown", detectable(report)))
     page = html_page(title(report), sections, f"{report['dataset']['name']}, {report['dataset']['vehicle']}",
                      kind="Missing effect", lead=lead(report)[0])
     write_text(out / "report.html", page)
@@ -150,11 +150,11 @@ def errors(report: dict[str, Any]) -> str:
         if rows:
             only = ["effect alone"] if report["alone"] is not None else []
             short = {"before": "as it was", "refitted": "refitted", "after": "with the effect"}
-            parts.append(table(["usual error", *(short[key] for key in names), *only, "repeats differ by", "better in"],
-                               rows, words))
+            header = ["usual error", *(short[key] for key in names), *only, "repeats differ by", "not worse in"]
+            parts.append(table(header, rows, words))
     parts.append(paragraph("Usual error: root mean square over a drive, averaged over drives. As it was: nothing has "
-                           "moved. Refitted: base parameters moved within their day-to-day spread. Effect alone: that "
-                           "vehicle with the effect, and nothing else moved for it. With the effect: both together. "
+                           "moved. Refitted: base parameters moved, held by their day-to-day spread. Effect alone: "
+                           "that vehicle with the effect, and nothing else moved for it. With the effect: both. "
                            "Repeats: no prediction can be better than two repeats of one drive agree.", "dim"))
     return "".join(parts)
 
@@ -221,8 +221,8 @@ def wrench(one: dict[str, Any]) -> str:
 
 def detectable(report: dict[str, Any]) -> str:
     """Smallest sizes."""
-    return table(["effect", "parameter", "smallest size with 80 % power", "unit", "noticed on simulated days"],
-                 [[one["effect"], one["parameter"], one["value"] if one["value"] is not None else "not visible",
-                   one["unit"], "" if one["power"] is None else f"{one['power']:.0%}"] for one in report["detectable"]])
-
-
+    return table(["effect", "parameter", "smallest size that shows", "unit", "noticed on simulated days"],
+                 [[spoken(one["effect"]), spoken(one["parameter"].partition(".")[2]),
+                   one["value"] if one["value"] is not None else "not visible", one["unit"],
+                   "" if one["power"] is None else f"{one['power']:.0%}"] for one in report["detectable"]],
+                 "Each effect in the size in which drives like these show it on four of five days")

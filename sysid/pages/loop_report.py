@@ -86,7 +86,7 @@ from sysid.missing.days import Reference
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.unexplained import held_back_gains
 from sysid.pages.before_after import replayed_paths, shown_drive
-from sysid.pages.loop_words import describe_unnamed, lead, not_determined, sentence, title
+from sysid.pages.loop_words import FAR, describe_unnamed, lead, not_determined, sentence, title
 from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
@@ -384,7 +384,7 @@ def base_table(result: Result) -> list[dict[str, Any]]:
                                              for name in space.names)]
 
 
-def shifts(rows: list[dict[str, Any]], least: float = 2.0) -> list[str]:
+def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
     """Base parameters that the last refit moved by more than so many day-to-day spreads, in words, furthest first."""
     far = sorted((row for row in rows if abs(row["away"]) > least), key=lambda row: -abs(row["away"]))
     return [f"{row['name']} {row['reference']:.4g} -> {row['after']:.4g} {row['unit']} ({row['away']:+.1f} spreads)"

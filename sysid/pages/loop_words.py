@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +11,7 @@ from sysid.logs.manoeuvre_library import make_command
 
 DEGREES = {"rad": "degrees", "rad/s": "degrees/s", "rad/s^2": "degrees/s^2"}
 LISTED = 4  # names in a sentence
+FAR = 2.0  # day-to-day spreads, beyond which a refit went further than days do
 
 
 def title(report: Mapping[str, Any]) -> str:
@@ -89,7 +89,9 @@ def prediction(report: Mapping[str, Any]) -> str:
 
 def vehicles(report: Mapping[str, Any]) -> dict[str, str]:
     """The vehicles that are compared, by their key in the report: what each is called."""
-    found = {"before": "the vehicle as it was", "refitted": "refitted within its day-to-day spread"}
+    far = any(abs(row["before"] - row["reference"]) > FAR * row["spread"] for row in report.get("base", ()))
+    found = {"before": "the vehicle as it was",
+             "refitted": "refitted to these drives" if far else "refitted within its day-to-day spread"}
     if not report.get("known", True):
         found = {"before": "the model, fitted to short motions", "refitted": "the model, fitted to whole paths"}
     if report["verdict"] == "named":
@@ -154,8 +156,8 @@ def _found(report: Mapping[str, Any]) -> str:
     if report["verdict"] == "named":
         texts = []
         for one in report["effects"]:
-            law = next((part.strip(" .") for part in one["equation"].replace("`", "").split(": ") if not re.search(
-                r"->|[=*^]", part)), "")
+            known = [p for p in one["parameters"].values() if not _may_be_none(p)] or list(one["parameters"].values())
+            law = known[0].get("description") or ""
             texts.append(f"{spoken(one['name'])}" + (f" ({law[0].lower()}{law[1:]})" if law else ""))
         return f"What explains these drives is {' and '.join(texts)}."
     where = [one["quantity"] for one in report["lives_in"][:2]]

@@ -14,9 +14,9 @@ from sysid.logs.log import Log
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
-from sysid.pages.svg import COLOURS, line_chart, replay_line
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
+from whill_mjx.io.svg import COLOURS, line_chart, replay_line
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 

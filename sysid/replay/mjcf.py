@@ -27,8 +27,21 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import SIZES, Entry, Robot, Size, default_paths, load_robot, resolve, sizes_of, write_mjcf
+from sysid.replay.mjcf_file import (
+    SIZES,
+    Entry,
+    Robot,
+    Size,
+    default_paths,
+    drive_entries,
+    load_robot,
+    resolve,
+    sizes_of,
+    turning_inertia,
+    write_mjcf,
+)
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+from sysid.replay.robot_check import rolling_ratio
 from sysid.replay.robot_drive import RobotDrive
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
@@ -78,15 +91,17 @@ def mjcf_model(
     Raises:
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
-    robot = load_robot(Path(path), wheels, wheel_radius, track, timestep)
+    robot = load_robot(Path(path), wheels, wheel_radius, track, timestep, regulated=calibrate)
     host, names = robot.host, default_paths(robot) if parameters is None else tuple(parameters)
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry | Size] = {}
-    sizes = sizes_of(robot)
+    sizes = sizes_of(robot, rolling_ratio(robot) if calibrate else 1.0)
+    drive = dict[str, tuple[Entry, float, float, float]]()
     if calibrate:
-        # An added servo is stiff: how a real one lags is in the delay and the limit of acceleration around the robot. A
-        # soft one would fall short of its target. Where wheels slip in every turn, the track has no part of its own.
+        # Where wheels slip in every turn, the track has no part of its own.
+        drive = drive_entries(robot)
         names = (*(one for one in names if not (robot.added and one.startswith("actuator."))),
+                 *drive, turning_inertia(robot),
                  *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
                  *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
     if robot.motors:
@@ -97,6 +112,10 @@ def mjcf_model(
         if name == "drive.kp" and robot.motors:
             low, high = given or bounds[name][1:3]
             bounds[name] = ((low * high) ** 0.5, low, high, "N m s/rad")
+            continue
+        if name in drive:
+            entries[name], value, low, high = drive[name]
+            bounds[name] = (value, low, high, entries[name].unit)
             continue
         if name in sizes:
             entries[name] = size = sizes[name]
@@ -143,7 +162,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
     blank = mjx.make_data(nominal)
     float_type = jnp.result_type(float)
     point, ahead = jnp.asarray(robot.point, float_type), jnp.asarray(robot.forward, float_type)
-    rest = jnp.asarray(robot.rest, float_type)
+    rest, activation = jnp.asarray(robot.rest, float_type), jnp.asarray(robot.activation, float_type)
     sign, wheels = jnp.asarray(robot.sign, float_type), np.array(robot.wheels)
 
     def with_values(params: Parameters) -> Any:
@@ -183,7 +202,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
         rate = _rotate(inverse, jnp.stack([0 * v, 0 * v, omega]))
         qvel = qvel.at[speed : speed + 3].set(velocity).at[speed + 3 : speed + 6].set(rate)
         qvel = qvel.at[wheels].set(sign * wheel_speeds(v, omega))
-        return Motion(qpos, qvel, jnp.zeros(host.na, float_type), jnp.zeros(host.nv, float_type))
+        return Motion(qpos, qvel, activation, jnp.zeros(host.nv, float_type))
 
     def substep(params: Parameters, state: Motion, command: jax.Array) -> Motion:
         if shares_results() and _may_abort(host):
@@ -193,6 +212,8 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
         if robot.motors:
             target = params.values["drive.kp"] * (target - state.qvel[wheels])
         ctrl = jnp.zeros(host.nu, float_type).at[np.array(robot.actuators)].set(target)
+        if robot.integrals:
+            ctrl = ctrl.at[np.array(robot.integrals)].set(sign * wheel_speeds(command[0], command[1]))
         data = blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warm, ctrl=ctrl)
         data = mjx.step(with_values(params), data)
         return Motion(data.qpos, data.qvel, data.act, data.qacc_warmstart)

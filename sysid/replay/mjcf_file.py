@@ -25,14 +25,21 @@ STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels cre
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
-THIN = 0.02  # of its radius: half the width of a wheel that rolls on its middle
+FIRM_TIME, FIRM, ALONE = [0.01, 1.0], [0.99, 0.99, 0.001, 0.5, 2.0], 1e3
+"""solref, solimp and solmix of wheels that a file says nothing of. With MuJoCo's own, one of 33 mm sinks by 0.4 mm, and
+rolls as if its radius were 0.6 % smaller."""
+URDF_STEP = 0.0025  # s; a URDF states none
+WATER = 1000.0  # kg/m^3, of a link without a mass, as MuJoCo has it
 DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 SKID_SHARE = 1.0
-"""The same where wheels skid in every turn. MuJoCo finds contact forces for a wheel that turns freely: one that its
-servo holds pulls too little along beside what it resists sideways, the less so the heavier it is by itself."""
-ROTOR_SHARE = 0.05  # of the inertia that it speeds up, which a wheel with such a servo has at least by itself
-SERVO_STEPS = 2  # the least number of timesteps in that time
+"""The same where wheels skid in every turn: heavy ones hold their speed while their contacts find how they slide."""
+ROTOR_SHARE = 0.25
+"""Of the inertia that it speeds up, which a wheel with such a servo has at least by itself: geared motors have as much.
+MuJoCo finds contact forces as if wheels turned freely. With a servo that is integrated implicitly it then moves a
+vehicle up to 90 ms ahead of its wheels, so the servo's torque is explicit, and a wheel that slips must be heavy."""
+LAGGING = 10.0  # 1/s^2, integral gain over the load of a wheel with which a controller starts: it takes half a second
+STRONG = 30.0  # m/s^2, acceleration at the limit of a drive whose limit is not known
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 FIELDS = {  # KIND, FIELD -> array of the model, column, unit
     ("body", "mass"): ("body_mass", None, "kg"),
@@ -45,11 +52,17 @@ FIELDS = {  # KIND, FIELD -> array of the model, column, unit
     ("joint", "armature"): ("dof_armature", None, "kg m^2"),
     ("joint", "frictionloss"): ("dof_frictionloss", None, "N m"),
     ("joint", "stiffness"): ("jnt_stiffness", None, "N m/rad"),
+    ("joint", "force_limit"): ("jnt_actfrcrange", 1, "N m"),
     ("actuator", "gain"): ("actuator_gainprm", 0, "-"),
     ("actuator", "force_limit"): ("actuator_forcerange", 1, "N m"),
 }
 KINDS = {"body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM, "joint": mujoco.mjtObj.mjOBJ_JOINT,
          "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR}
+
+
+PREFIXES = {"body": "body", "geom": "geom", "dof": "joint", "jnt": "joint", "actuator": "actuator"}
+"""Of arrays, and the KIND of what their rows are."""
+LIMITS = ("actuator_forcerange", "jnt_actfrcrange")  # the same either way
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,11 @@ class Entry:
     """Of the elements that the path names."""
     servo: tuple[int, ...] = ()
     """Columns of actuator_biasprm with which a servo pulls back what its gain pulls."""
+
+    @property
+    def kind(self) -> str:
+        """KIND of what it changes."""
+        return PREFIXES[self.array.partition("_")[0]]
 
     def read(self, model: Any) -> float:
         """Its value, of the first element."""
@@ -87,7 +105,10 @@ class Entry:
         if self.array == "body_mass":
             scale = (value / model.body_mass[rows])[:, None]
             found["body_inertia"] = put(model.body_inertia, None, model.body_inertia[rows] * scale)
-        if self.array == "actuator_forcerange":
+        if self.array == "body_inertia" and self.path.endswith(".inertia"):
+            scale = (value / model.body_inertia[rows, self.column])[:, None]
+            found[self.array] = put(model.body_inertia, None, model.body_inertia[rows] * scale)
+        if self.array in LIMITS:
             found[self.array] = put(found[self.array], 0, -value)
         for column in self.servo:
             found["actuator_biasprm"] = put(found.get("actuator_biasprm", model.actuator_biasprm), column, -value)
@@ -106,6 +127,8 @@ class Size:
     geoms: tuple[tuple[int, ...], ...]
     """Of each wheel, those on the left first."""
     bodies: tuple[int, ...]
+    rolling: float
+    """Radius on which a wheel rolls over that of its geom: contacts are soft, and wheels sink [-]."""
     along: tuple[np.ndarray, ...]
     """(3,) in the frames of the wheels' parents: a wheel that grows rises, a track that grows moves it outwards."""
 
@@ -121,7 +144,7 @@ class Size:
             return {"body_pos": place}
         size, reach = model.geom_size, model.geom_rbound  # beyond its reach a geom meets nothing
         for sign, geoms in zip(signs, self.geoms, strict=True):
-            factor = value / self.nominal if self.path == "wheels.radius" else 1 + sign * half
+            factor = value / self.nominal / self.rolling if self.path == "wheels.radius" else 1 + sign * half
             for geom in geoms:
                 reach = _added(reach, geom, abs(factor - 1) * size[geom, 0])
                 size = _added(size, (geom, 0), (factor - 1) * size[geom, 0])
@@ -177,6 +200,25 @@ class Robot:
     """Between the driven wheels, as the file says [m]."""
     notes: tuple[str, ...] = ()
     """What was left out of the file."""
+    integrals: tuple[int, ...] = ()
+    """Actuators that take the same targets and pull by how far their wheels lag behind; none, or one for each wheel."""
+    spin: float = 0.0
+    """Inertia of a driven wheel, motor included [kg m^2]."""
+    load: float = 0.0
+    """Inertia that it speeds up, its share of the vehicle's included [kg m^2]."""
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Those of the driven wheels."""
+        return tuple(int(self.host.dof_jntid[wheel]) for wheel in self.wheels)
+
+    @property
+    def activation(self) -> np.ndarray:
+        """(na,) of actuators with a memory, at rest: no wheel lags behind."""
+        found = np.zeros(self.host.na)
+        for one, joint in zip(self.integrals, self.joints, strict=False):
+            found[self.host.actuator_actadr[one]] = self.rest[self.host.jnt_qposadr[joint]]
+        return found
 
     @property
     def sides(self) -> np.ndarray:
@@ -186,16 +228,20 @@ class Robot:
 
 def load_robot(
     path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None, track: float | None = None,
-    timestep: float | None = None,
+    timestep: float | None = None, regulated: bool = False,
 ) -> Robot:
-    """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`."""
+    """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`.
+
+    `regulated`: its wheels are driven as by the controller of a usual robot, with an integral part and a limit.
+    """
     try:
         spec, replaced, stated = read_robot(path, wheels, wheel_radius)
         joints = wheel_joints(path, spec, wheels)
         if stated is not None:
-            if len(joints) == 2:
-                spec.option.impratio = STIFF  # the file has none
+            if len(joints) == 2:  # the file has none
+                spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
             replaced += _as_in_gazebo(path, spec, joints)
+            spec.option.timestep = URDF_STEP
         _complete(path, spec, joints)
         if timestep is not None:
             spec.option.timestep = timestep
@@ -208,7 +254,11 @@ def load_robot(
         radius = _wheel_radius(path, host, bodies[0]) if wheel_radius is None else wheel_radius
         inertias = [_wheel_inertias(host, one, radius, len(ids)) for one in ids]
         bare = _add_servos(spec, joints, inertias)
-        if bare:
+        if regulated and _is_stable(host, joints, inertias):
+            spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        if regulated:
+            _regulate(spec, host, joints, inertias, float(radius))
+        if bare or regulated:
             host = spec.compile()
             data = mujoco.MjData(host)
             mujoco.mj_kinematics(host, data)
@@ -253,6 +303,7 @@ def load_robot(
             mujoco.mj_resetData(host, data)
             _settle(path, host, data, speed, turning, float(radius))
             sliding = _sliding(host, data, int(host.body_rootid[bodies[0]]))
+    inertias = [_wheel_inertias(host, one, float(radius), len(ids)) for one in ids]
     if stated is not None:
         for geom in sliding:
             friction = min(stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
@@ -261,7 +312,8 @@ def load_robot(
     return Robot(path, spec, host, root, speed, turning, actuators, sign,
                  _are_motors(path, host, actuators), _drive_gain(host, actuators, inertias), rotation.T @ middle,
                  rotation.T @ forward, float(radius), distance if track is None else track, data.qpos.copy(),
-                 tuple(actuators[one] for one in bare), sliding, distance, (*replaced, *notes))
+                 tuple(actuators[one] for one in bare), sliding, distance, (*replaced, *notes),
+                 _integrals(host, ids), *(float(one) for one in np.mean(inertias, axis=0)))
 
 
 def _sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int) -> tuple[int, ...]:
@@ -314,8 +366,11 @@ def _settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: tup
 SIZES = ("wheels.radius", "wheels.difference", "wheels.track")
 
 
-def sizes_of(robot: Robot) -> dict[str, Size]:
-    """The true sizes that may be fitted; none where a wheel rolls on something that is not round."""
+def sizes_of(robot: Robot, rolling: float = 1.0) -> dict[str, Size]:
+    """The true sizes that may be fitted; none where a wheel rolls on something that is not round.
+
+    `rolling` is the radius on which wheels roll over that of their geoms.
+    """
     host, data = robot.host, mujoco.MjData(robot.host)
     mujoco.mj_kinematics(host, data)
     joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
@@ -333,7 +388,8 @@ def sizes_of(robot: Robot) -> dict[str, Size]:
     radius = max(float(host.geom_size[one, 0]) for one in geoms[0])
     known = (("wheels.radius", "m", radius, raised), ("wheels.difference", "-", 0.0, raised),
              ("wheels.track", "m", robot.distance, apart))
-    return {path: Size(path, unit, value, geoms, _numbers(bodies), along) for path, unit, value, along in known}
+    return {path: Size(path, unit, value, geoms, _numbers(bodies), rolling, along)
+            for path, unit, value, along in known}
 
 
 def resolve(robot: Robot, path: str) -> Entry:
@@ -359,6 +415,8 @@ def resolve(robot: Robot, path: str) -> Entry:
             raise ValueError(f"{robot.path}: {kind} has no field {field!r} (known: {', '.join(fields)}, or an array "
                              f"{kind}_NAME of mjx.Model). Correct {path!r}.")
         column = int(parts[-1]) if numbered else 0 if values.ndim > 1 else None
+        if (kind, field) == ("body", "inertia") and not numbered:
+            column, unit = _upright(robot, ids[0]), "kg m^2"
     rows = [int(host.jnt_dofadr[one]) for one in ids] if array.startswith("dof_") else ids
     servo: tuple[int, ...] = ()
     if array == "actuator_gainprm" and column == 0:
@@ -370,6 +428,23 @@ def resolve(robot: Robot, path: str) -> Entry:
     if array == "actuator_forcerange" and not host.actuator_forcelimited[list(ids)].all():
         raise ValueError(f"{robot.path}: {path} has no limit in the file. Give the actuator a forcerange.")
     return entry
+
+
+def _upright(robot: Robot, body: int) -> int:
+    """Principal axis of a body that is the most upright at rest."""
+    data = mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(robot.host, data)
+    return int(np.abs(data.ximat[body].reshape(3, 3)[2]).argmax())
+
+
+def turning_inertia(robot: Robot) -> str:
+    """Path of the inertia of the vehicle's heaviest body: robot files often have a placeholder there, and the rest of
+    its controller's lag shows in turns."""
+    host = robot.host
+    root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
+    heaviest = int(np.where(host.body_rootid == root, host.body_mass, 0.0).argmax())
+    return f"body.{host.body(heaviest).name}.inertia"
 
 
 def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
@@ -416,7 +491,7 @@ def _put_size(spec: Any, entry: Size, model: Any) -> None:
 
 def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
     """Set one element of the editable model to what the compiled one says."""
-    kind = entry.path.partition(".")[0]
+    kind = entry.kind
     name = mujoco.mj_id2name(model._host, KINDS[kind], number)
     element = {"body": spec.body, "geom": spec.geom, "joint": spec.joint, "actuator": spec.actuator}[kind](name)
     if kind == "body" and entry.array in ("body_mass", "body_ipos", "body_inertia"):
@@ -486,10 +561,10 @@ def _below_wheels(
 def _as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     """What a URDF leaves to its simulator, a note for each change.
 
-    Wheels roll on the middle of their width: a stiff cylinder stands on its two edges, scrubs in every turn and turns
-    as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of arms, heads
-    and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its speed,
-    whatever its bearing.
+    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges, scrubs in every turn
+    and turns as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of
+    arms, heads and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its
+    speed, whatever its bearing.
     """
     notes = []
     driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
@@ -497,7 +572,10 @@ def _as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
         if geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = 0, 1
         if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and geom.parent.name in driven:
-            geom.size[1] = min(geom.size[1], THIN * geom.size[0])
+            if not geom.parent.explicitinertial:
+                geom.mass = WATER * 2 * np.pi * geom.size[0] ** 2 * geom.size[1]
+            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [geom.size[0], 0.0, 0.0]
+            geom.solref, geom.solimp, geom.solmix = FIRM_TIME, FIRM, ALONE
     for joint in list(spec.joints):
         if joint.name in joints:
             if np.any(joint.frictionloss) or np.any(joint.damping):
@@ -541,20 +619,90 @@ def _add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float
     """Give velocity servos to wheels without actuators; numbers of these wheels.
 
     Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
-    vehicles follow within the same time. A wheel that slips is far lighter, so the integration is implicit in speed.
-    MuJoCo softens a contact with the inverse inertia of what touches: a wheel without a motor's rotor would creep.
+    vehicles follow within the same time. MuJoCo softens a contact with the inverse inertia of what touches: a wheel
+    without a motor's rotor would creep.
     """
     bare = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)]
-    time = max(SERVO_TIME, SERVO_STEPS * spec.option.timestep)
+    share = ROTOR_SHARE if len(joints) == 2 else SKID_SHARE
+    time = max(SERVO_TIME, spec.option.timestep / share)
     for k in bare:
         actuator = spec.add_actuator(name=joints[k], target=joints[k], trntype=mujoco.mjtTrn.mjTRN_JOINT)
         wheel, total = inertias[k]
         actuator.set_to_velocity(kv=total / time)
         joint = spec.joint(joints[k])
-        joint.armature += max((ROTOR_SHARE if len(joints) == 2 else SKID_SHARE) * total - wheel, 0.0)
+        joint.armature += max(share * total - wheel, 0.0)
     if bare:
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     return bare
+
+
+def _regulate(
+    spec: Any, host: mujoco.MjModel, joints: Sequence[str], inertias: Sequence[tuple[float, float]], radius: float,
+) -> None:  # fmt: skip
+    """Give wheels without one an integral part beside their servo or motor, and a limit of what both pull together.
+
+    The integral part takes the same targets: torque = ki (integral of the target - angle of the wheel). A usual
+    controller of a robot's wheels is of this kind. Its gain starts where it hardly acts.
+    """
+    for name, (_, total) in zip(joints, inertias, strict=True):
+        joint = spec.joint(name)
+        mine = [one for one in spec.actuators if one.target == name]
+        if not any(one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR for one in mine):
+            actuator = spec.add_actuator(name=f"{name}_integral", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.set_to_intvelocity(kp=total * LAGGING)
+            actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if not host.jnt_actfrclimited[host.joint(name).id]:
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            limit = min(_motor_limit(host, host.joint(name).id), total * STRONG / radius)
+            joint.actfrcrange = [-limit, limit]
+
+
+def _is_stable(host: mujoco.MjModel, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
+    """Whether wheels that slip are stable under the torques of their actuators at the start of a step."""
+    gains = [float(-host.actuator_biasprm[host.actuator_trnid[:, 0] == host.joint(name).id, 2].min(initial=0.0))
+             for name in joints]
+    return all(gain * host.opt.timestep <= wheel for gain, (wheel, _) in zip(gains, inertias, strict=True))
+
+
+def _motor_limit(host: mujoco.MjModel, joint: int) -> float:
+    """Largest torque of the file's motor on a joint; infinite where it has none."""
+    found = float("inf")
+    for one in np.flatnonzero(host.actuator_trnid[:, 0] == joint):
+        gear, gain = abs(host.actuator_gear[one, 0]), abs(host.actuator_gainprm[one, 0])
+        if host.actuator_forcelimited[one]:
+            found = min(found, gear * float(np.abs(host.actuator_forcerange[one]).max()))
+        if host.actuator_ctrllimited[one] and host.actuator_biastype[one] == int(mujoco.mjtBias.mjBIAS_NONE):
+            found = min(found, gear * gain * float(np.abs(host.actuator_ctrlrange[one]).max()))
+    return found
+
+
+def _integrals(host: mujoco.MjModel, joints: Sequence[int]) -> tuple[int, ...]:
+    """Actuators with an integral part on these joints; none where one lacks it."""
+    integrator = host.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+    found = [np.flatnonzero((host.actuator_trnid[:, 0] == joint) & integrator) for joint in joints]
+    return tuple(int(one[0]) for one in found) if all(len(one) for one in found) else ()
+
+
+def drive_entries(robot: Robot) -> dict[str, tuple[Entry, float, float, float]]:
+    """Parameters of the controller that a regulated robot got, each with its start and bounds.
+
+    All follow from the inertia that a wheel speeds up: lags of up to a second, oscillations of up to 7 Hz, and
+    accelerations of up to 30 m/s^2.
+    """
+    host, load, both = robot.host, robot.load, robot.integrals
+    found = {}
+    if robot.added:
+        ids = tuple(robot.added)
+        kp = Entry("drive.kp", "actuator_gainprm", ids, 0, "N m s/rad", ids, (2,))
+        high = robot.spin / host.opt.timestep  # a wheel that slips is stable
+        found["drive.kp"] = (kp, min(load / 0.03, high / 2), load / 1.0, high)
+    if both:
+        ki = Entry("drive.ki", "actuator_gainprm", both, 0, "N m/rad", both, (1,))
+        found["drive.ki"] = (ki, LAGGING * load, 0.3 * load, 2000.0 * load)
+        limit = Entry("drive.limit", "jnt_actfrcrange", robot.joints, 1, "N m", robot.joints)
+        high = limit.read(host)
+        found["drive.limit"] = (limit, high, high / 100, high * 1.001)
+    return found
 
 
 def _wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) -> tuple[float, float]:
@@ -576,7 +724,7 @@ def _drive_gain(
     """
     wheel, total = (min(one) for one in zip(*inertias, strict=True))
     motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
-    time = max(SERVO_TIME, SERVO_STEPS * host.opt.timestep)
+    time = max(SERVO_TIME, 2 * host.opt.timestep)
     high = wheel / host.opt.timestep
     return min(total / time, high / 2) / motor, high / motor
 

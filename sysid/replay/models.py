@@ -125,6 +125,8 @@ def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...
     return (*sizes, *(("odometry_scale",) if both else ()), "pose_mount")
 
 
+UNLIMITED = {"acceleration_limit.wheel": 60.0}
+"""Upper bounds where a limit no longer acts [m/s^2]: at the effect's usual bound of 5 a small robot takes 50 ms."""
 ODOMETRY_ALONE, POSE_ALONE, BOTH = ("odometry_lag",), ("pose_mount",), ("sensor_delay", "odometry_scale")
 """Effects around a model that show in one stream, or against the other."""
 
@@ -148,8 +150,9 @@ def calibrated(model: Model, trials: tuple[Trial, ...]) -> tuple[Model, tuple[st
         return model.with_effects(names), ()
     found = model.with_effects(names)
     others = tuple(f"{limit.name}.{field}" for field in parameters_of(limit) if field != "wheel")
-    neutral = jnp.asarray([getattr(limit, name.partition(".")[2]) for name in others])
-    return replace(found, params=set_parameters(found.params, others, neutral)), others
+    neutral = [getattr(limit, name.partition(".")[2]) for name in others]
+    names, values = (*others, *UNLIMITED), jnp.asarray([*neutral, *UNLIMITED.values()])
+    return replace(found, params=set_parameters(found.params, names, values)), others
 
 
 def with_effects(params: Any, names: Sequence[str]) -> Any:
@@ -200,6 +203,7 @@ def model_space(params: Parameters, names: Sequence[str] | None = None) -> Space
     if unknown:
         raise ValueError(f"the model has no parameter {unknown[0]!r} (known: {', '.join(about)}).")
     low, high = (np.array([getattr(about[name], end) for name in names], float) for end in ("low", "high"))
+    high = np.maximum(high, [UNLIMITED.get(name, -np.inf) for name in names])
     initial = np.clip(np.asarray(get_parameters(params, names), float), low, high)
     log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
     return Space(names, low, high, initial, log, tuple((name, "not selected") for name in about if name not in names))

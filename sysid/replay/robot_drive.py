@@ -35,12 +35,16 @@ class RobotDrive:
         first = np.zeros((sets, trials, width))
         place, speed = slice(1, 1 + host.nq), slice(1 + host.nq, 1 + host.nq + host.nv)
         first[..., place], first[..., speed] = states.qpos, states.qvel
+        if host.na:
+            first[..., speed.stop : speed.stop + host.na] = robot.activation
         half = commands[..., 1] * robot.track / 2
         control = np.zeros((sets, trials, steps, host.nu))
         wanted = (commands[..., 0] - half, commands[..., 0] + half)
         for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
             gear = host.actuator_gear[one, 0] if robot.motors else 1.0
             control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
+        for side, one, sign in zip(robot.sides, robot.integrals, robot.sign, strict=False):
+            control[..., one] = sign * wanted[side] / robot.wheel_radius
         rows = sets * trials
         data = [mujoco.MjData(host) for _ in range(min(cores(), rows))]
         path, _ = rollout.rollout([models[i // trials] for i in range(rows)], data, first.reshape(rows, -1),

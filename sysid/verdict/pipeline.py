@@ -85,7 +85,7 @@ def find_missing(
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    floor = floor_change(reference, outcome.base, outcome.excess[0], config.thresholds.alpha, len(log.training))
+    floor = floor_change(reference, log.training, config.thresholds.alpha)
     result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)

@@ -17,7 +17,6 @@ from sysid.missing.pose_fit import fit_poses
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import base_columns
 from sysid.replay.models import measured_effects, with_effects
-from sysid.verdict.floor import on_floor
 from sysid.verdict.result import Result
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 
@@ -64,14 +63,14 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
 
 
 def on_other_floor(result: Result) -> Any:
-    """The reference vehicle on the floor of these drives: of all its parameters the members of that change alone are
-    fitted. The reference vehicle itself where the floor is the same."""
+    """The reference vehicle on the floor of these drives: of all its parameters those alone are fitted that say what
+    changed. The reference vehicle itself where the floor is the same."""
     vehicle, change = result.reference.params, result.floor
     if change is None or not change.named:
         return vehicle
-    vehicle = on_floor(vehicle, change)
-    names = [one.parameter for one in change.members]
-    return _to_poses(result, vehicle, names, 12) if result.config.poses else vehicle
+    have = describe(vehicle)
+    names = list(dict.fromkeys(one.quantity.parameter for one in change.members if one.quantity.parameter in have))
+    return _to_poses(result, vehicle, names, 12) if names else vehicle
 
 
 def named_parameters(result: Result, vehicle: Any) -> list[str]:

@@ -16,6 +16,7 @@ from bridge.command_table import make_table, read_commands
 from bridge.episodes import LENGTH, EpisodeServer, ProtocolError, encode, number, receive
 from bridge.guard import read_beat
 from bridge.image import ImageError, compressed_to_rgb8
+from bridge.mcap_file import HEAD, MAGIC, _end, mend
 from bridge.parameters import as_options
 from bridge.record import recover
 
@@ -137,6 +138,19 @@ def test_a_damaged_compressed_image(suffix):
             assert len(str(error)) < 600
 
     one()
+
+
+@few(60)
+@given(data=damaged(MAGIC + HEAD.pack(1, 8) + bytes(8) + HEAD.pack(5, 40) + bytes(40) + _end()))
+def test_a_damaged_mcap_file_is_made_whole_or_left_alone(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "one.mcap"
+    path.write_bytes(data)
+    with Costs():
+        mend(path)
+    mended = path.read_bytes()
+    assert mended == data or (mended.startswith(MAGIC) and mended.endswith(_end()))
+    mend(path)
+    assert path.read_bytes() == mended
 
 
 def test_recordings_of_killed_recorders_with_damaged_names_and_rows_are_recovered_or_left_alone(tmp_path):

@@ -16,6 +16,7 @@ from test_models import ROBOT
 from sysid.design import load_subject
 from sysid.errors.features import CHANNELS
 from sysid.errors.noise import ROUGH, Whitener
+from sysid.logs import lerobot
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log, read_csv
 from sysid.logs.measured import load_drive, load_mrclam
@@ -208,6 +209,26 @@ def test_a_damaged_table_of_a_stranger(tmp_path, name):
 
     path = folder / name
     check(path, path.read_bytes(), read, 15)
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", "meta/tasks.parquet", "data/chunk-000/file-000.parquet"])
+def test_a_damaged_dataset_of_lerobot(dataset, tmp_path, name):
+    pytest.importorskip("pyarrow")
+    lerobot.write(tmp_path, load_log(dataset))
+
+    def read():
+        for _, table in lerobot.read(tmp_path).drives:
+            assert len({len(values) for values in table.columns.values()}) == 1
+
+    path = tmp_path / name
+    check(path, path.read_bytes(), read)
+
+
+def test_a_damaged_gyro_of_a_driving_log(dataset, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(dataset, folder)
+    path = folder / "trials" / "ahead_1" / "imu.csv"
+    check(path, b"t,gyro\n" + b"".join(b"%.2f,0.1\n" % (0.05 * k) for k in range(30)), lambda: load_log(folder), 30)
 
 
 @pytest.mark.parametrize("name", ["cart.urdf", "cart.xacro"])

@@ -22,7 +22,8 @@ def effect(name, parameters, alike=()):
             "equation": "A command acts `delay` after it is sent: u(t) = u_sent(t - delay)."}
 
 
-DELAY = effect("command_delay", {"command_delay.delay": parameter(0.1523, 0.1131, 0.1902)})
+DELAY = effect("command_delay", {"command_delay.delay": parameter(
+    0.1523, 0.1131, 0.1902, description="time from sending a command to its effect")})
 
 
 def report(*effects, verdict="named", **more):
@@ -60,7 +61,7 @@ def test_an_open_end_is_said():
 
 def test_three_sentences_say_what_it_is_what_it_changes_and_what_is_open():
     what, change, rest = lead(report(DELAY))
-    assert what == "What explains these drives is command delay (a command acts delay after it is sent)."
+    assert what == "What explains these drives is command delay (time from sending a command to its effect)."
     assert "27.0 cm for the vehicle as it was, 15.0 cm refitted within its day-to-day spread, 2.0 cm with" in change
     assert "two repeats of one drive differ by 1.4 cm" in change and "No other effect" in rest
     alike = effect("command_delay", DELAY["parameters"], ("sensor_delay", "clock_offset"))

@@ -390,11 +390,12 @@ def test_without_xacro_the_error_has_the_command_that_installs_it(tmp_path, monk
 @pytest.mark.quick
 def test_a_robot_of_cylinders_is_not_stepped_where_results_are_shared(tmp_path, monkeypatch):
     """XLA would end the process."""
-    path = tmp_path / "cart.urdf"
-    path.write_text(URDF)
+    path = tmp_path / "cart.xml"
+    tyre = 'type="sphere" size="0.1" mass="0.5"'
+    path.write_text(ROBOT.replace(tyre, 'type="cylinder" size="0.1 0.02" zaxis="0 1 0" mass="0.5"'))
     model = mjcf_model(path)
     monkeypatch.setenv("XLA_FLAGS", f"{FLAG}={OPTION}")
-    with pytest.raises(ValueError, match="cart.urdf: XLA aborts .* Leave this call out"):
+    with pytest.raises(ValueError, match="cart.xml: XLA aborts .* Leave this call out"):
         model.plant.substep(model.params, model.plant.place(model.params, jnp.zeros(5)), jnp.zeros(2))
 
 

@@ -48,7 +48,7 @@ class Run:
     name: str
     """How pages call it: the shortest end of the path that no other run has."""
     kind: str
-    """"training", "fit", "missing effect", "evaluation", "log", or "unknown"."""
+    """"training", "fit", "missing effect", "evaluation", "log", what run.json says of another, or "unknown"."""
     state: str
     """"finished", "at work", "stopped" or "damaged"."""
     sentence: str
@@ -255,10 +255,10 @@ def _kind(path: Path, about: dict[str, Any], problems: list[str]) -> str:
     said = about.get("kind")
     if said is None and (path / "report.json").exists():
         said = _json(path / "report.json", []).get("kind")
-    if isinstance(said, str) and said in KINDS:
-        return KINDS[said]
+    if isinstance(said, str):
+        return KINDS.get(said, said[:60])
     if said is not None:
-        problems.append(f"{path / RUN_FILE}: is of the unknown kind {str(said)[:60]!r}.")
+        problems.append(f"{path / RUN_FILE}: kind is {str(said)[:60]}; it must be a text.")
     return next((kind for name, kind in MADE_BY if (path / name).exists()), "unknown")
 
 

@@ -78,7 +78,8 @@ class Cell:
 
 
 def html_page(
-    title: str, sections: Sequence[Section], subtitle: str = "", *, kind: str, lead: str, head: str = ""
+    title: str, sections: Sequence[Section], subtitle: str = "", *, kind: str = "Report", lead: str = "",
+    head: str = "",
 ) -> str:
     """A whole page: the header of all reports, links to the sections, sections.
 
@@ -87,7 +88,7 @@ def html_page(
         sections: its parts.
         subtitle: where the content comes from.
         kind: of the report, such as "Fit"; stands above the title.
-        lead: what the page means, in one sentence.
+        lead: what the page means, in one sentence; empty where the first section begins with it.
         head: more for the head of the page; HTML.
     """
     anchors = _anchors([section.title for section in sections])
@@ -95,11 +96,12 @@ def html_page(
                     for anchor, section in zip(anchors, sections, strict=True))
     parts = "".join(f'<section id="{anchor}"><h2>{escape(section.title)}</h2>{section.body}</section>\n'
                     for anchor, section in zip(anchors, sections, strict=True))
+    means = f'<p class="lead">{escape(lead)}</p>' if lead else ""
     below = f'<p class="dim">{escape(subtitle)}</p>' if subtitle else ""
     return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f'{head}<style>{STYLE}</style></head><body><header><p class="kind"><span>whill-mjx</span>'
-            f'{escape(kind)}</p><h1>{escape(title)}</h1><p class="lead">{escape(lead)}</p>{below}'
+            f'{escape(kind)}</p><h1>{escape(title)}</h1>{means}{below}'
             f"<nav>{links}</nav></header>\n{parts}<footer>Made by whill-mjx {__version__}.</footer></body></html>\n")
 
 

@@ -9,21 +9,22 @@ calls this before anything moves.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import COUNT, SEED, listen, refusing, run
+from whill_mjx.io.command_line import COUNT, SEED, listen, refusing, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from whill_mjx.io.fields import COLUMNS
+from whill_mjx.io.reading import read_csv
 from whill_mjx.logs.dataset import write_csv
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import place, substep
@@ -135,16 +136,12 @@ def read_table(path: Path) -> np.ndarray:
     """Rows (M, 3) of a command file.
 
     Raises:
-        ValueError: it is none.
+        FileNotFoundError, ValueError: it is none.
     """
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            rows = [[float(row[name]) for name in ("t", "v", "omega")] for row in csv.DictReader(file)]
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}. Give a CSV file with the columns t,v,omega.") from None
-    table = np.array(rows, float).reshape(-1, 3)
-    if len(table) < 2 or not np.isfinite(table).all() or not (np.diff(table[:, 0]) > 0).all():
-        raise ValueError(f"{path}: {len(table)} rows; it needs at least two, finite and in order of time. Correct it.")
+    columns = read_csv(path, [COLUMNS[name] for name in ("t", "v", "omega")], "no such command file.")
+    table = np.column_stack([columns[name] for name in ("t", "v", "omega")])
+    if not (np.diff(table[:, 0]) > 0).all():
+        raise ValueError(f"{path}: t does not increase from row to row. Sort the rows.")
     return table
 
 
