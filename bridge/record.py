@@ -41,6 +41,8 @@ PARTIAL = re.compile(r"\.(?P<trial>[A-Za-z0-9][\w.-]*)\.partial-(?P<process>\d+)
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 """Types that are kept whole on request only: they take megabytes a second."""
+AHEAD = 1.0
+"""Seconds by which a stamp may be ahead of this node's clock; one that is further is of another clock."""
 LOOK_PERIOD = 0.1
 """Seconds between two looks for publishers."""
 
@@ -302,7 +304,7 @@ class RecordNode:
         """Return the time that a message of this stamp gets."""
         if not self._by_stamp:
             return time.monotonic()
-        return stamp or self._node.get_clock().now().nanoseconds * 1e-9
+        return believed(stamp, float(self._node.get_clock().now().nanoseconds * 1e-9))
 
     def _on_command(self, message: Any, stamp: float, v: float, omega: float) -> None:
         t = self._time(stamp)
@@ -334,6 +336,14 @@ class RecordNode:
                 write(self.writer)
         except OSError as error:
             self.failure = self.failure or error
+
+
+def believed(stamp: float, now: float) -> float:
+    """Return a stamp [s], or the receiver's time where there is none or it is from the future.
+
+    Such a one counts on another clock, as that of a guard beside a simulation.
+    """
+    return stamp if 0 < stamp < now + AHEAD else now
 
 
 def message_class(name: str) -> Any:

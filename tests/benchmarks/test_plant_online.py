@@ -30,7 +30,7 @@ def online(setting, table, until):
                                      {"wind": 20.0}], ids=lambda effects: "".join(effects) or "plain")
 def test_a_drive_command_by_command_is_the_drive_of_the_whole_table(effects):
     setting, jobs = plan(effects, 3, 0.0, True, {"steps": TABLE}, 1)
-    ((_, odometry, pose),) = drive_all(setting, jobs)
+    ((_, odometry, pose, *_),) = drive_all(setting, jobs)
     rows, poses = online(setting, TABLE, 3.0)
     count = min(len(rows), len(odometry))
     assert count > 55

@@ -8,7 +8,7 @@ import tomllib
 
 import pytest
 
-from bridge.record import TrialWriter, finish, main, parse_arguments, toml_text, write_dataset_file
+from bridge.record import TrialWriter, believed, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 
 pytestmark = pytest.mark.quick
@@ -32,6 +32,11 @@ def test_trial_has_the_columns_of_the_format_and_one_time_origin(tmp_path):
     assert read(folder / "command.csv") == [{"t": 0.0, "v": 0.999, "omega": 0.0}, {"t": 0.05, "v": 0.5, "omega": -0.2}]
     assert read(folder / "odometry.csv") == [{"t": 0, "x": 0, "y": 0, "yaw": 0, "v": 0.1, "omega": 0, "stamp": 0}]
     assert read(folder / "ground_truth.csv") == [{"t": 0.1, "x": 3.0, "y": 4.0, "yaw": 1.5, "stamp": 0}]
+
+
+@pytest.mark.parametrize("stamp, time", [(9.5, 9.5), (10.05, 10.05), (0.0, 10.0), (1.7e9, 10.0)])
+def test_a_stamp_of_another_clock_is_replaced_by_the_time_of_receipt(stamp, time):
+    assert believed(stamp, now=10.0) == time
 
 
 def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
