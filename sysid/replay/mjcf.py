@@ -100,7 +100,7 @@ def mjcf_model(
     if calibrate:
         # Where wheels slip in every turn, the track has no part of its own.
         drive = drive_entries(robot)
-        names = (*(one for one in names if not (robot.added and one.startswith("actuator."))),
+        names = (*(one for one in names if not ((robot.added or robot.motors) and one.startswith("actuator."))),
                  *drive, turning_inertia(robot),
                  *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
                  *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
