@@ -1,12 +1,13 @@
-# Two commands: `make train` and `make test`. Both install everything they need into .venv first.
+# `make train`, `make test` and `make loop` install everything they need into .venv first. Others: CONTRIBUTING.md.
 PYTHON ?= python3
 VENV ?= .venv
 RUN ?= runs/train
+LOOP ?= runs/loop
 BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: train test test-quick test-long lint clean
+.PHONY: train loop test test-quick test-long lint docs notebooks coverage constraints release clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
 define beating
@@ -35,8 +36,17 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(call beating,$(PIP) install -c constraints.txt -e ".[dev$(COMMA)ros]")
 	@touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "Installing what the site needs (MkDocs, jupytext) into $(VENV): once, some seconds."
+	$(call beating,$(PIP) install -c constraints.txt -e ".[docs]")
+	@touch $@
+
 train: $(VENV)/.installed
 	$(BIN)/python -m whill_mjx.train --out $(RUN)
+
+# Drive, record, fit, find what is missing, drive again, train, drive: over ROS 2, on the contact plant.
+loop: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30
@@ -52,5 +62,41 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy whill_mjx sysid dreamer bridge benchmarks
 
+# Lines and branches that the suite runs; a page in build/coverage.
+coverage: $(VENV)/.installed-dev
+	$(PIP) install -q -c constraints.txt pytest-cov
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+
+# Renew constraints.txt: the newest versions that pyproject.toml allows, for every Python of PYTHONS. Then run the tests.
+PYTHONS ?= python3.11 python3.12 python3.13
+constraints:
+	mkdir -p build/constraints
+	rm -f build/constraints/freeze-*
+	for python in $(PYTHONS); do \
+		version=$$($$python -c 'import sys; print("%d.%d" % sys.version_info[:2])') || exit 1; \
+		rm -rf build/constraints/venv && $$python -m venv build/constraints/venv || exit 1; \
+		echo "Python $$version: installing the newest versions."; \
+		build/constraints/venv/bin/pip install -q ".[dev$(COMMA)ros$(COMMA)docs]" pytest-cov || exit 1; \
+		build/constraints/venv/bin/pip freeze --exclude whill-mjx > build/constraints/freeze-$$version || exit 1; \
+	done
+	rm -rf build/constraints/venv
+	$(firstword $(PYTHONS)) .ci/constraints.py build/constraints/freeze-*
+	git diff --stat constraints.txt
+
+# Wheels and source archives in dist/, tried in clean environments of Python 3.11 to 3.13 (VERSIONS=3.12 for one).
+VERSIONS ?= 3.11 3.12 3.13
+release: $(VENV)/.installed-dev
+	$(PIP) install -q -c constraints.txt build
+	.ci/release $(BIN)/python $(VERSIONS)
+
+# The site in build/site: every link and picture is checked, and a broken one fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/site/index.html."
+
+# The tutorials as notebooks in build/notebooks.
+notebooks: $(VENV)/.installed-docs
+	$(BIN)/python -m benchmarks.tutorials notebooks --out build/notebooks
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) build

@@ -30,7 +30,7 @@ import numpy as np
 
 from benchmarks.bridge_robot import Robot, Switch, message_type
 from bridge.options import Parser, in_range, whole
-from bridge.simulate import Frame
+from bridge.simulated import Frame
 from whill_mjx.io.command_line import guarded
 
 CLAIM = "Frame to command, delivery, pacing and every stop of the bridge, measured between processes"

@@ -151,7 +151,7 @@ class Robot:
         self.wait_until(lambda _: publisher.get_subscription_count())
         publisher.publish(message_type("std_msgs/Empty")())
 
-    def wait_until(self, condition: Callable[[Robot], Any], seconds: float = 60) -> Any:
+    def wait_until(self, condition: Callable[[Robot], Any], seconds: float = 120) -> Any:
         """Wait for a condition of this robot and return its value.
 
         Raises:
@@ -164,15 +164,32 @@ class Robot:
             time.sleep(0.005)
         return value
 
-    def wait_for_status(self, seconds: float = 60, **fields: Any) -> dict[str, Any]:
-        """Wait until the newest status has these values, of texts and lists a part is enough; return it."""
+    def wait_for_status(self, seconds: float = 120, since: int | None = None, **fields: Any) -> dict[str, Any]:
+        """Wait until the newest status has these values, of texts and lists a part is enough; return it.
+
+        With `since`, a number of statuses, one of those that came after them is enough: for what passes by itself.
+        """
         def fits(robot: Robot) -> dict[str, Any] | None:
-            status = robot.statuses[-1] if robot.statuses else {}
-            whole = all(want == status.get(name) if isinstance(want, bool) else want in str(status.get(name, ""))
-                        for name, want in fields.items())
-            return status if status and whole else None
+            for status in robot.statuses[-1:] if since is None else robot.statuses[since:]:
+                if all(want == status.get(name) if isinstance(want, bool) else want in str(status.get(name, ""))
+                       for name, want in fields.items()):
+                    return status
+            return None
 
         return self.wait_until(fits, seconds)
+
+    def wait_until_quiet(self, count: Callable[[], int], seconds: float = 0.5) -> int:
+        """Wait until a count has not changed for some time, and return it; what was on its way has come by then."""
+        found: list[tuple[float, int]] = []
+
+        def settled(_: Robot) -> bool:
+            now = count()
+            if not found or found[-1][1] != now:
+                found.append((time.monotonic(), now))
+            return time.monotonic() - found[-1][0] > seconds
+
+        self.wait_until(settled)
+        return found[-1][1]
 
     def moving(self, since: float = 0.0) -> list[Heard]:
         """Return the commands after a time that are not zero."""

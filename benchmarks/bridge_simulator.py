@@ -19,13 +19,15 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bridge import CLAIM, Figures, cpu_model
+from benchmarks.bridge import CLAIM, Figures, cpu_model, memory_mb
 from benchmarks.harness import figure, record
+from bridge.episodes import PATIENCE
 from bridge.options import Parser, in_range, whole
 from whill_mjx.io.command_line import guarded
 
@@ -135,40 +137,101 @@ def measure_lock_step(domain: int, folder: Path, steps: int, resets: int) -> Fig
             "ros_env_stale_images": ([float(wrong)], f"of {2 * resets} images after resets")}
 
 
-def damaged(rng: random.Random) -> bytes:
-    """Bytes that are no message: noise, cut off, huge, or JSON that is no call."""
-    kind = rng.randrange(4)
-    if kind == 0:
-        return rng.randbytes(rng.randrange(200))
-    if kind == 1:
-        return struct.pack(">I", rng.randrange(1, 5000)) + rng.randbytes(rng.randrange(20))
-    if kind == 2:
-        return struct.pack(">I", rng.randrange(65537, 1 << 32))
-    content = rng.choice([b"[]", b"{}", b'{"id":1}', b'{"id":1,"call":"reset"}', b"nan", b'{"call":[]}', b"\xff"])
+SENDERS = 6
+"""Threads that send damaged messages at a time; the server has eight places."""
+SERVED = 15.0
+"""Seconds in which a client must be served between them: slow ones hold all places for five at most."""
+
+
+def message(content: bytes) -> bytes:
+    """A message of some content."""
     return struct.pack(">I", len(content)) + content
 
 
-def measure_fuzz(domain: int, folder: Path, count: int) -> Figures:
-    """Damaged messages after which the server was dead, and its growth of memory."""
-    from benchmarks.bridge import memory_mb
+HELLO = message(b'{"id":1,"call":"hello","protocol":1,"token":""}')
+
+
+def damaged(rng: random.Random) -> bytes:
+    """Bytes that are no message: noise, cut off, huge, or JSON that is no call; some of them after a greeting."""
+    kind, greeting = rng.randrange(4), HELLO if rng.random() < 0.3 else b""
+    if kind == 0:
+        return greeting + rng.randbytes(rng.randrange(200))
+    if kind == 1:
+        return greeting + struct.pack(">I", rng.randrange(1, 5000)) + rng.randbytes(rng.randrange(20))
+    if kind == 2:
+        return greeting + struct.pack(">I", rng.randrange(65537, 1 << 32)) + rng.randbytes(rng.randrange(1000))
+    content = rng.choice([b"[]", b"{}", b'{"id":1}', b'{"id":1,"call":"reset"}', b"nan", b'{"call":[]}', b"\xff",
+                          b'{"id":1,"call":"step","v":1e999,"omega":0}', b"[" * 5000, b'{"id":1e400,"call":"state"}'])
+    return greeting + message(content)
+
+
+def attack(port: int, count: int, seed: int) -> None:
+    """Send damaged messages, each on a connection of its own; one of 500 slowly, one of 2000 stalls."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 20) as connection:
+            content = damaged(rng)
+            if rng.random() < 0.002:
+                for at in range(0, min(len(content), 60), 3):
+                    connection.sendall(content[at:at + 3])
+                    time.sleep(0.02)
+            elif rng.random() < 0.0005:
+                connection.sendall(content[:2])
+                time.sleep(6)
+            else:
+                connection.sendall(content)
+
+
+def open_files(pid: int) -> int:
+    """Files and sockets that a process holds."""
+    return len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def serves(port: int) -> bool:
+    """Whether a client gets its state in time, whoever else is there."""
     from bridge.episodes import EpisodeClient
 
-    rng, simulator = random.Random(0), Simulator(domain, folder)
+    end = time.monotonic() + SERVED
+    while time.monotonic() < end:
+        try:
+            client = EpisodeClient(port, wait=SERVED)
+        except (OSError, ValueError):  # all places are taken
+            time.sleep(0.05)
+            continue
+        try:
+            return "episode" in client.call("state")
+        finally:
+            client.close()
+    return False
+
+
+def measure_fuzz(domain: int, folder: Path, count: int) -> Figures:
+    """Calls that were not served between damaged messages of many clients, and what the server kept of them."""
+    simulator = Simulator(domain, folder)
+    pid = simulator.process.pid
     try:
-        before, failed = memory_mb(simulator.process.pid), 0
-        for number in range(count):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", simulator.port), 5) as connection:
-                connection.sendall(damaged(rng))
-            if number % 200 == 199:
-                try:
-                    EpisodeClient(simulator.port, wait=10).close()
-                except (OSError, ValueError):
-                    failed += 1
-        growth = memory_mb(simulator.process.pid) - before
+        serves(simulator.port)
+        memory, files = memory_mb(pid), open_files(pid)
+        senders = [threading.Thread(target=attack, args=(simulator.port, count // SENDERS, seed), daemon=True)
+                   for seed in range(SENDERS)]
+        for sender in senders:
+            sender.start()
+        calls = failed = 0
+        while any(sender.is_alive() for sender in senders):
+            time.sleep(0.2)
+            calls += 1
+            failed += not serves(simulator.port)
+        time.sleep(PATIENCE + 1)  # what stalls is left alone by then
+        failed += simulator.process.poll() is not None
+        kept = open_files(pid) - files
+        growth = memory_mb(pid) - memory
     finally:
         simulator.close()
-    return {"tcp_fuzz_failures": ([float(failed)], f"of {count // 200} calls between {count} damaged messages"),
-            "tcp_fuzz_growth_mb": ([growth], f"MB of memory over {count} damaged messages")}
+    sent = SENDERS * (count // SENDERS)
+    return {"tcp_fuzz_failures": ([float(failed)], f"of {calls} calls between {sent} damaged messages of {SENDERS} "
+                                                   "clients at a time, slow and stalled ones among them"),
+            "tcp_fuzz_growth_mb": ([growth], f"MB of memory over {sent} damaged messages"),
+            "tcp_fuzz_open_files": ([float(kept)], f"more open files after {sent} damaged messages")}
 
 
 def main() -> None:

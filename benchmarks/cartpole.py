@@ -31,7 +31,7 @@ from bridge.options import Parser, in_range, whole
 from dreamer import spaces
 from dreamer.config import DreamerConfig, preset
 from dreamer.evaluate import evaluate
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from dreamer.types import FunctionalEnv
 from whill_mjx.io.command_line import guarded
 
@@ -153,9 +153,9 @@ def train_group(
         return []
     train(
         task.train, config, out, options.steps // task.repeat, seeds[0] if options.separate else seeds,
-        eval_fn=evaluation, eval_every=max(1, options.eval_every // task.repeat),
-        checkpoint_every_s=options.checkpoint_s, log_every_s=10.0, on_metrics=progress(task, began), progress=False,
-        time_limit_s=left,
+        TrainingOptions(eval_fn=evaluation, eval_every=max(1, options.eval_every // task.repeat),
+                   checkpoint_every_s=options.checkpoint_s, log_every_s=10.0, on_metrics=progress(task, began),
+                   progress=False, time_limit_s=left),
     )  # fmt: skip
     return read_log(out)
 

@@ -28,7 +28,7 @@ from bridge.options import Parser, in_range, whole
 from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from whill_mjx import evaluate as evaluation_command
 from whill_mjx.io.command_line import guarded
 from whill_mjx.learning.checks import mean_figures
@@ -134,8 +134,9 @@ def together(options: argparse.Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     noted = {"task": options.task, "layout": options.layout, "exploring_starts": starts}
     (options.out / "environment.json").write_text(json.dumps(noted) + "\n")
-    result = train(env, learner, options.out, steps, seeds, eval_fn=inside, eval_every=preset.eval_every,
-                   checkpoint_every_s=1e9, progress=False, time_limit_s=limit)
+    run = TrainingOptions(eval_fn=inside, eval_every=preset.eval_every, checkpoint_every_s=1e9, progress=False,
+                          time_limit_s=limit)
+    result = train(env, learner, options.out, steps, seeds, run)
     if result.env_steps < steps:
         print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
         return

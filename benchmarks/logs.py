@@ -1,6 +1,6 @@
 """Whether faults of time and frames in driving logs are named, and how long a log of an hour takes.
 
-    python -m benchmarks.logs               # 200 faulty and 200 healthy logs, and an hour of driving
+    python -m benchmarks.logs               # 200 faulty and 200 healthy logs, fits to some, and an hour of driving
     python -m benchmarks.logs --parts faults --count 60 --seed 7
 
 Writes benchmarks/results/logs.json.
@@ -26,6 +26,8 @@ from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
+FITTED = ("clock set forward", "commands pause", "outside pose late", "tracked body turned", "odometry reset")
+"""Faults whose harm to a fit is measured, at all three sizes."""
 WRONG = re.compile("sign is reversed|check its unit")
 """What no fault here is."""
 
@@ -136,6 +138,68 @@ def fault_figures(count: int, seed: int, verbose: bool) -> dict[str, Any]:
     return found
 
 
+def slow_unicycle() -> Any:
+    """A small model whose fit takes seconds: a unicycle that follows its commands late, scaled and with a lag."""
+    import jax.numpy as jnp
+
+    from sysid import function_model
+
+    dt = 0.02
+
+    def step(p: dict[str, Any], state: Any, command: Any) -> Any:
+        share = dt / (dt + p["lag"])
+        v = state[3] + share * (p["distance"] * command[0] - state[3])
+        omega = state[4] + share * (p["turn"] * command[1] - state[4])
+        middle = state[2] + omega * dt / 2
+        return jnp.stack([state[0] + dt * v * jnp.cos(middle), state[1] + dt * v * jnp.sin(middle),
+                          state[2] + dt * omega, v, omega])
+
+    return function_model(step, {"distance": (1.0, 0.5, 1.5), "turn": (1.0, 0.5, 1.5), "lag": (0.15, 0.0, 1.0, "s")},
+                          dt=dt, name="slow unicycle", effects=("command_delay", "pose_delay"))
+
+
+def fitted_error(robot: Robot, drives: list[Drive]) -> float:
+    """Position error [m] on healthy drives of a robot of the model fitted to some drives, as `sysid.fit` reads them;
+    nan where these are refused."""
+    from sysid.logs.measured import load_any
+    from sysid.logs.metrics import score
+    from sysid.search.fitting import fit_log, predict
+    from sysid.search.settings import FitConfig
+
+    with TemporaryDirectory() as folder:
+        faulty, whole = Path(folder) / "faulty", Path(folder) / "whole"
+        write_log(faulty, robot, drives)
+        write_log(whole, robot, robot.drives)
+        try:
+            fit = fit_log(load_any(faulty), FitConfig(method="lm", starts=1, quick=True, physics_dt=0.02),
+                          model=slow_unicycle())
+        except ValueError:
+            return float("nan")
+        trials = load_any(whole).trials
+        _, replayed = predict(fit, trials)
+        errors = [score(trial, one)["ground_truth"].trajectory for trial, one in zip(trials, replayed, strict=True)]
+    return float(np.mean([error for error in errors if error is not None]))
+
+
+def harm_figures(repeats: int, seed: int) -> dict[str, Any]:
+    """How many times the error of a fit to a healthy log that of a fit to the same log with a fault is, by size."""
+    found: dict[str, list[float]] = {}
+    for number in range(repeats):
+        random = np.random.default_rng(1000 * seed + number)
+        robot = healthy(random, turning=1.0, whole=True)
+        usual = fitted_error(robot, robot.drives)
+        for fault in (one for one in FAULTS if one.name in FITTED):
+            for size, value in enumerate(fault.sizes):
+                drives = fault.apply(robot.drives, value, np.random.default_rng(number))
+                times = fitted_error(robot, drives) / usual
+                progress(f"robot {number + 1} of {repeats}, {fault.name} at {value:g} {fault.unit}: {times:.2f} times")
+                found.setdefault(f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{size + 1}", []).append(times)
+    sizes = {f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{k + 1}": f"{value:g} {fault.unit}"
+             for fault in FAULTS for k, value in enumerate(fault.sizes)}
+    return {name: {**figure(values, "times the error of a fit to the healthy log"), "size": sizes[name]}
+            for name, values in found.items()}
+
+
 def write_hour(path: Path, seconds: float = 3600.0) -> None:
     """Write a bag: odometry at 50 Hz and commands at 10 Hz, of drives of 20 s with 5 s of standstill between them."""
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -211,15 +275,18 @@ def progress(text: str) -> None:
 def main() -> None:
     """Command line."""
     parser = Parser(prog="python -m benchmarks.logs", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--parts", nargs="+", default=["faults", "hour"], choices=["faults", "hour"])
+    parser.add_argument("--parts", nargs="+", default=["faults", "fits", "hour"],
+                        choices=["faults", "fits", "hour"])
     parser.add_argument("--count", type=whole(), default=200, help="faulty logs, and healthy ones")
     parser.add_argument("--seed", type=whole(0), default=0)
-    parser.add_argument("--repeats", type=whole(), default=3, help="of the hour")
+    parser.add_argument("--repeats", type=whole(), default=3, help="of the hour, and robots of the fits")
     parser.add_argument("--dry", action="store_true", help="print what goes wrong, record nothing")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     if "faults" in options.parts:
         figures |= fault_figures(options.count, options.seed, options.dry)
+    if "fits" in options.parts:
+        figures |= harm_figures(options.repeats, options.seed)
     if "hour" in options.parts:
         figures |= hour_figures(options.repeats)
     for name, one in figures.items():

@@ -5,9 +5,12 @@
 `ladder` (drive_norlab, skid-steered robot): the base model with a turn efficiency is fitted to steps of 6 s on asphalt,
 gravel and sand; then the loop names an effect, the vehicle with it is fitted, and the loop goes on from there until it
 names none. Each rung is scored on steps that were never fitted, with all parameters refitted, and as `alone` with those
-of the named effect alone: the rest is gained by base parameters that moved beside it. `peers` (`measured_peers`) says
+of the named effect alone: the rest is gained by base parameters that moved beside it. `laws` (`measured_laws`): what
+each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
-asphalt run is the reference, gravel and sand are asked what changed. `mrclam` (five nearly ideal robots): verdicts with
+asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one, and what is held out
+of them is predicted by the reference vehicle with that change alone. `floors` asks the same of gyro and wheels without
+a model, and of halves of one run how often that is false. `mrclam` (five nearly ideal robots): verdicts with
 the base model's delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
@@ -17,7 +20,9 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,19 +32,25 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
+from benchmarks.measured_laws import ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
+from sysid.logs.floor import BLOCKS, Measured, in_blocks, sums_of
 from sysid.logs.log import Log, Prediction, Trial
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
+from sysid.logs.pose_lag import pose_lag
 from sysid.missing.catalogue import PARAMETER
-from sysid.pages.loop_report import base_table, effects, replay, shifts
+from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
-from sysid.verdict.late_pose import NAME
+from sysid.verdict.floor import FloorChange, compared
+from sysid.verdict.found import Thresholds
+from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
-from sysid.verdict.result import LoopConfig, Result
-from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, refit_poses
+from sysid.verdict.preparation import prepare, reference_for
+from sysid.verdict.result import LoopConfig, Prepared, Result
+from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, on_other_floor, refit_poses
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE
 from whill_mjx.vehicle.parameters import set_values
@@ -49,6 +60,7 @@ from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2")
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
 HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.667-1", "sand": "warthog_sand_2"}
+OTHER_RUNS = ("warthog_2023", "husky_steps_000_133")
 ROBOTS = (1, 2, 3, 4, 5)
 BLOCK = 5  # steps that follow one another and are drawn together
 DRAWS = 4000
@@ -56,6 +68,9 @@ MANY = 10**6  # steps: all
 TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
 SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
 DEAD = {"command_dead_zone"}
+FLOOR_MODEL = ("turn_efficiency", "turn_lag", "pose_delay")
+"""What the base model of `change` has besides the physical preset."""
+LAWS = {"motor_line", "turn_lag", "turn_efficiency_speed", "turning_slip", "side_slip"}
 LONGEST, LARGEST = 0.3, 0.1
 """Delay [s] and share of the speed beyond which a verdict on a nearly ideal robot is false."""
 
@@ -66,7 +81,8 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/measured."""
-    parts: tuple[Literal["ladder", "peers", "change", "mrclam"], ...] = ("ladder", "peers", "change", "mrclam")
+    parts: tuple[Literal["ladder", "laws", "peers", "floors", "change", "mrclam"], ...] = (
+        "ladder", "laws", "peers", "floors", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
     windows: Annotated[int, COUNT] = 96
@@ -77,6 +93,8 @@ class Benchmark:
     """Loops at most, one after the other."""
     physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
+    quick: bool = False
+    """Loops of `change` with fewer iterations and nulls."""
 
 
 def drive_log(settings: Benchmark, terrains: tuple[str, ...]) -> Log:
@@ -119,7 +137,20 @@ def verdict_of(result: Result) -> dict[str, Any]:
     return {"verdict": found.verdict, "reason": found.reason, "p_value": (late or [found.p_value])[0], "effects": [
         {"name": one["name"], "class": one["class"],
          "parameters": {name: [value["value"], *value["interval"]] for name, value in one["parameters"].items()}}
-        for one in named], "seconds": result.seconds}
+        for one in named], "seconds": result.seconds, "scan": scanned(result),
+        "floor": None if result.floor is None else result.floor.report()}
+
+
+def scanned(result: Result) -> dict[str, list[float]]:
+    """Of each law of skid-steered robots its gain, its worth beside what days differ by, and its p-value in the scan;
+    after a refit, its gain and p-value."""
+    scan, out = result.search.scan, {}
+    for number, one in enumerate(result.hypotheses):
+        if one.effect in LAWS:
+            out[one.key] = [float(scan.gain[number]), float(scan.worth[number]), float(scan.p[number])]
+    for round_number, candidates in enumerate(result.search.rounds, start=1):
+        out |= {f"{one.hypothesis.key}, refit {round_number}": [one.gain, one.p] for one in candidates}
+    return out
 
 
 def one_loop(
@@ -229,6 +260,27 @@ def ladder(settings: Benchmark) -> None:
     record("measured", CLAIM, figures, replacing="ladder_")
 
 
+def laws(settings: Benchmark) -> None:
+    """What each law adds to the fitted base model, named or not."""
+    log = drive_log(settings, tuple(TRAIN))
+    bench = make_bench(log, settings.physics_dt, 7 if settings.quick else 15)
+
+    def found(name: str, compute: Callable[[], dict[str, list[float]]]) -> dict[str, list[float]]:
+        done = kept(settings, f"law_{name}")
+        return (keep(settings, f"law_{name}", {"errors": compute()}) if done is None else done)["errors"]
+
+    rows = ablate(bench, errors, found)
+    figures: dict[str, Any] = {}
+    trials = list(rows["base"])
+    for name, one in rows.items():
+        stem = f"law_{name.replace(' ', '_')}"
+        figures |= mean_errors(stem, one)
+        if name != "base":
+            figures |= gained(f"{stem}_gain", trials, rows["base"], one, 0)
+    show(figures)
+    record("measured", CLAIM, figures, replacing="law_")
+
+
 def peers(settings: Benchmark) -> None:
     """What models of the commands alone predict, fitted to all training steps."""
     log = drive_log(replace(settings, windows=MANY), tuple(TRAIN))
@@ -253,29 +305,110 @@ def mean_errors(stem: str, rows: dict[str, list[float]]) -> dict[str, Any]:
     return {f"{stem}_position": figure([position], "m"), f"{stem}_yaw": figure([yaw], "rad")}
 
 
+def floors(settings: Benchmark) -> None:
+    """What the gyro and the wheels alone say of the floor: gravel and both sand runs against asphalt, and halves of
+    each run against one another, ten cuts in turn (its tenths are consecutive)."""
+    folder, alpha = settings.shared / "data" / "measured" / "drive_norlab", Thresholds().alpha
+    sums = {run: [one for trial in load_drive(folder, (run,), chained=True).trials if (one := sums_of(trial))]
+            for run in (*RUNS, *OTHER_RUNS)}
+    asphalt = in_blocks(sums[RUNS[0]])
+    figures: dict[str, Any] = {}
+    named: list[bool] = []
+    for run in RUNS[1:]:
+        found = between(asphalt, in_blocks(sums[run]), alpha)
+        print(f"{run}: {found.said() or 'the same floor'}; class {', '.join(found.classes)}", flush=True)
+        named.append(found.named)
+        stem = f"floor_{run.removeprefix('warthog_')}"
+        figures[f"{stem}_p"] = figure([found.p], "-")
+        for member in found.members:
+            key = f"{stem}_{member.quantity.name.replace(' ', '_').replace(chr(39), '')}"
+            figures[key] = figure([member.after], member.quantity.unit)
+    figures["floor_named"] = figure([float(sum(named))], f"of {len(named)} runs")
+    false = {run: 0 for run in sums}
+    for run, each in sums.items():
+        for cut in range(10):
+            second = (10 * np.arange(len(each)) // len(each) - cut) % 10 >= 5
+            first, other = (in_blocks([one for one, inside in zip(each, second == side, strict=True) if inside])
+                            for side in (False, True))
+            false[run] += between(first, other, alpha).named
+    print(f"halves of one run taken for two floors, of 10: {false}", flush=True)
+    figures["floor_false_asphalt"] = figure([float(false[RUNS[0]])], "of 10 halves of the asphalt run")
+    figures["floor_false"] = figure([float(sum(false.values()))], f"of {10 * len(false)} halves of {len(false)} runs")
+    show(figures)
+    record("measured", CLAIM, figures, replacing="floor_")
+
+
+def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> FloorChange:
+    """The change of floor from one set of blocks to another."""
+    assert theirs is not None and mine is not None
+    found = compared(theirs, mine, 2 * (BLOCKS - 1), alpha)
+    assert found is not None
+    return found
+
+
+def asphalt_vehicle(settings: Benchmark) -> Prepared:
+    """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
+    config = change_config(settings)
+    asphalt = drive_log(settings, ("asphalt",))
+    reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
+                              start=floor_start(asphalt))
+    return prepare(reference, asphalt.spec, config)
+
+
+def change_config(settings: Benchmark) -> LoopConfig:
+    """The delay of the outside pose is held: the gyro determines it."""
+    return LoopConfig(physics_dt=settings.physics_dt, quick=settings.quick, held=(PARAMETER,))
+
+
+def floor_start(log: Log) -> Any:
+    """The base model with what turns a skid-steered robot, how late, and how late its outside pose is."""
+    start = with_effects(preset_params(log.spec, "physical"), FLOOR_MODEL)
+    trials = log.training
+    lag = pose_lag(trials, [part.tolist() for part in np.array_split(np.arange(len(trials)), 8)], yaw_rates(log))
+    return set_values(start, [PARAMETER], jnp.array([0.0 if lag is None else lag.delay]))
+
+
+def one_change(settings: Benchmark, name: str, log: Log, ready: Callable[[], Prepared]) -> dict[str, Any]:
+    """What changed from the reference to a log, with held-out errors of the reference vehicle, and of it on the other
+    floor: only the members of that change moved."""
+    done = kept(settings, name)
+    if done is not None:
+        return done
+    result = find_missing(log, config=change_config(settings), reference=ready(),
+                          progress=lambda _, text: print(f"  {name}: {text}", flush=True))
+    found, held = verdict_of(result), log.held_out
+    found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
+    found["before"] = errors(held, replay(result, result.reference.params, held))
+    found["after"] = errors(held, replay(result, on_other_floor(result), held))
+    return keep(settings, name, found)
+
+
 def change(settings: Benchmark) -> None:
-    """What changed from asphalt to gravel and to sand."""
-    loops = climb(settings, "asphalt", drive_log(settings, ("asphalt",)))
-    named = [i for i, loop in enumerate(loops) if loop["verdict"] == "named"]
-    vehicle = load_vehicle(settings.out / f"asphalt_{named[-1] + 1 if named else 1}.toml")[1]
-    days = (drive_log(settings, ("asphalt",)),)  # whose blocks show how far the vehicle wanders
-    figures = {}
-    for terrain in ("gravel", "sand"):
-        log = drive_log(settings, (terrain,))
-        loop = one_loop(settings, f"asphalt_to_{terrain}", log, config_of(settings, vehicle), vehicle=vehicle,
-                        references=days)
-        print(f"{terrain}: " + ("; ".join(shifts(loop["base"])) or "base parameters as on asphalt"), flush=True)
-        trials = list(loop["before"])
+    """What changed from asphalt to gravel and to the two sand runs."""
+    ready = lru_cache(maxsize=1)(partial(asphalt_vehicle, settings))
+    figures: dict[str, Any] = {}
+    named = 0
+    for name in ("warthog_gravel", "warthog_sand_1", "warthog_sand_2"):
+        loop = one_change(settings, f"from_asphalt_to_{name}", run_log(settings, name), ready)
+        report([loop])
+        trials, short = list(loop["before"]), name.removeprefix("warthog_")
         for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
-            stem = f"changed_{terrain}_{metric}"
+            stem = f"changed_{short}_{metric}"
             for which in ("ideal", "before", "after"):
                 value = float(np.mean([row[column] for row in loop[which].values()]))
                 figures[f"{stem}_{which}"] = figure([value], unit)
             figures |= gained(f"{stem}_gain", trials, loop["before"], loop["after"], column)
-            figures |= gained(f"{stem}_alone", trials, loop["before"], loop["alone"], column)
-        report([loop])
+        sure = figures[f"changed_{short}_position_gain_low"]["value"] > 0
+        named += bool(loop["floor"] and loop["floor"]["name"]) and sure
+    figures["changed_named"] = figure([float(named)], "of 3 runs")
     show(figures)
-    record("measured", CLAIM, figures)
+    record("measured", CLAIM, figures, replacing="changed_")
+
+
+def run_log(settings: Benchmark, run: str) -> Log:
+    """Steps of one run, its last third held out."""
+    log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", (run,), chained=True)
+    return thin(without_lost(split(log, (f"{run}:0-0.667",), (f"{run}:0.667-1",))), settings.windows)
 
 
 def is_false(loop: dict[str, Any], fastest: float) -> bool:
@@ -321,14 +454,15 @@ def report(loops: list[dict[str, Any]]) -> None:
         print(f"{loop['verdict']} (p {loop['p_value']:.2g}): {loop['reason']}", flush=True)
         for one in loop["effects"]:
             print(f"  {one['name']} {one['parameters']}, class {', '.join(one['class'])}", flush=True)
+        if loop.get("floor"):
+            print(f"  floor: {loop['floor']}", flush=True)
 
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"ladder": (ladder, "drive_norlab"), "peers": (peers, "drive_norlab"), "change": (change, "drive_norlab"),
-             "mrclam": (mrclam, "mrclam")}
+    parts = {"ladder": ladder, "laws": laws, "peers": peers, "floors": floors, "change": change, "mrclam": mrclam}
     for name in settings.parts:
-        part, folder = parts[name]
+        part, folder = parts[name], "mrclam" if name == "mrclam" else "drive_norlab"
         if not (settings.shared / "data" / "measured" / folder).is_dir():
             print(f"{name}: {settings.shared / 'data' / 'measured' / folder} is not there, left out")
             continue

@@ -1,11 +1,16 @@
 """Measures what docs/reliability.md promises: damaged files, mistaken commands, kills and Ctrl-C.
 
-    python -m benchmarks.reliability --parts files options        # minutes; --damaged 2000 takes an hour
-    python -m benchmarks.reliability --parts kills ctrl_c         # hours: each command is killed --kills times
+    python -m benchmarks.reliability --parts files --rooms sysid  # minutes a room; that of the bridge takes an hour
+    python -m benchmarks.reliability --parts options              # minutes
+    python -m benchmarks.reliability --parts kills --commands fit # hours: each command is killed --kills times
+    python -m benchmarks.reliability --parts ctrl_c               # an hour
 
 Damaged files and mistaken commands are those of the tests, more of them. Kills and Ctrl-C meet the commands as users
 start them, at random moments. A run is lost work where its newest step is older than a minute, different where its
 results are not those of a run left alone, and half written where a file with its final name cannot be read.
+
+What was measured is kept in --keep: a benchmark that is stopped goes on there, and figures are those of all rooms and
+commands that it holds of this commit.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ import argparse
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,9 +33,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, figure, record
+from benchmarks.harness import RESULTS, figure, provenance, record
 from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.folders import write_whole
 
 CLAIM = "No file, mistake, kill or full disk ends in a traceback, lost work or half-written results"
 ROOT = Path(__file__).parents[1]
@@ -42,6 +49,19 @@ COMMANDS = {
               "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "20"],
 }  # fmt: skip
 """Runs of about five minutes on two cores."""
+QUICK = {
+    "fit": ["sysid.fit", CHAIR, "--quick"],
+    "close_loop": ["sysid.close_loop", CHAIR, "--quick"],
+    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "800",
+              "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "5"],
+}  # fmt: skip
+"""The same of about a minute."""
+ROOMS = {
+    "whill_mjx": ["whill_mjx/test_damaged_files.py"], "sysid": ["sysid/test_damaged_logs.py"],
+    "inputs": ["bridge/test_damaged_inputs.py"], "bridge": ["bridge/test_damaged_policy_files.py"],
+    "dreamer": ["dreamer/test_damaged_policies.py", "dreamer/test_damaged_checkpoints.py"],
+}  # fmt: skip
+"""Tests of readers, each room in a process."""
 RESULT = {"fit": "vehicle.toml", "close_loop": "vehicle.toml", "train": "policy/weights.npz"}
 """File whose bits are compared."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -60,17 +80,37 @@ def tested(words: list[str], **environment: str) -> tuple[int, list[str]]:
     return sum(all(part.tag != "skipped" for part in case) for case in cases), failed
 
 
-def damaged_files(count: int) -> Figures:
+class Kept:
+    """What was measured of this commit, a JSON file each."""
+
+    def __init__(self, folder: Path):
+        self.folder, self._commit = folder, provenance()["commit"]
+
+    def read(self, name: str) -> dict[str, Any]:
+        """What is known; empty where nothing is, or it is of another commit."""
+        path = self.folder / f"{name}.json"
+        found = json.loads(path.read_text()) if path.exists() else {}
+        return found if found.get("commit") == self._commit else {}
+
+    def write(self, name: str, found: dict[str, Any]) -> None:
+        """Keep it."""
+        write_whole(self.folder / f"{name}.json", json.dumps({**found, "commit": self._commit}, indent=1) + "\n")
+
+
+def damaged_files(rooms: list[str], count: int, kept: Kept) -> Figures:
     """Readers that let out another exception, hang or need too much, of `count` damaged files each."""
-    rooms = ("whill_mjx/test_damaged_files.py", "bridge/test_damaged_policy_files.py")
-    apart = ("sysid/test_damaged_logs.py",), ("dreamer/test_damaged_policies.py",)  # each room has a conftest
-    cases, failed = 0, list[str]()
-    for room in (rooms, *apart):
-        more, messages = tested([f"tests/{path}" for path in room], DAMAGED_FILES=str(count))
-        cases, failed = cases + more, failed + messages
+    for room in rooms:
+        if kept.read(f"files_{room}").get("count", 0) < count:
+            paths = [f"tests/{path}" for path in ROOMS[room]]
+            cases, failed = tested(paths, DAMAGED_FILES=str(count))
+            kept.write(f"files_{room}", {"count": count, "readers": cases, "failed": failed})
+            print(f"{room}: {cases} readers, {len(failed)} failed {[one[:300] for one in failed]}", flush=True)
+    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}"))}
+    failed = [one for found in known.values() for one in found["failed"]]
     hangs = [one for one in failed if "SECONDS" in one or "process_time" in one]
-    memory = [one for one in failed if "BYTES" in one or "_peak" in one]
-    about = {"files_per_reader": count, "readers": cases}
+    memory = [one for one in failed if "BYTES" in one or "_peak" in one or "MemoryError" in one]
+    about = {"files_per_reader": {room: found["count"] for room, found in known.items()},
+             "readers": sum(found["readers"] for found in known.values())}
     return {"fuzz_undocumented": {**figure([float(len(failed) - len(hangs) - len(memory))], "count"), **about},
             "fuzz_hangs": {**figure([float(len(hangs))], "count"), **about},
             "fuzz_memory": {**figure([float(len(memory))], "count"), **about}}
@@ -82,9 +122,9 @@ def mistaken_commands() -> Figures:
     return {"option_tracebacks": {**figure([float(len(failed))], "count"), "command_lines": cases}}
 
 
-def started(name: str, out: Path) -> subprocess.Popen[str]:
+def started(words: list[str], out: Path) -> subprocess.Popen[str]:
     """A command at work in a folder."""
-    return subprocess.Popen([sys.executable, "-m", *COMMANDS[name], "--out", str(out)], cwd=ROOT, text=True,
+    return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
                             env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
 
@@ -109,52 +149,64 @@ def newest(out: Path) -> float:
     return max((path.stat().st_mtime for path in out.rglob("*") if path.is_file()), default=0.0)
 
 
-def kill_again_and_again(name: str, kills: int, folder: Path, seed: int = 0) -> dict[str, int]:
+def kill_again_and_again(name: str, words: list[str], kills: int, kept: Kept) -> dict[str, Any]:
     """What `kills` kills of one run do, each signal in turn, and how long the run takes when left alone."""
-    chosen, straight, broken = random.Random(seed), folder / "straight", folder / "broken"
-    began = time.monotonic()
-    child = started(name, straight)
-    said = child.communicate()[1]
-    if child.returncode:
-        raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
-    seconds = time.monotonic() - began
-    found = {"lost": 0, "half_written": 0, "different": 0, "seconds": round(seconds), "kills": 0}
-    for number in (SIGNALS[k % len(SIGNALS)] for k in range(kills)):
-        child, begun = started(name, broken), time.time()
+    found, straight, broken = kept.read(f"kills_{name}"), *(kept.folder / f"{name}_{one}" for one in ("left", "killed"))
+    if found.get("words") != words:
+        for out in (straight, broken):
+            shutil.rmtree(out, ignore_errors=True)
+        began, child = time.monotonic(), started(words, straight)
+        said = child.communicate()[1]
+        if child.returncode:
+            raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
+        found = {"words": words, "seconds": round(time.monotonic() - began), "lost": 0, "half_written": 0,
+                 "different": 0, "wrong_ends": 0, "kills": 0, "ended": False}
+        kept.write(f"kills_{name}", found)
+    while found["kills"] < kills and not found["ended"]:
+        number = SIGNALS[found["kills"] % len(SIGNALS)]
+        chosen = random.Random(found["kills"])
+        child, begun = started(words, broken), time.time()
         try:
-            child.communicate(timeout=chosen.uniform(1.0, 3 * seconds / kills + 20.0))
-            break  # it has ended by itself
+            child.communicate(timeout=chosen.uniform(1.0, 3 * found["seconds"] / kills + 20.0))
+            found["ended"] = True  # by itself
         except subprocess.TimeoutExpired:
             found["lost"] += time.time() - max(newest(broken), begun) > MINUTE
             child.send_signal(number)
-            child.communicate()
+            said = child.communicate()[1]
             found["kills"] += 1
             found["half_written"] += len(half_written(broken))
-    child = started(name, broken)
-    child.communicate()
-    same = child.returncode == 0 and (broken / RESULT[name]).read_bytes() == (straight / RESULT[name]).read_bytes()
-    found["different"] += not same
+            found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
+        kept.write(f"kills_{name}", found)
+        print(f"{name}: {found}", flush=True)
+    if "same" not in found:
+        child = started(words, broken)
+        child.communicate()
+        there, here = (out / RESULT[name] for out in (straight, broken))
+        found["same"] = child.returncode == 0 and there.read_bytes() == here.read_bytes()
+        found["different"] = int(not found["same"])
+        kept.write(f"kills_{name}", found)
     print(f"{name}: {found}", flush=True)
     return found
 
 
-def killed_runs(names: list[str], kills: int) -> Figures:
+def killed_runs(commands: dict[str, list[str]], kills: int, kept: Kept) -> Figures:
     """Kills of all commands, summed."""
-    with tempfile.TemporaryDirectory() as folder:
-        found = {name: kill_again_and_again(name, kills, Path(folder) / name) for name in names}
-    about = {"kills": sum(one["kills"] for one in found.values()),
-             "seconds": {name: one["seconds"] for name, one in found.items()}}
-    return {f"kills_{what}": {**figure([float(sum(one[what] for one in found.values()))], "count"), **about}
-            for what in ("lost", "different", "half_written")}
+    for name, words in commands.items():
+        kill_again_and_again(name, words, kills, kept)
+    known = {name: found for name in COMMANDS if "same" in (found := kept.read(f"kills_{name}"))}
+    about = {"kills": {name: found["kills"] for name, found in known.items()},
+             "seconds": {name: found["seconds"] for name, found in known.items()}}
+    return {f"kills_{what}": {**figure([float(sum(one[what] for one in known.values()))], "count"), **about}
+            for what in ("lost", "different", "half_written", "wrong_ends")}
 
 
-def interrupted(names: list[str], count: int, seed: int = 0) -> Figures:
+def interrupted(commands: dict[str, list[str]], count: int, seed: int = 0) -> Figures:
     """Seconds from Ctrl-C at random moments to the end of the process, at its 95th percentile over `count` each."""
     chosen, seconds, wrong = random.Random(seed), [], 0
-    for name in names:
+    for name, words in commands.items():
         for _ in range(count):
             with tempfile.TemporaryDirectory() as folder:
-                child = started(name, Path(folder) / "run")
+                child = started(words, Path(folder) / "run")
                 time.sleep(chosen.uniform(0.5, 40.0))
                 began = time.monotonic()
                 child.send_signal(signal.SIGINT)
@@ -173,15 +225,20 @@ def main(arguments: list[str] | None = None) -> None:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--damaged", type=whole(), default=2000, help="damaged files for each reader")
+    parser.add_argument("--rooms", nargs="+", choices=tuple(ROOMS), default=list(ROOMS), help="readers of files")
     parser.add_argument("--kills", type=whole(), default=30, help="of each command")
     parser.add_argument("--interrupts", type=whole(), default=20, help="of each command")
     parser.add_argument("--commands", nargs="+", choices=tuple(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--quick", action="store_true", help="kill runs of a minute instead of five")
+    parser.add_argument("--keep", type=Path, default=Path("runs/reliability"), help="folder to go on in")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of reliability.json")
     given = parser.parse_args(arguments)
+    kept = Kept(given.keep)
+    commands = {name: (QUICK if given.quick else COMMANDS)[name] for name in given.commands}
     parts: dict[str, Callable[[], Figures]] = {
-        "files": lambda: damaged_files(given.damaged), "options": mistaken_commands,
-        "kills": lambda: killed_runs(given.commands, given.kills),
-        "ctrl_c": lambda: interrupted(given.commands, given.interrupts)}
+        "files": lambda: damaged_files(given.rooms, given.damaged, kept), "options": mistaken_commands,
+        "kills": lambda: killed_runs(commands, given.kills, kept),
+        "ctrl_c": lambda: interrupted(commands, given.interrupts)}
     for part in given.parts:
         print(record("reliability", CLAIM, parts[part](), given.out), flush=True)
 

@@ -141,7 +141,8 @@ def shared(settings: Benchmark) -> None:
             "verdict": report["verdict"], "reason": report["reason"],
             "effects": [{key: one[key] for key in ("name", "kind", "class", "parameters", "p_value")}
                         for one in report["effects"]],
-            "lives_in": report["lives_in"][:3], "before": report["before"], "after": report["after"],
+            "lives_in": report["lives_in"][:3], "as_it_was": report["before"], "before": report["refitted"],
+            "after": report["after"],
             "seconds": time.perf_counter() - began}
         print(name, report["verdict"], [one["name"] for one in report["effects"]], report["reason"], flush=True)
         write_json(path, content)

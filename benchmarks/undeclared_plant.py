@@ -283,7 +283,7 @@ def judge(
         write_run(work / "reports" / job.label, result, report)
         after = report["after"]["held_out"]["ground_truth"]
         content["heldout_ratio"] = after["trajectory"] / after["noise_floor"]["trajectory"]
-        before = report["before"]["held_out"]["ground_truth"]
+        before = report["refitted"]["held_out"]["ground_truth"]  # a fair peer: it may move base parameters too
         content["heldout_ratio_before"] = before["trajectory"] / before["noise_floor"]["trajectory"]
         content["full_seconds"] = time.perf_counter() - began
     verdict.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from bridge import ros
-from bridge.options import Parser, in_range
+from bridge.options import Parser, ends_at_ctrl_c, in_range
 from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
 
 SLOW = 0.15
@@ -60,6 +60,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Publish until SIGTERM or Ctrl-C."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)

@@ -14,6 +14,8 @@ PERIOD = 0.05
 """Seconds between two commands."""
 LONGEST = 600.0
 """Seconds that a manoeuvre may last."""
+LARGEST = 5_000_000
+"""Bytes of a command file: LONGEST at 100 Hz has 2 MB."""
 REACTION = 0.25
 """Seconds in which the vehicle drives on before any stop takes effect."""
 COLUMNS = ("t", "v", "omega")
@@ -68,33 +70,69 @@ class Reach:
 def read_commands(path: Path) -> np.ndarray:
     """Return the rows (N, 3) of a command file: t [s], v [m/s], omega [rad/s].
 
+    Columns after the third are not looked at.
+
     Raises:
-        ValueError: the file cannot be read, has other columns, or times that do not increase.
+        ValueError: the file cannot be read, is too large, has other columns, rows longer or shorter than the header,
+            or times that do not increase.
     """
+    reader = csv.reader(_text(path).splitlines())
     try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            lines = [line for line in csv.reader(file) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: {error}. Give a CSV file with the columns {','.join(COLUMNS)}.") from error
-    if not lines or tuple(name.strip() for name in lines[0][:3]) != COLUMNS:
-        raise ValueError(f"{path}: begins with {','.join(lines[0]) if lines else 'nothing'}; it must begin with the "
+        lines = [(reader.line_num, line) for line in reader if line]
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: is no CSV ({error}). Save the table again.") from None
+    header = lines[0][1] if lines else []
+    if tuple(name.strip() for name in header[:3]) != COLUMNS:
+        raise ValueError(f"{path}: begins with {_shown(header) if header else 'nothing'}; it must begin with the "
                          f"columns {','.join(COLUMNS)}. sysid.design and sysid.close_loop write such files.")
     rows: list[list[float]] = []
-    for number, line in enumerate(lines[1:], start=2):
-        try:
-            row = [float(cell) for cell in line[:3]]
-        except ValueError:
-            row = []
-        if len(row) != 3 or not all(math.isfinite(value) for value in row):
-            raise ValueError(f"{path}, line {number}: {','.join(line)!r} is not three finite numbers. Correct it.")
+    for number, line in lines[1:]:
+        if len(line) != len(header):
+            raise ValueError(f"{path}, line {number}: has {len(line)} cells, the header {len(header)}. Write decimals "
+                             "with a point.")
+        row = [_number(cell) for cell in line[:3]]
+        if not all(math.isfinite(value) for value in row):
+            raise ValueError(f"{path}, line {number}: {_shown(line)} is not three finite numbers. Correct it.")
         if rows and row[0] <= rows[-1][0]:
             raise ValueError(f"{path}, line {number}: t goes from {rows[-1][0]:g} to {row[0]:g}; it must increase. "
                              "Sort the rows.")
         rows.append(row)
-    if len(rows) < 2 or rows[-1][0] - rows[0][0] > LONGEST:
-        raise ValueError(f"{path}: {len(rows)} rows; a manoeuvre has at least 2 and lasts at most {LONGEST:g} s. "
+    if len(rows) < 2:
+        raise ValueError(f"{path}: has {'no row' if not rows else 'a single row'} of commands; a manoeuvre has at "
+                         "least 2. Give the whole file.")
+    if rows[-1][0] - rows[0][0] > LONGEST:
+        raise ValueError(f"{path}: lasts {rows[-1][0] - rows[0][0]:g} s; a manoeuvre lasts at most {LONGEST:g} s. "
                          "Split it.")
     return np.array(rows)
+
+
+def _text(path: Path) -> str:
+    """Text of a file of at most LARGEST bytes, with or without a byte-order mark."""
+    try:
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file. Give a CSV file with the columns {','.join(COLUMNS)}.")
+        with open(path, "rb") as file:
+            content = file.read(LARGEST + 1)
+        text = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}. Give a CSV file with the columns {','.join(COLUMNS)}.") from None
+    if len(content) > LARGEST:
+        raise ValueError(f"{path}: is larger than {LARGEST / 1e6:g} MB; a manoeuvre of {LONGEST:g} s needs less. "
+                         "Split it.")
+    return text
+
+
+def _number(cell: str) -> float:
+    """The number in a cell, nan where it is none; `1_0` is none, though Python reads it."""
+    try:
+        return float(cell) if cell.isascii() and "_" not in cell else math.nan
+    except ValueError:
+        return math.nan
+
+
+def _shown(cells: list[str]) -> str:
+    text = ",".join(cells)
+    return ascii(text if len(text) <= 60 else text[:57] + "...")[1:-1]
 
 
 def make_table(rows: np.ndarray, low: tuple[float, float], high: tuple[float, float], slew: tuple[float, float],

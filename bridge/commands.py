@@ -12,6 +12,9 @@ TYPES = {"geometry_msgs/msg/Twist": "Twist", "geometry_msgs/msg/TwistStamped": "
 """Message types of commands, and the words for them on the command line."""
 UNKNOWN = "_UNKNOWN_"
 """Part of the name that ROS gives to a node which it has not identified yet."""
+NAMELESS = "a node without a name"
+SETTLE = 1.0
+"""Seconds in which nodes that run already have found one another, on a loaded computer too."""
 HEARD_DEPTH = 50
 """Commands that may wait to be heard, so that none of another node is overwritten by ours."""
 GUARD_REPORTS = 3
@@ -67,6 +70,35 @@ class Ear:
             return False
         self._unknown.clear()
         return True
+
+
+class Commanders:
+    """Keeps account of the other nodes that publish commands; pure, with injected time.
+
+    Nodes find one another within some tenths of a second, under load later. So an empty list says little at first: it
+    counts when it has stayed the same for `SETTLE`.
+    """
+
+    def __init__(self, now: float) -> None:
+        self._found: list[str] = []
+        self._changed = self._named = now
+
+    def look(self, now: float, found: list[str]) -> None:
+        """Take the names that the graph knows at the steady time `now` [s]; unidentified ones contain `UNKNOWN`."""
+        if found != self._found:
+            self._found, self._changed = found, now
+        if not any(UNKNOWN in name for name in found):
+            self._named = now
+
+    def names(self, now: float) -> list[str]:
+        """Return who counts as a commander: a node with a name at once, one without a name when it stays."""
+        stays = now - self._named >= SETTLE
+        named = [name for name in self._found if UNKNOWN not in name]
+        return named + [NAMELESS for name in self._found if UNKNOWN in name and stays]
+
+    def settled(self, now: float) -> bool:
+        """Return whether nobody has come or gone for a while."""
+        return now - self._changed >= SETTLE
 
 
 @dataclass(frozen=True)
@@ -135,7 +167,10 @@ class CommandListener:
         return [endpoint for endpoint in without(found, *self._known) if UNKNOWN not in endpoint.node]
 
     def commanders(self) -> list[str]:
-        """Return the names of all other nodes that publish commands; one guard beside us is not among them."""
+        """Return the names of all other nodes that publish commands; one guard beside us is not among them.
+
+        The graph knows a node's endpoint before its name: such a name contains `UNKNOWN`, the guard's own too.
+        """
         found = endpoints(self.node.get_publishers_info_by_topic(self.name))
         return sorted(endpoint.node for endpoint in without(found, self._own, self._guard))
 

@@ -17,7 +17,7 @@ from bridge.bases import BASES
 from bridge.commands import endpoints
 from bridge.controller import Controller
 from bridge.diagnosis import Evidence, FrameLog, causes
-from bridge.options import Parser, in_range, result_file, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import SafetyConfig
 from bridge.vehicle_node import NOT_ACTIVE, VehicleNode, add_options, limits
@@ -141,6 +141,7 @@ class DriveNode(VehicleNode):
             starting=now - self._started < STARTING)
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Run the node until SIGTERM or Ctrl-C; return 2 where the policy file or an option is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)

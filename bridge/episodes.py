@@ -19,7 +19,6 @@ the server says so and closes. It listens on the loopback address unless another
 import contextlib
 import hmac
 import json
-import math
 import socket
 import socketserver
 import struct
@@ -202,7 +201,7 @@ class EpisodeServer:
             return "the first call must be hello"
         if message.get("protocol") != PROTOCOL:
             return f"protocol {message.get('protocol')!r} is not served; it is {PROTOCOL}"
-        if not hmac.compare_digest(str(message.get("token", "")).encode(), self._token.encode()):
+        if not hmac.compare_digest(str(message.get("token", "")).encode(errors="surrogatepass"), self._token.encode()):
             return "the token is wrong"
         return ""
 
@@ -254,7 +253,6 @@ def number(message: dict[str, Any], name: str, low: float, high: float, default:
         ValueError: it is missing, no number, or out of range.
     """
     value = message.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) \
-            or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ValueError(f"{name} is {repr(value)[:60]}; it must be a number from {low:g} to {high:g}")
     return float(value)

@@ -16,7 +16,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
-from bridge.options import Parser, whole
+from bridge.options import Parser, ends_at_ctrl_c, whole
 
 SILENCE = 0.15
 """[s]; a driving policy node gives a sign of life at least every 50 ms."""
@@ -138,7 +138,7 @@ def read_beat(text: str, **fields: type) -> dict[str, Any]:
     """Return the JSON object of a heartbeat, empty where a field is missing or of another type."""
     try:
         beat = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     whole = isinstance(beat, dict) and all(isinstance(beat.get(name), kind) for name, kind in fields.items())
     return beat if whole else {}
@@ -215,6 +215,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Guard until SIGTERM, Ctrl-C or the end of the node that is followed."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)

@@ -3,7 +3,8 @@
     python -m bridge.manoeuvre command.csv --space 6 4 --dataset logs/monday --trial circle --repeat 3
 
 Before anything moves, the commands are checked against the limits and the path against the free floor. The vehicle
-stands until an operator arms it (a message on bridge/rearm, or Enter in this terminal), once for each replicate.
+stands until an operator arms it (a message on bridge/rearm, or Enter in this terminal), once for each replicate. With
+`--ros-args -p use_sim_time:=true` the manoeuvre runs in simulated time, such as that of `bridge.simulate --clock`.
 Whatever stops `bridge.drive` stops a manoeuvre too. A stopped replicate is put aside and begins again from its start.
 """
 
@@ -13,6 +14,7 @@ import os
 import select
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,13 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
-from bridge.options import Parser, in_range, whole
+from bridge.fitted_reach import simulate_reach
+from bridge.options import Parser, ends_at_ctrl_c, in_range, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
 
+NAME = "bridge.manoeuvre"
 BACK = "bring the vehicle back to its start, then arm"
 FINISHED = "all replicates are driven"
 WIDEST = (2.0, 4.0)
@@ -41,6 +45,9 @@ class Player:
 
     def __init__(self, table: CommandTable, safety: SafetyConfig, repeat: int = 1) -> None:
         self.table, self.repeat = table, repeat
+        self.clock: Callable[[float], float] = lambda now: now
+        """Seconds of the clock that the table counts in, from the steady time; simulated time may be another one. What
+        stops the vehicle is always timed by the steady clock."""
         self.supervisor = Supervisor(safety)
         self.driven = 0
         """Replicates driven to their end."""
@@ -60,21 +67,24 @@ class Player:
     def on_tick(self, now: float) -> Command | None:
         """Return the next row of the table where it is due, zero where the vehicle must stand."""
         supervisor = self.supervisor
-        if self.elapsed is not None and not supervisor.may_drive:
-            self.elapsed, self.aborted = None, self.aborted + 1
-            return self._send(supervisor.tick(now))
+        if self.elapsed is not None:
+            command = supervisor.tick(now)  # sees that the rows have stopped, too
+            if not supervisor.may_drive:
+                self.elapsed, self.aborted = None, self.aborted + 1
+                return self._send(command)
         if self.finished:
             return self._send(supervisor.tick(now))
-        if now < self._due:
+        at = self.clock(now)
+        if at < self._due - 1e-6:  # stamps of simulated time are not exact sums of the period
             return None
-        self._due = now + PERIOD if now - self._due > PERIOD else self._due + PERIOD
+        self._due = at + PERIOD if at - self._due > PERIOD else self._due + PERIOD
         self._rows += 1
         supervisor.frame(now, now, self._rows)
         if not supervisor.may_drive:
             return self._send(supervisor.tick(now))
         if self.elapsed is None:
-            self._began = now
-        self.elapsed = now - self._began
+            self._began = at
+        self.elapsed = at - self._began
         if self.elapsed >= self.table.seconds:
             self.elapsed, self.driven = None, self.driven + 1
             supervisor.latch(FINISHED if self.finished else BACK)
@@ -102,6 +112,10 @@ class ManoeuvreNode(VehicleNode):
         self._driven_before = 0
         self.failure = ""
         """Why the drive ended early, such as a full disk."""
+        self._simulated = 0.0
+        if ros.uses_simulated_time(node):
+            player.clock = lambda _: self._simulated
+            ros.subscribe_clock(node, self._on_clock)
         ros.steady_timer(node, PERIOD / 2, self._on_progress)
         self.start()
 
@@ -112,12 +126,18 @@ class ManoeuvreNode(VehicleNode):
             self._over_since = time.monotonic()
         return bool(self.failure) or time.monotonic() - self._over_since > 1.0
 
+    def _on_clock(self, seconds: float) -> None:
+        """Take the simulated time, and send the row that is due."""
+        self._simulated = seconds
+        self._on_input(time.monotonic())
+        self._on_progress()
+
     def details(self) -> dict[str, Any]:
         """Return the progress of the manoeuvre."""
         player = self.player
         return {"manoeuvre": {"replicate": min(player.driven + 1, player.repeat), "of": player.repeat,
                               "elapsed": player.elapsed, "seconds": player.table.seconds,
-                              "aborted": player.aborted}}
+                              "driven": player.driven, "aborted": player.aborted}}
 
     @property
     def _recording(self) -> TrialWriter | None:
@@ -163,7 +183,7 @@ def _enter_was_pressed() -> bool:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = Parser(prog="bridge.manoeuvre", description="Drive a command file and record it.")
+    parser = Parser(prog=NAME, description="Drive a command file and record it.")
     parser.add_argument("commands", type=Path, help="CSV file with the columns t,v,omega")
     parser.add_argument("--space", type=in_range(1e-3, 1e3), nargs=2, required=True, metavar=("LENGTH", "WIDTH"),
                         help="free floor [m]; nothing else may stand or walk on it")
@@ -171,6 +191,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="of the vehicle around its drive-axle centre [m]; default: a WHILL with its rider's feet")
     parser.add_argument("--uncertainty", type=in_range(1e-3, 0.999), default=0.15,
                         help="how much faster or slower the vehicle may be than commanded; default 0.15")
+    parser.add_argument("--vehicle-file", type=Path, metavar="FILE",
+                        help="vehicle file of sysid.fit: the path is simulated for vehicles drawn from its intervals, "
+                             "in place of --uncertainty")
+    parser.add_argument("--draws", type=whole(1, 10_000), default=64, help="how many; default 64")
     parser.add_argument("--slew", type=in_range(1e-3, 1e3), nargs=2, metavar=("V", "OMEGA"), default=(1.0, 2.0),
                         help="steepest change of the commands [m/s2, rad/s2]; default 1 2")
     parser.add_argument("--repeat", type=whole(), default=1, help="replicates, each of them armed by an operator")
@@ -193,12 +217,21 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
     """
     low, high = limits((-WIDEST[0], -WIDEST[1]), WIDEST, options)
     table = make_table(read_commands(options.commands), low, high, tuple(options.slew), str(options.commands))
-    place = check_space(reach_of(table, options.radius, options.uncertainty), tuple(options.space))
+    if options.vehicle_file is None:
+        place = check_space(reach_of(table, options.radius, options.uncertainty), tuple(options.space))
+    else:
+        print(f"{NAME}: simulating the manoeuvre with {options.vehicle_file} ...", file=sys.stderr)
+        fitted = simulate_reach(table, options.vehicle_file, options.radius, options.draws)
+        try:
+            place = f"{check_space(fitted.widest, tuple(options.space))} In simulation {fitted}."
+        except ValueError as error:
+            raise ValueError(f"{options.commands}: in simulation {fitted}. So {error}") from None
     safety = SafetyConfig(low=low, high=high, hold_zeros=BASES[options.base].hold_zeros, frame_age=0.25,
                           stamp_age=math.inf, require_arm=True, auto_resume=False)
     return table, safety, place
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Drive until all replicates are done, SIGTERM or Ctrl-C.
 
@@ -214,12 +247,12 @@ def main(arguments: list[str] | None = None) -> int:
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
-        print(f"bridge.manoeuvre: {error}", file=sys.stderr)
+        print(f"{NAME}: {error}", file=sys.stderr)
         return 2
-    print(f"bridge.manoeuvre: {place}", file=sys.stderr)
+    print(f"{NAME}: {place}", file=sys.stderr)
     if options.check:
         return 0
-    print(f"bridge.manoeuvre: {table.seconds:.0f} s, {options.repeat} times. Arm each with Enter, or with a message on "
+    print(f"{NAME}: {table.seconds:.0f} s, {options.repeat} times. Arm each with Enter, or with a message on "
           f"{ros.REARM_TOPIC}.", file=sys.stderr)
     with ros.node_session(ros.MANOEUVRE_NAME, ros_arguments, options.realtime) as node:
         player = Player(table, safety, options.repeat)
@@ -229,7 +262,7 @@ def main(arguments: list[str] | None = None) -> int:
         finally:
             manoeuvre.close()
     if manoeuvre.failure:
-        print(f"bridge.manoeuvre: {manoeuvre.failure}", file=sys.stderr)
+        print(f"{NAME}: {manoeuvre.failure}", file=sys.stderr)
         return 4
     return 0 if player.finished else 3
 

@@ -7,8 +7,24 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import NoReturn
+
+
+def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
+    """Let a command's `main` return 130 after one line where Ctrl-C comes before or after its node spins."""
+
+    @wraps(main)
+    def guarded(arguments: list[str] | None = None) -> int:
+        try:
+            return main(arguments)
+        except KeyboardInterrupt:
+            name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
+            print(f"{name}: stopped (SIGINT)", file=sys.stderr)
+            return 130
+
+    return guarded
 
 
 class Parser(argparse.ArgumentParser):

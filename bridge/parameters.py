@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+LARGEST = 100_000
+"""Bytes of a parameter file; those of the bridge have 2 kB."""
 OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that every ROS node has; the node itself reads them."""
 
@@ -32,7 +34,7 @@ def as_options(ros_arguments: list[str], node: str, positional: str = "") -> lis
             values[name.rpartition(":")[2]] = _yaml(text)
     words: list[str] = []
     for name, value in values.items():
-        if name in OF_ROS or name.startswith("qos_overrides."):
+        if name in OF_ROS or str(name).startswith("qos_overrides."):
             continue
         if name == positional:
             words.insert(0, str(value))
@@ -48,24 +50,44 @@ def read_file(path: Path, node: str) -> dict[str, Any]:
         ValueError: the file is missing or is no parameter file.
     """
     try:
-        sections = _yaml(path.read_text(encoding="utf-8"))
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file. Give an existing parameter file.")
+        with path.open("rb") as file:
+            content = file.read(LARGEST + 1)
+        text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: {error}. Give an existing parameter file.") from error
+        raise ValueError(f"{path}: {error}. Give an existing parameter file.") from None
+    if len(content) > LARGEST:
+        raise ValueError(f"{path}: is larger than {LARGEST / 1000:g} kB. Give a parameter file.")
+    try:
+        sections = _yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     if not isinstance(sections, dict):
         raise ValueError(f"{path}: holds {type(sections).__name__}; a parameter file maps node names to "
                          "`ros__parameters`. Correct it.")
     values: dict[str, Any] = {}
     for name, section in sections.items():
         if str(name).rpartition("/")[2] in ("**", "*", node) and isinstance(section, dict):
-            values.update(section.get("ros__parameters") or {})
+            table = section.get("ros__parameters") or {}
+            if not isinstance(table, dict) or not all(map(_is_plain, table.values())):
+                raise ValueError(f"{path}: {str(name)[:60]!r} has ros__parameters that are no numbers, texts or lists "
+                                 "of them by name. Correct it.")
+            values.update(table)
     return values
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value is a number, a text, or a list of such."""
+    items = value if isinstance(value, list) else [value]
+    return all(item is None or isinstance(item, bool | int | float | str) for item in items)
 
 
 def _option(name: str, value: Any) -> Iterator[str]:
     """Yield the words of one option; false and empty values leave the default."""
     if value is False or value is None or value == "":
         return
-    yield "--" + name.replace("_", "-")
+    yield "--" + str(name).replace("_", "-")
     if value is not True:
         yield from (str(item) for item in (value if isinstance(value, list) else [value]))
 
@@ -75,5 +97,5 @@ def _yaml(text: str) -> Any:
 
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"ROS parameters: {error}. Correct the YAML.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # also a date that is none
+        raise ValueError(f"ROS parameters: {' '.join(str(error).split())[:300]}. Correct the YAML.") from None

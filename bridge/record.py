@@ -11,6 +11,7 @@ killed recorder leaves the hidden folder with all rows but the last second's; `-
 
 import argparse
 import contextlib
+import importlib
 import math
 import os
 import re
@@ -22,8 +23,9 @@ from typing import IO, Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.options import Parser, in_range
-from bridge.streams import Stream
+from bridge.mcap_file import McapWriter, mend
+from bridge.options import Parser, ends_at_ctrl_c, in_range
+from bridge.streams import DEPTH, Stream
 
 COLUMNS = {
     "command": ("t", "v", "omega"),
@@ -31,10 +33,14 @@ COLUMNS = {
     "ground_truth": ("t", "x", "y", "yaw", "stamp"),
     "imu": ("t", "gyro", "stamp"),
 }
+MCAP = "recording.mcap"
+"""File of a trial with the whole messages of all topics."""
 TRIAL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 PARTIAL = re.compile(r"\.(?P<trial>[A-Za-z0-9][\w.-]*)\.partial-(?P<process>\d+)")
 
 
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+"""Types that are kept whole on request only: they take megabytes a second."""
 LOOK_PERIOD = 0.1
 """Seconds between two looks for publishers."""
 
@@ -53,6 +59,7 @@ class TrialWriter:
         self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
         self._partial.mkdir()
         self._files: dict[str, IO[str]] = {}
+        self._mcap: McapWriter | None = None
         self._origin: float | None = None
         self._waiting: tuple[float, float] | None = None
         self._last: dict[str, float] = {}
@@ -104,10 +111,18 @@ class TrialWriter:
         """Add the yaw rate [rad/s] of an inertial measurement unit."""
         self._add("imu", t, gyro, stamp)
 
+    def message(self, topic: str, kind: Any, data: bytes) -> None:
+        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file."""
+        if self._mcap is None:
+            self._mcap = McapWriter(self._partial / MCAP)
+        self._mcap.write(topic, kind, data)
+
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""
         for file in self._files.values():
             file.flush()
+        if self._mcap is not None:
+            self._mcap.flush()
 
     def close(self) -> Path:
         """End the recording: give the trial its name and return its folder.
@@ -125,6 +140,11 @@ class TrialWriter:
             finally:
                 with contextlib.suppress(OSError):
                     file.close()
+        if self._mcap is not None:
+            try:
+                self._mcap.close()
+            except OSError as error:
+                failure = error
         if failure is not None:
             raise OSError(failure.errno, f"{failure.strerror}: the recording is cut off; what was written lies in "
                                          f"{self._partial}. Make room and record again")
@@ -153,8 +173,8 @@ class TrialWriter:
             if self._waiting is not None:
                 self._add("command", t, *self._waiting)
         t = round(t - self._origin, 6)
-        if t <= self._last.get(stream, -math.inf):
-            return  # two messages within a microsecond
+        if t < 0 or t <= self._last.get(stream, -math.inf):
+            return  # stamped before the first pose, or two messages within a microsecond
         self._last[stream] = t
         self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1
@@ -177,7 +197,7 @@ def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
         'reference_point = "drive axle centre"\n'
         f"odometry = {toml_text(options.odometry_topic)}\n"
         f"ground_truth = {toml_text(options.ground_truth_topic)}\n"
-        "held_out = []   # trials to be predicted, never fitted\n"
+        f"held_out = [{', '.join(map(toml_text, options.held_out))}]   # trials to be predicted, never fitted\n"
     )
     temporary = path.with_name(".dataset.toml.tmp")
     temporary.write_text(text, encoding="utf-8")
@@ -189,8 +209,36 @@ def toml_text(text: str) -> str:
     return '"' + "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in text) + '"'
 
 
+class StampedListener(CommandListener):
+    """Hears commands with their own time, and whole."""
+
+    def __init__(self, node: Any, topic: str, on_message: Callable[[Any, float, float, float], None]) -> None:
+        """Listen in the type that the base hears.
+
+        `on_message` gets the message, its stamp [s] (0 where it has none), v [m/s] and omega [rad/s].
+        """
+        self._on_message = on_message
+        super().__init__(node, topic, "auto", lambda v, omega: None)
+
+    def _open(self, kind: str) -> None:
+        from geometry_msgs import msg
+
+        def heard(message: Any) -> None:
+            planar, stamp = message, 0.0
+            if kind == "TwistStamped":
+                planar, stamp = message.twist, ros.stamp_seconds(message.header.stamp)
+            self._on_message(message, stamp, planar.linear.x, planar.angular.z)
+
+        self.kind = kind
+        ros.subscribe_own(self.node, getattr(msg, kind), self.name, heard, ros.best_effort(DEPTH))
+
+
 class RecordNode:
-    """Writes the streams of the graph to one trial; all times are those of receipt on the steady clock."""
+    """Writes the streams of the graph to one trial.
+
+    Times are those of receipt on the steady clock. With `--time stamp` they are the messages' own; a command without
+    one has the node's time at its receipt.
+    """
 
     def __init__(self, node: Any, writer: TrialWriter | None, options: argparse.Namespace, seconds: float = 0.0
                  ) -> None:
@@ -203,10 +251,13 @@ class RecordNode:
         """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
         self._seconds = seconds
-        self._commands = CommandListener(node, options.command_topic, "auto", self._on_command)
+        self._node, self._by_stamp = node, options.time == "stamp"
+        self._commands = StampedListener(node, options.command_topic, self._on_command)
         self.streams = [Stream(node, Odometry, options.odometry_topic, self._on_odometry),
                         Stream(node, Odometry, options.ground_truth_topic, self._on_ground_truth),
                         Stream(node, Imu, options.imu_topic, self._on_imu)]
+        self._images = options.images
+        self._whole: dict[str, Stream] | None = {} if options.mcap or options.images else None
         ros.steady_timer(node, LOOK_PERIOD, self._look)
         ros.steady_timer(node, 1.0, self._flush)
 
@@ -216,31 +267,65 @@ class RecordNode:
 
     def lost(self) -> dict[str, int]:
         """Return how many messages of each topic the middleware lost, where it lost any."""
-        return {stream.name: stream.lost for stream in self.streams if stream.lost}
+        heard = [*self.streams, *(self._whole or {}).values()]
+        return {stream.name: stream.lost for stream in heard if stream.lost}
 
     def _look(self) -> None:
         self._commands.look()
         for stream in self.streams:
             stream.look()
+        if self._whole is not None:
+            self._look_for_topics(self._whole)
+
+    def _look_for_topics(self, known: dict[str, Stream]) -> None:
+        """Listen to every topic of the graph, whose messages go whole into the MCAP file."""
+        for topic, kinds in self._node.get_topic_names_and_types():
+            kind = message_class(kinds[0])
+            own = topic == self._commands.name  # a second reader of commands would look like a base that listens
+            if topic in known or own or kind is None or (kinds[0] in IMAGES and not self._images):
+                continue
+            if self._node.get_publishers_info_by_topic(topic):
+                known[topic] = Stream(self._node, kind, topic, self._keeper(topic, kind), raw=True)
+        for stream in known.values():
+            stream.look()
+
+    def _keeper(self, topic: str, kind: Any) -> Callable[[bytes], None]:
+        def keep(data: bytes) -> None:
+            self._write(lambda writer: writer.message(topic, kind, data))
+
+        return keep
 
     def _flush(self) -> None:
         self._write(lambda writer: writer.flush())
 
-    def _on_command(self, v: float, omega: float) -> None:
-        now = time.monotonic()
-        self._write(lambda writer: writer.command(now, v, omega))
+    def _time(self, stamp: float) -> float:
+        """Return the time that a message of this stamp gets."""
+        if not self._by_stamp:
+            return time.monotonic()
+        return stamp or self._node.get_clock().now().nanoseconds * 1e-9
+
+    def _on_command(self, message: Any, stamp: float, v: float, omega: float) -> None:
+        t = self._time(stamp)
+        self._write(lambda writer: writer.command(t, v, omega))
+        if self._whole is not None:
+            from rclpy.serialization import serialize_message
+
+            self._keeper(self._commands.name, type(message))(serialize_message(message))
 
     def _on_odometry(self, message: Any) -> None:
-        now, speed, stamp = time.monotonic(), message.twist.twist, ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.odometry(now, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
+        speed, stamp = message.twist.twist, ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.odometry(t, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
-        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.ground_truth(now, *planar_pose(message), stamp))
+        stamp = ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.ground_truth(t, *planar_pose(message), stamp))
 
     def _on_imu(self, message: Any) -> None:
-        now, stamp = time.monotonic(), ros.stamp_seconds(message.header.stamp)
-        self._write(lambda writer: writer.imu(now, message.angular_velocity.z, stamp))
+        stamp = ros.stamp_seconds(message.header.stamp)
+        t = self._time(stamp)
+        self._write(lambda writer: writer.imu(t, message.angular_velocity.z, stamp))
 
     def _write(self, write: Callable[[TrialWriter], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
@@ -249,6 +334,15 @@ class RecordNode:
                 write(self.writer)
         except OSError as error:
             self.failure = self.failure or error
+
+
+def message_class(name: str) -> Any:
+    """Return the class of a message such as nav_msgs/msg/Odometry; None where its package is not installed."""
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError):
+        return None
 
 
 def recover(dataset: Path) -> list[Path]:
@@ -268,6 +362,8 @@ def recover(dataset: Path) -> list[Path]:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for path in partial.glob("*.csv"):
             drop_torn_row(path)
+        for path in partial.glob(MCAP):
+            mend(path)
         os.replace(partial, folder)
         found.append(folder)
     return found
@@ -289,7 +385,7 @@ def is_running(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:
+    except (OSError, OverflowError):  # somebody else's, or no number that a process can have: left alone
         return True
     return True
 
@@ -322,6 +418,14 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
     parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
     parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
+    parser.add_argument("--time", choices=("receipt", "stamp"), default="receipt",
+                        help="what `t` is: when a message came, or its own stamp, for sensors that share one clock")
+    parser.add_argument("--mcap", action="store_true",
+                        help=f"also keep every message of every topic in the trial's {MCAP}, which Foxglove, ros2 bag "
+                             "and sysid.convert read; without images and point clouds")
+    parser.add_argument("--images", action="store_true", help="the same with images and point clouds")
+    parser.add_argument("--held-out", nargs="+", default=[], metavar="TRIAL",
+                        help="trials that dataset.toml names as never to be fitted")
     parser.add_argument("--vehicle", default="WHILL Model CR")
     parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
     parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")
@@ -356,6 +460,7 @@ def main_recover(dataset: Path) -> int:
     return 0
 
 
+@ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Record until the time is over, SIGTERM or Ctrl-C.
 

@@ -4,6 +4,7 @@ Only functions import rclpy, so the package can be imported, and its pure parts 
 """
 
 import json
+import math
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ ODOMETRY_TOPIC = "whill/odom"
 IMU_TOPIC = "imu"
 CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
 SCAN_TOPIC = "sensing/lidar/scan"
+MAP_TOPIC = "map"
 PAUSE_TOPIC = "simulate/pause"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
@@ -106,18 +108,22 @@ def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any],
 
 
 def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
-                              lost: Callable[[Any], None], **callbacks: Any) -> Any:
-    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription."""
+                              lost: Callable[[Any], None], raw: bool = False, **callbacks: Any) -> Any:
+    """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription.
+
+    With `raw` the callback gets the serialised message.
+    """
+    more = {"raw": True} if raw else {}
     try:
         from rclpy.event_handler import UnsupportedEventTypeError
     except ImportError:  # Humble
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
         events = subscription_events(message_lost=lost, **callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events)
+        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
 
 
 def is_reliable(policy: Any) -> bool:
@@ -172,21 +178,41 @@ def clock_publisher(node: Any) -> Callable[[int, int], None]:
     return publish
 
 
-def transform_publisher(node: Any) -> Callable[[Any], None]:
-    """Return a function that publishes an odometry's pose on /tf; it does nothing where tf2_msgs is not installed."""
+def uses_simulated_time(node: Any) -> bool:
+    """Return whether the node's time is that on /clock (`--ros-args -p use_sim_time:=true`)."""
+    return bool(node.get_parameter("use_sim_time").value)
+
+
+def subscribe_clock(node: Any, callback: Callable[[float], None]) -> None:
+    """Call with the seconds of each message on /clock, which the node's clock shows by then."""
+    from rclpy.time import Time
+    from rosgraph_msgs.msg import Clock
+
+    def heard(message: Any) -> None:
+        node.get_clock().set_ros_time_override(Time.from_msg(message.clock))  # its own reader may hear it later
+        callback(stamp_seconds(message.clock))
+
+    node.create_subscription(Clock, "/clock", heard, best_effort())
+
+
+def transform_publisher(node: Any) -> Callable[[str, str, Any, float, float, float], None]:
+    """Return a function that publishes a frame in another one, its stamp, x, y [m] and yaw [rad] on /tf.
+
+    It does nothing where tf2_msgs is not installed.
+    """
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
-        return lambda odometry: None
+        return lambda parent, child, stamp, x, y, yaw: None
     from geometry_msgs.msg import TransformStamped
 
-    publisher = node.create_publisher(TFMessage, "/tf", reliable(10))
+    publisher = node.create_publisher(TFMessage, "/tf", reliable(100))
 
-    def publish(odometry: Any) -> None:
-        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
-        position = odometry.pose.pose.position
-        message.transform.translation.x, message.transform.translation.y = position.x, position.y
-        message.transform.rotation = odometry.pose.pose.orientation
+    def publish(parent: str, child: str, stamp: Any, x: float, y: float, yaw: float) -> None:
+        message = TransformStamped(child_frame_id=child)
+        message.header.frame_id, message.header.stamp = parent, stamp
+        message.transform.translation.x, message.transform.translation.y = x, y
+        message.transform.rotation.z, message.transform.rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
         publisher.publish(TFMessage(transforms=[message]))
 
     return publish

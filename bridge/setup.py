@@ -19,6 +19,6 @@ setup(cmdclass={"build_py": BuildModules}, data_files=[
     ("share/ament_index/resource_index/packages", ["resource/whill_bridge"]),
     (SHARE, ["package.xml", "fastdds.xml"]),
     (f"{SHARE}/launch", sorted(glob("launch/*.launch.py"))),
-    (f"{SHARE}/config", sorted(glob("config/*.yaml"))),
+    (f"{SHARE}/config", sorted([*glob("config/*.yaml"), *glob("config/*.rviz"), *glob("config/*.json")])),
     (f"{SHARE}/systemd", sorted(glob("systemd/*.service"))),
 ])

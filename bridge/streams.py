@@ -16,9 +16,9 @@ class Stream:
     best-effort publisher. So the reader is made when the publishers are known, and made again when others come.
     """
 
-    def __init__(self, node: Any, kind: Any, topic: str, on_message: Callable[[Any], None]) -> None:
-        """Watch a topic; call `look` some times a second."""
-        self.node, self.kind, self.name = node, kind, node.resolve_topic_name(topic)
+    def __init__(self, node: Any, kind: Any, topic: str, on_message: Callable[[Any], None], raw: bool = False) -> None:
+        """Watch a topic; call `look` some times a second. With `raw` messages come serialised."""
+        self.node, self.kind, self.name, self.raw = node, kind, node.resolve_topic_name(topic), raw
         self.lost = 0
         """Messages that the middleware reports as lost."""
         self._on_message = on_message
@@ -38,7 +38,11 @@ class Stream:
     def _open(self, reliable: bool) -> None:
         before, self._reliable = self._reader, reliable
         profile = ros.reliable(DEPTH) if reliable else ros.best_effort(DEPTH)
-        self._reader = ros.subscribe_counting_losses(self.node, self.kind, self.name, self._heard, profile, self._count)
+        if before is not None and self.raw:  # whose messages cannot be told apart while there are two readers
+            self.node.destroy_subscription(before)
+            before = None
+        self._reader = ros.subscribe_counting_losses(self.node, self.kind, self.name, self._heard, profile, self._count,
+                                                     self.raw)
         if before is not None:
             self.node.destroy_subscription(before)
 

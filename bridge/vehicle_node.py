@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from bridge import inputs, ros
 from bridge.bases import BASES
-from bridge.commands import CommandTopic, Ear, Endpoint
+from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
 from bridge.guard import BEAT_PERIOD, GuardLink
 from bridge.options import in_range, whole
 from bridge.safety import Command, State, Supervisor
@@ -29,6 +29,7 @@ STATUS_PERIOD = 1.0
 CLOCK_STEP = 0.1
 """Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
 NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
+LOOKING = "looking for other nodes that publish commands"
 NOT_ACTIVE = "not activated"
 GUARD_STOPPED = "the guard stopped the vehicle"
 
@@ -69,6 +70,7 @@ class VehicleNode:
         self._looked = self._said = -math.inf
         self._clock_offset = time.time() - self._started
         self._reported: tuple[str, ...] = ()
+        self._others = Commanders(self._started)
         self._commanders: list[str] = []
         self._listeners: list[Endpoint] = []
         self._guard_stops = 0
@@ -84,6 +86,7 @@ class VehicleNode:
     def start(self) -> None:
         """Begin to watch; the vehicle stands until its base was found."""
         self.supervisor.block(NO_BASE, True)
+        self.supervisor.block(LOOKING, not self.options.allow_other_commanders)
         self._on_watch()
         ros.steady_timer(self.node, WATCH_PERIOD, self._on_watch)
         ros.steady_timer(self.node, BEAT_PERIOD, self._on_beat)
@@ -189,15 +192,17 @@ class VehicleNode:
 
     def _on_look(self) -> None:
         """Look at the graph: who listens, who else commands; keep the guard running."""
-        self.guard.keep(time.monotonic())
+        now = time.monotonic()
+        self.guard.keep(now)
         self.commands.look()
         self._listeners = self.commands.listeners()
         fitting = [end for end in self._listeners if end.type.endswith("/" + self.commands.kind)]
         self.supervisor.block(NO_BASE, not (self.commands.kind and fitting))
-        before, self._commanders = self._commanders, self.commands.commanders()
-        # seen twice: at first a node's name, the guard's too, is not known yet
-        others = bool(before and self._commanders) and not self.options.allow_other_commanders
-        self.supervisor.block(COMMANDERS, others)
+        self._others.look(now, self.commands.commanders())
+        self._commanders = self._others.names(now)
+        alone = not self.options.allow_other_commanders
+        self.supervisor.block(COMMANDERS, alone and bool(self._commanders))
+        self.supervisor.block(LOOKING, alone and not self.supervisor.may_drive and not self._others.settled(now))
         if (self.supervisor.state.value, self.supervisor.reason) != self._reported[:2]:
             self._on_status()
 

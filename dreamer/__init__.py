@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from dreamer.policy import Policy as Policy
     from dreamer.spaces import Box as Box
     from dreamer.spaces import Discrete as Discrete
+    from dreamer.train import TrainingOptions as TrainingOptions
     from dreamer.train import TrainResult as TrainResult
     from dreamer.types import FunctionalEnv as FunctionalEnv
     from dreamer.types import Mirror as Mirror
@@ -32,6 +33,7 @@ _HOMES = {
     "Box": "dreamer.spaces",
     "Discrete": "dreamer.spaces",
     "from_gym": "dreamer.gym",
+    "TrainingOptions": "dreamer.train",
     "TrainResult": "dreamer.train",
     "Policy": "dreamer.policy",
     "PolicyContract": "dreamer.export",

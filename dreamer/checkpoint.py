@@ -28,6 +28,8 @@ from dreamer import parallel
 KEEP = 2
 UNFINISHED = ".unfinished-"
 SCHEMA = 1
+ENTRIES = {"config": dict, "files": dict, "env_steps": int, "wall_s": int | float}
+"""Entries of meta.json and their kinds."""
 
 
 class CheckpointError(ValueError):
@@ -169,8 +171,15 @@ def load(path: Path, template: Any, config: Any) -> tuple[Any, dict[str, Any]]:
                 f"{path / name}: length or checksum is not what was written, so the file is damaged. "
                 f"Delete {path} and resume from an older checkpoint, or start in a new folder."
             )
-    with _checkpointer(ocp) as reader:
-        arrays = reader.restore((path / "state").resolve())
+    try:
+        with _checkpointer(ocp) as reader:
+            arrays = reader.restore((path / "state").resolve())
+    except MemoryError:
+        raise
+    except Exception as error:  # a file that meta.json does not list, say; orbax's errors have no common class
+        reason = " ".join(str(error).split())[:160]
+        raise Damaged(f"{path / 'state'}: cannot be read ({reason}). Delete {path} and resume from an older "
+                      "checkpoint, or start in a new folder.") from None
     leaves = {name: _from_numpy(path, name, leaf, arrays) for name, leaf in _named_leaves(template).items()}
     return jax.tree.unflatten(jax.tree.structure(template), list(leaves.values())), meta
 
@@ -189,14 +198,14 @@ def _checkpointer(ocp: Any) -> Any:
 
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
-        meta = json.loads((path / "meta.json").read_text())
-        if meta["schema"] == SCHEMA and {"config", "files", "env_steps", "wall_s"} <= set(meta):
+        meta = json.loads((path / "meta.json").read_text(encoding="utf-8"))
+        if meta["schema"] == SCHEMA and all(isinstance(meta.get(name), kind) for name, kind in ENTRIES.items()):
             return meta
-        problem = f"schema {meta['schema']} is not {SCHEMA}, or an entry is missing"
+        problem = f"schema {str(meta['schema'])[:60]} is not {SCHEMA}, or an entry is missing or of another kind"
     except FileNotFoundError:
         raise Damaged(f"{path}: there is no such checkpoint. Resume from an older one or start anew.") from None
-    except (ValueError, KeyError, TypeError) as error:
-        problem = f"not readable as JSON with the expected entries ({error})"
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        problem = f"not readable as JSON with the expected entries ({str(error)[:160]})"
     raise Damaged(f"{path / 'meta.json'}: {problem}. Delete {path} or use the version that wrote it.")
 
 

@@ -100,7 +100,7 @@ def check(obs_shape: ObsShape, obs: Any, instances: int) -> None:
 
 
 class Actions(Protocol):
-    """A kind of action. `raw` are the policy head's outputs (..., outputs) in float32."""
+    """A kind of action. `raw` are the policy head's outputs (..., outputs) in float32, without a unit."""
 
     @property
     def width(self) -> int:
@@ -111,32 +111,32 @@ class Actions(Protocol):
         """Outputs of the policy head."""
 
     def noise(self, key: jax.Array, batch: Shape) -> jax.Array:
-        """Random numbers that `sample` turns into actions."""
+        """Random numbers (*batch, ...) without a unit that `sample` turns into actions."""
 
     def sample(self, config: DreamerConfig, raw: jax.Array, noise: jax.Array) -> jax.Array:
-        """Drawn actions (..., width)."""
+        """Drawn actions (..., width), normalised."""
 
     def mode(self, config: DreamerConfig, raw: jax.Array) -> jax.Array:
-        """Best actions (..., width)."""
+        """Best actions (..., width), normalised."""
 
     def random(self, key: jax.Array, batch: Shape) -> jax.Array:
-        """Actions (..., width) that are uniform over all possible ones."""
+        """Actions (*batch, width), normalised and uniform over all possible ones."""
 
     def score(self, config: DreamerConfig, raw: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Log-probability (...) of actions (..., width), and entropy (...) [nat]."""
 
     def saturation(self, raw: jax.Array) -> jax.Array:
-        """How far (...) the best action lies beyond where gradients reach it; 0 where that cannot happen."""
+        """How far (...), without a unit, the best action lies beyond where gradients reach it; 0 where it cannot."""
 
     def watch(self, config: DreamerConfig, raw: jax.Array) -> dict[str, jax.Array]:
-        """Scalars worth logging."""
+        """Scalars () worth logging by name, without a unit."""
 
     def to_env(self, action: jax.Array) -> jax.Array:
-        """The actions (..., width) as the environment receives them."""
+        """Normalised actions (..., width) as the environment receives them: (..., width), or classes (...) int32."""
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(Actions):
     """Actions in [-1, 1]^size: a normal with bounded mean and deviation, whose samples are clipped for the outside."""
 
     size: int
@@ -150,7 +150,7 @@ class Box:
         return 2 * self.size
 
     def normal(self, config: DreamerConfig, raw: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean and standard deviation (..., A)."""
+        """Mean and standard deviation (..., A) of normalised actions."""
         mean, std = jnp.split(raw, 2, -1)
         return dist.bounded_normal(mean, std, config.min_std, config.max_std)
 
@@ -182,7 +182,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Discrete:
+class Discrete(Actions):
     """One of n classes, drawn from a categorical with a uniform share. The environment receives (...) int32."""
 
     classes: int
@@ -196,7 +196,7 @@ class Discrete:
         return self.classes
 
     def probs(self, config: DreamerConfig, raw: jax.Array) -> jax.Array:
-        """Probabilities (..., n)."""
+        """Probabilities (..., n), without a unit."""
         return dist.unimix_probs(raw, config.unimix)
 
     def noise(self, key: jax.Array, batch: Shape) -> jax.Array:

@@ -28,7 +28,7 @@ from dreamer.iteration import TrainState, compile_init, compile_iteration, init_
 from dreamer.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
-__all__ = ["TrainResult", "TrainState", "evaluate", "init_state", "train", "train_iteration"]
+__all__ = ["TrainingOptions", "TrainResult", "TrainState", "evaluate", "init_state", "train", "train_iteration"]
 
 EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
@@ -119,6 +119,41 @@ def alone(function: Callable[P, TrainResult]) -> Callable[P, TrainResult]:
     return held
 
 
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How often a training logs, saves and evaluates, and who watches it."""
+
+    eval_fn: EvalFn | None = None
+    """(params, env_steps) -> figures, logged as eval/..."""
+    eval_ahead: Callable[[Params], Any] | None = None
+    """Called once in a thread, with the parameters at the start, while the run's own program is compiled: the same
+    evaluation, say. Evaluations that are due before it is done are made after it, with the parameters of their time.
+    Training goes on meanwhile, and lines are logged in order. Not with several devices."""
+    eval_every: int = 10_000
+    """Control steps between evaluations; one more happens at the end."""
+    checkpoint_every_s: float = 600.0
+    """Time between checkpoints [s]; one more is written at the end."""
+    log_every_s: float = 5.0
+    """Time between log lines [s]."""
+    resume: bool = True
+    """Go on from the newest checkpoint, if there is one; otherwise start anew and overwrite."""
+    progress: bool = True
+    """Show a bar on stderr."""
+    on_metrics: MetricsFn | None = None
+    """Called with every logged line."""
+    stop: StopFn | None = None
+    """Called with every logged line that holds an evaluation; True ends the run there. With several processes it must
+    come to the same answer in each."""
+    time_limit_s: float | None = None
+    """End after the call has taken so long [s], as if interrupted; a later call goes on."""
+    devices: Sequence[jax.Device] = ()
+    """Over which instances and batches are split, those of all processes; none takes the first one."""
+    tensorboard: bool = False
+    """Write the logged lines to OUT/tensorboard too."""
+    announce: Callable[[str], None] = lambda text: None
+    """Gets a line when something begins that takes long: compilation, the training, the last checkpoint."""
+
+
 @alone
 def train(
     env: FunctionalEnv,
@@ -126,22 +161,9 @@ def train(
     out: Path | str,
     total_steps: int,
     seed: int | Sequence[int],
-    *,
-    eval_fn: EvalFn | None = None,
-    eval_ahead: Callable[[Params], Any] | None = None,
-    eval_every: int = 10_000,
-    checkpoint_every_s: float = 600.0,
-    log_every_s: float = 5.0,
-    resume: bool = True,
-    progress: bool = True,
-    on_metrics: MetricsFn | None = None,
-    stop: StopFn | None = None,
-    time_limit_s: float | None = None,
-    devices: Sequence[jax.Device] = (),
-    tensorboard: bool = False,
-    announce: Callable[[str], None] = lambda text: None,
+    options: TrainingOptions = TrainingOptions(),  # noqa: B008
 ) -> TrainResult:
-    """Train until `total_steps` control steps, summed over instances, are done, or until `stop` says so.
+    """Train until `total_steps` control steps, summed over instances, are done, or until `options.stop` says so.
 
     `out` receives config.json, metrics.jsonl (one line per log) and checkpoints/. A run that is killed and started
     again goes on from its last checkpoint as if nothing had happened. One process at a time trains in a folder.
@@ -156,22 +178,7 @@ def train(
         total_steps: when to stop; a resumed run may get more.
         seed: of everything random. Several make one program of as many runs: steps then count those of one run,
             figures are means over the runs, and parameters have a seed axis in front.
-        eval_fn: (params, env_steps) -> figures, logged as eval/...
-        eval_ahead: called once in a thread, with the parameters at the start, while the run's own program is compiled:
-            the same evaluation, say. Evaluations that are due before it is done are made after it, with the parameters
-            of their time, and training goes on meanwhile; lines are logged in order. Not with several devices.
-        eval_every: control steps between evaluations; one more happens at the end.
-        checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
-        log_every_s: time between log lines [s].
-        resume: go on from the newest checkpoint in `out`, if there is one; otherwise start anew and overwrite.
-        progress: show a bar on stderr.
-        on_metrics: called with every logged line.
-        stop: called with every logged line that holds an evaluation; True ends the run there. With several processes
-            it must come to the same answer in each.
-        time_limit_s: end after this call has taken so long [s], as if interrupted; a later call goes on.
-        devices: over which instances and batches are split, those of all processes; none takes the first one.
-        tensorboard: write the logged lines to OUT/tensorboard too.
-        announce: gets a line when something begins that takes long: compilation, the training, the last checkpoint.
+        options: intervals, evaluation, callbacks and devices.
 
     Raises:
         ImportError: tensorboard is asked for and tensorboardX is not installed.
@@ -179,117 +186,177 @@ def train(
             replay in the host's memory is asked for with several seeds or devices, or another process trains there.
     """
     out = Path(out)
-    _check_seed(out, seed, resume)
+    _check_seed(out, seed, options.resume)
     out.mkdir(parents=True, exist_ok=True)
-    mesh = parallel.make_mesh(devices, env.num_envs, config.batch_size) if devices else None
+    mesh = parallel.make_mesh(options.devices, env.num_envs, config.batch_size) if options.devices else None
     if mesh is not None and not isinstance(seed, int):
         raise ValueError(f"seed = {seed}: several seeds run in one program on one device. Give one, or no devices.")
-    announce("preparing the training: first worlds and parameters")
-    state, wall_before = _first_state(env, config, out, seed, resume, mesh)
-    began = time.monotonic()
-    steps_per_iter = env.num_envs * config.steps_per_iter
-    env_steps = int(state.env_steps)
-    done = pretrain.counters(state)
-    place = pretrain.position(config, {"env_steps": env_steps, **done})
-    counted = place >= 0  # all pretraining is done
-    log = _Log(out / "metrics.jsonl", config, place, on_metrics, tensorboard)
-
-    def compiled(step: Any) -> Any:
-        if isinstance(seed, int):
-            return compile_iteration(env, config, state, mesh, step)
-        return seeds.compile_iterations(env, config, state, step)
-
-    ready = None
-    if eval_ahead is not None and mesh is None and env_steps < total_steps:
-        ready = _in_thread(eval_ahead, state.agent.acting)
-    announce("compiling the training program, usually 1 to 2 minutes")
-    iterate = compiled(train_iteration if counted else pretrain.pretrain_iteration)
-    announce("training")
-    bar = Progress(total_steps, env_steps, progress and parallel.is_first_process())
-    meter, saved_at = Meter(), time.monotonic()
-
-    def wall_s() -> float:
-        return wall_before + time.monotonic() - began
-
-    def write_log(state: TrainState, evaluated: bool, at_once: bool) -> bool:
-        """Log a line, and whether the run is to stop after an evaluation; `at_once`: no line may wait any longer."""
-        line = {"env_steps": env_steps, "updates": int(state.agent.updates) if counted else 0, "wall_s": wall_s()}
-        figures = meter.read(config)
-        line |= done | (figures if counted else {f"pretrain/{name}": value for name, value in figures.items()})
-        params = None
-        if evaluated and jax.process_count() > 1:
-            params = jax.device_get(state.agent.acting)  # they evaluate side by side, each on its own device
-        elif evaluated:
-            params = jax.tree.map(jnp.copy, state.agent.acting)  # the next iteration donates its own
-        waiting.append((line, params))
-        bar.show(env_steps, _headline(line))
-        return write_waiting(at_once)
-
-    def write_waiting(at_once: bool) -> bool:
-        stops = False
-        while waiting:
-            line, params = waiting[0]
-            if params is not None and eval_fn is not None:
-                if ready is not None and not (at_once or ready.done()):
-                    break
-                if ready is not None:
-                    wait([ready])
-                figures = eval_fn(params, line["env_steps"])
-                line |= {f"eval/{name}": float(value) for name, value in figures.items()}
-                bar.note(_evaluated(figures))
-            log.write(line)
-            waiting.pop(0)  # interrupted just before, the line is written twice and read once
-            stops = stops or (params is not None and stop is not None and stop(line))
-        return stops
-
-    waiting: list[tuple[dict[str, Any], Params | None]] = []
-    logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
-    stopped, iterations = False, 0
-    missing = env_steps // eval_every > log.evaluated_at // eval_every or env_steps >= total_steps > log.evaluated_at
+    run = _Run(env, config, out, total_steps, options)
+    run.begin(seed, mesh)
     try:
-        if eval_fn is not None and counted and env_steps and parallel.agree(missing):
-            stopped = write_log(state, True, at_once=True)  # it was interrupted between a step and its evaluation
-        while (env_steps < total_steps or not counted) and not stopped:
-            state, metrics = iterate(state)
-            begins = False
-            if counted:
-                env_steps += steps_per_iter
-                meter.add(metrics, steps_per_iter)
-            else:
-                before, done = done, pretrain.counters(state)
-                begins = pretrain.position(config, {"env_steps": 0, **done}) == 0
-                meter.add(metrics, done["pretrain_steps"] - before["pretrain_steps"])
-            meter.wait_for_previous()
-            now = time.monotonic()
-            finished = (counted or begins) and env_steps >= total_steps
-            evaluate_now = eval_fn is not None and (finished or env_steps // eval_every > evaluated_at)
-            if finished or begins or evaluate_now or now - logged_at >= log_every_s:
-                stopped = write_log(state, evaluate_now, at_once=finished or begins)
-                logged_at, evaluated_at = time.monotonic(), env_steps // eval_every
-            iterations += 1
-            due = now - saved_at >= checkpoint_every_s
-            if jax.process_count() > 1:
-                due = iterations % AGREE_EVERY == 0 and parallel.agree(due)
-            stopped = stopped or (time_limit_s is not None and parallel.agree(now - began > time_limit_s))
-            if finished or stopped or due:
-                stopped = write_waiting(at_once=True) or stopped  # a run that goes on from here has no older lines
-                save_state(out, state, config, wall_s())
-                saved_at = time.monotonic()
-            if begins:
-                counted = True
-                iterate = iterate if finished or stopped else compiled(train_iteration)
+        run.go_on()
     except KeyboardInterrupt:
-        if jax.process_count() == 1 and checkpoint.is_whole(state):  # other processes may not be there to take part
-            try:
-                write_waiting(at_once=True)
-            finally:  # interrupted again, say
-                save_state(out, state, config, wall_s())
+        run.interrupted()
         raise
     finally:
-        bar.close()
-        log.close()
-    updates = int(state.agent.updates) if counted else 0
-    return TrainResult(out, state.agent, env_steps, updates, wall_s(), log.last)
+        run.close()
+    return run.result()
+
+
+class _Run:
+    """One call of `train`: the state, what is counted, and what waits to be logged."""
+
+    def __init__(
+        self, env: FunctionalEnv, config: DreamerConfig, out: Path, total_steps: int, options: TrainingOptions
+    ) -> None:
+        self.env, self.config, self.out, self.total_steps, self.options = env, config, out, total_steps, options
+        self._waiting: list[tuple[dict[str, Any], Params | None]] = []
+        self._ready: Future | None = None
+        self._iterations = 0
+        self._stopped = False
+
+    def begin(self, seed: int | Sequence[int], mesh: Mesh | None) -> None:
+        """Restore or make the state, and compile the program of an iteration."""
+        options = self.options
+        options.announce("preparing the training: first worlds and parameters")
+        self.state, self._wall_before = _first_state(self.env, self.config, self.out, seed, options.resume, mesh)
+        self._began = time.monotonic()
+        self.env_steps = int(self.state.env_steps)
+        self._done = pretrain.counters(self.state)
+        place = pretrain.position(self.config, {"env_steps": self.env_steps, **self._done})
+        self._counted = place >= 0  # all pretraining is done
+        self._log = _Log(self.out / "metrics.jsonl", self.config, place, options.on_metrics, options.tensorboard)
+
+        def compiled(step: Any) -> Any:
+            if isinstance(seed, int):
+                return compile_iteration(self.env, self.config, self.state, mesh, step)
+            return seeds.compile_iterations(self.env, self.config, self.state, step)
+
+        self._compiled = compiled
+        if options.eval_ahead is not None and mesh is None and self.env_steps < self.total_steps:
+            self._ready = in_thread(options.eval_ahead, self.state.agent.acting)
+        options.announce("compiling the training program, usually 1 to 2 minutes")
+        self._iterate = compiled(train_iteration if self._counted else pretrain.pretrain_iteration)
+        options.announce("training")
+        self._bar = Progress(self.total_steps, self.env_steps, options.progress and parallel.is_first_process())
+        self._meter = Meter()
+        self._saved_at = self._logged_at = time.monotonic()
+        self._evaluated = self.env_steps // options.eval_every
+
+    def go_on(self) -> None:
+        """Iterate to the end."""
+        self._make_up_evaluation()
+        while (self.env_steps < self.total_steps or not self._counted) and not self._stopped:
+            begins = self._step()
+            now = time.monotonic()
+            finished = (self._counted or begins) and self.env_steps >= self.total_steps
+            self._log_where_due(now, finished, begins)
+            self._save_where_due(now, finished)
+            if begins:
+                self._counted = True
+                over = finished or self._stopped
+                self._iterate = self._iterate if over else self._compiled(train_iteration)
+
+    def interrupted(self) -> None:
+        """Keep what is done."""
+        if jax.process_count() == 1 and checkpoint.is_whole(self.state):  # others may not be there to take part
+            try:
+                self._write_waiting(at_once=True)
+            finally:  # interrupted again, say
+                self._save()
+
+    def close(self) -> None:
+        """End the bar and the log."""
+        self._bar.close()
+        self._log.close()
+
+    def result(self) -> TrainResult:
+        """What the run leaves behind."""
+        updates = int(self.state.agent.updates) if self._counted else 0
+        return TrainResult(self.out, self.state.agent, self.env_steps, updates, self._wall_s(), self._log.last)
+
+    def _wall_s(self) -> float:
+        return self._wall_before + time.monotonic() - self._began
+
+    def _make_up_evaluation(self) -> None:
+        """Evaluate where a run was interrupted between a step and its evaluation."""
+        every, last = self.options.eval_every, self._log.evaluated_at
+        missing = self.env_steps // every > last // every or self.env_steps >= self.total_steps > last
+        if self.options.eval_fn is not None and self._counted and self.env_steps and parallel.agree(missing):
+            self._stopped = self._write_log(evaluated=True, at_once=True)
+
+    def _step(self) -> bool:
+        """Dispatch one iteration; return whether it was the last one of the pretraining."""
+        self.state, metrics = self._iterate(self.state)
+        begins = False
+        if self._counted:
+            steps = self.env.num_envs * self.config.steps_per_iter
+            self.env_steps += steps
+        else:
+            before, self._done = self._done, pretrain.counters(self.state)
+            begins = pretrain.position(self.config, {"env_steps": 0, **self._done}) == 0
+            steps = self._done["pretrain_steps"] - before["pretrain_steps"]
+        self._meter.add(metrics, steps)
+        self._meter.wait_for_previous()
+        self._iterations += 1
+        return begins
+
+    def _log_where_due(self, now: float, finished: bool, begins: bool) -> None:
+        passed = self.env_steps // self.options.eval_every > self._evaluated
+        evaluate_now = self.options.eval_fn is not None and (finished or passed)
+        if finished or begins or evaluate_now or now - self._logged_at >= self.options.log_every_s:
+            self._stopped = self._write_log(evaluate_now, at_once=finished or begins)
+            self._logged_at, self._evaluated = time.monotonic(), self.env_steps // self.options.eval_every
+
+    def _save_where_due(self, now: float, finished: bool) -> None:
+        limit = self.options.time_limit_s
+        due = now - self._saved_at >= self.options.checkpoint_every_s
+        if jax.process_count() > 1:
+            due = self._iterations % AGREE_EVERY == 0 and parallel.agree(due)
+        self._stopped = self._stopped or (limit is not None and parallel.agree(now - self._began > limit))
+        if finished or self._stopped or due:
+            # A run that goes on from here has no older lines.
+            self._stopped = self._write_waiting(at_once=True) or self._stopped
+            self._save()
+            self._saved_at = time.monotonic()
+
+    def _save(self) -> None:
+        save_state(self.out, self.state, self.config, self._wall_s())
+
+    def _write_log(self, evaluated: bool, at_once: bool) -> bool:
+        """Log a line, and whether the run is to stop after an evaluation; `at_once`: no line may wait any longer."""
+        updates = int(self.state.agent.updates) if self._counted else 0
+        line = {"env_steps": self.env_steps, "updates": updates, "wall_s": self._wall_s()}
+        figures = self._meter.read(self.config)
+        line |= self._done
+        line |= figures if self._counted else {f"pretrain/{name}": value for name, value in figures.items()}
+        params = None
+        if evaluated and jax.process_count() > 1:
+            params = jax.device_get(self.state.agent.acting)  # they evaluate side by side, each on its own device
+        elif evaluated:
+            params = jax.tree.map(jnp.copy, self.state.agent.acting)  # the next iteration donates its own
+        self._waiting.append((line, params))
+        self._bar.show(self.env_steps, _headline(line))
+        return self._write_waiting(at_once)
+
+    def _write_waiting(self, at_once: bool) -> bool:
+        """Write the lines whose evaluation can be made now; return whether one of them ends the run."""
+        stops = False
+        while self._waiting:
+            line, params = self._waiting[0]
+            if params is not None and self.options.eval_fn is not None:
+                if self._ready is not None and not (at_once or self._ready.done()):
+                    break
+                if self._ready is not None:
+                    wait([self._ready])
+                figures = self.options.eval_fn(params, line["env_steps"])
+                line |= {f"eval/{name}": float(value) for name, value in figures.items()}
+                self._bar.note(_evaluated(figures))
+            self._log.write(line)
+            self._waiting.pop(0)  # interrupted just before, the line is written twice and read once
+            stop = self.options.stop
+            stops = stops or (params is not None and stop is not None and stop(line))
+        return stops
 
 
 def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
@@ -299,7 +366,7 @@ def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
         return
     try:
         begun = json.loads(path.read_text())["seed"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return  # the checkpoint has the configuration, and its keys those of the seed
     asked = seed if isinstance(seed, int) else list(seed)
     if begun != asked:
@@ -307,7 +374,7 @@ def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
                          "folder.")
 
 
-def _in_thread(call: Callable[[Params], Any], params: Params) -> Future:
+def in_thread(call: Callable[[Params], Any], params: Params) -> Future:
     """A call beside what follows, with a copy of the parameters, which may be donated meanwhile."""
     threads = ThreadPoolExecutor(1)
     started = threads.submit(call, jax.tree.map(jnp.copy, params))
@@ -417,11 +484,12 @@ class _Log:
         kept: list[str] = []
         if not parallel.is_first_process():
             return
-        for text in path.read_text().splitlines() if path.exists() else []:
+        for text in path.read_text(errors="replace").splitlines() if path.exists() else []:
             try:
                 line = json.loads(text)
-            except ValueError:
-                continue  # cut off by the kill
+                pretrain.position(config, line)
+            except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+                continue  # cut off by the kill, or damaged
             if pretrain.position(config, line) <= place and text not in kept[-1:]:
                 kept.append(text)
                 self.last = line

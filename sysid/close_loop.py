@@ -11,8 +11,8 @@ within their day-to-day spread, and the verdict is one of
 Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
 scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
 
-Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html and RUN/vehicle.toml with the effect in it. A loop
-that was stopped goes on where it was when the same command is given again.
+Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html, RUN/method.html and, with the effect in it,
+RUN/vehicle.toml. A loop that was stopped goes on where it was when the same command is given again.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
+from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 from sysid import command_line
@@ -35,7 +35,7 @@ from sysid.verdict.pipeline import check_logs, watched
 from sysid.verdict.result import LoopConfig
 
 KIND = "sysid.close_loop"
-OUTPUTS = ("next_command.csv", "steps")
+OUTPUTS = ("next_command.csv", "method.html", "steps")
 STOPPED = "stopped; give the same command again to go on."
 
 

@@ -1,8 +1,10 @@
 """Converts recordings to a driving-log dataset: `python -m sysid.convert SOURCE --out DATASET`.
 
-SOURCE is a ROS bag (rosbag2 folder, .db3, .mcap, ROS 1 .bag), a folder of bags, or one of the published measured sets.
+SOURCE is a ROS bag (rosbag2 folder, .db3, .mcap, ROS 1 .bag), a CSV or TUM file, a folder of them, a LeRobotDataset, or
+one of the published measured sets.
 Bags become one trial each, or one per drive between standstills; a bag named circle_1 becomes the trial circle_1. The
-dataset is docs/log_format.md's; an existing one gets the new trials added.
+dataset is docs/log_format.md's; an existing one gets the new trials added. `--to lerobot` writes a dataset as a
+LeRobotDataset v3 instead.
 """
 
 from __future__ import annotations
@@ -11,10 +13,11 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from whill_mjx.io.command_line import listen, refusing
+from whill_mjx.io.command_line import listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 from sysid import command_line
@@ -25,6 +28,8 @@ from whill_mjx.io.folders import LOCK_FILE, FolderRefused, check_place, lock_fol
 
 def main(config: ConvertConfig) -> Log:
     """Convert and say what was made."""
+    if config.to == "lerobot":
+        return to_lerobot(config)
     with refusing(), dataset_folder(config.out):
         log, notes = convert(config)
     for note in notes:
@@ -33,6 +38,31 @@ def main(config: ConvertConfig) -> Log:
     print(f"{config.out}: {count} trial{'s' * (count > 1)}, {seconds:.0f} s; look at it with python -m sysid.inspect "
           f"{config.out}")
     return log
+
+
+def to_lerobot(config: ConvertConfig) -> Log:
+    """Write a dataset as a LeRobotDataset, whole or not at all."""
+    from sysid.logs import lerobot
+    from sysid.logs.measured import load_any
+
+    with refusing():
+        log = load_any(config.source)
+        check_place("--out", config.out)
+        if config.out.exists():
+            raise FolderRefused(f"--out {config.out}: exists already. Choose another place.")
+        with TemporaryDirectory(prefix=f".{config.out.name}.", dir=_made(config.out.parent)) as partial:
+            made = Path(partial) / config.out.name
+            notes = lerobot.write(made, log, config.fps)
+            made.rename(config.out)
+    for note in notes:
+        print(note)
+    print(f"{config.out}: a LeRobotDataset {lerobot.VERSION}")
+    return log
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 @contextmanager

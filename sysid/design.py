@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing
+from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import numpy as np

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from whill_mjx.io.command_line import listen
+from whill_mjx.io.command_line import listen, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 from sysid import command_line

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
+from whill_mjx.io.command_line import listen, refusing, starts
 
-from whill_mjx.io.command_line import listen, refusing
-
-if __name__ == "__main__":
+if starts(__name__):
     listen()
+
+import numpy as np
 
 from sysid import command_line
 from sysid.logs.coverage import Blind
@@ -28,9 +28,10 @@ from sysid.logs.log import Log
 from sysid.logs.next_drives import NextDrive, next_drives
 from whill_mjx.io.command_line import POSITIVE, Range
 from whill_mjx.io.folders import claim_folder
+from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
-OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "next_1.csv", "next_2.csv", "next_3.csv")
+OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "next_1.csv", "next_2.csv", "next_3.csv", "inspect.html")
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,15 @@ class InspectConfig:
     json: bool = False
     """Print JSON instead of text."""
     out: Path | None = None
-    """Folder for inspect.txt, inspect.json, inspect.png and scripts of the next three drives; the picture of a robot
-    file goes to the current folder without one."""
+    """Folder for inspect.html, .txt, .json, .png and scripts of the next three drives; without one, the picture of a
+    robot file goes to the current folder."""
     space: Annotated[tuple[float, float], Range(0.1, 10_000)] = (4.0, 4.0)
     """Length and width of the free floor for the next drives [m]."""
     v_max: Annotated[float | None, POSITIVE] = None
     """Fastest speed of the next drives [m/s]; by default half of the vehicle's, at most 0.5 m/s."""
+    radius: Annotated[float | None, POSITIVE] = None
+    """Reach of the vehicle around its drive-axle centre in the next drives [m], rider's feet included; by default that
+    of its nominal body."""
 
 
 def inspect_robot(config: InspectConfig) -> dict[str, Any]:
@@ -80,16 +84,18 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
 
 
 def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDrive] = ()) -> list[Path]:
-    """Write inspect.txt, inspect.json, inspect.png and the scripts of drives; returns their paths."""
+    """Write inspect.txt, .json, .png and .html and the scripts of drives; returns their paths."""
+    from sysid.pages.inspect_page import write_page
     from sysid.pages.inspect_plot import write_plot
     from sysid.pages.report import write_report
     from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv, write_text
 
-    paths = [folder / name for name in OUTPUTS[: 3 + len(drives)]]
+    paths = [folder / name for name in (*OUTPUTS[: 3 + len(drives)], OUTPUTS[-1])]
     write_text(paths[0], text(found) + "\n")
-    write_report(paths[1], found)
+    write_report(paths[1], {**stamp("sysid-inspection"), **found})
     write_plot(paths[2], log, found)
-    for path, drive in zip(paths[3:], drives, strict=True):
+    write_page(paths[-1], found, paths[2])
+    for path, drive in zip(paths[3:-1], drives, strict=True):
         write_csv(path, COMMAND_HEADER, drive.command.table)
     return paths
 
@@ -118,11 +124,13 @@ def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDriv
     from sysid.pages.report import plain
 
     found = inspect(log)
-    drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max)
+    drives = next_drives(log, [Blind(**one) for one in found["blind_spots"]], config.space, config.v_max, config.radius)
     found["next_drives"] = [
         {"file": OUTPUTS[3 + k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
          "v": float(np.abs(one.command.v).max()), "omega": float(np.abs(one.command.omega).max()),
-         "length_width": list(one.size), "start": list(one.start)} for k, one in enumerate(drives)]
+         "floor": list(one.floor), "radius": one.radius, "drive_it": f"python -m bridge.manoeuvre "
+         f"{(config.out or Path()) / OUTPUTS[3 + k]} --space {config.space[0]:g} {config.space[1]:g} "
+         f"--radius {one.radius:g} --check"} for k, one in enumerate(drives)]
     print(json.dumps(plain(found), indent=1) if config.json else text(found))
     return found, drives
 

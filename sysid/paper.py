@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from whill_mjx.io.command_line import listen, refusing
+from whill_mjx.io.command_line import listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import numpy as np

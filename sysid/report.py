@@ -29,9 +29,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from whill_mjx.io.command_line import listen, refusing
+from whill_mjx.io.command_line import listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 from sysid import command_line

@@ -64,4 +64,5 @@ def file_label(path: Path | str | None) -> str | None:
     file = Path(text.partition(".py:")[0] + ".py" if ".py:" in text else text)
     if not file.is_file():
         return text
-    return f"{Path(text).name} {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
+    with file.open("rb") as content:
+        return f"{Path(text).name} {hashlib.file_digest(content, 'sha256').hexdigest()[:12]}"

@@ -15,11 +15,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing
+from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
@@ -116,8 +116,15 @@ def write(out: Path, log: Log, traces: Sequence[Trace], names: Sequence[str]) ->
         Section("Arrival", table(header, body) + paragraph(
             "Medians over runs. Times are without compilation; a derivative counts one evaluation per parameter.",
             "dim"))],
-        f"{device.device_kind}, {len(names)} parameters")
+        f"{device.device_kind}, {len(names)} parameters", kind="Searches", lead=_headline(rows))
     write_text(out / "searches.html", page)
+
+
+def _headline(rows: Sequence[dict[str, Any]]) -> str:
+    """One sentence: which search came nearest, and how long it took."""
+    best = min(rows, key=lambda row: row["cost"])
+    return (f"The lowest cost, {best['cost']:.4g}, is that of the search {best['method']}, in "
+            f"{best['all_seconds']:.3g} s.")
 
 
 def cli() -> None:

@@ -1,6 +1,7 @@
 """Most of the suite's time is XLA compiling small programs: none is compiled twice, many with few optimisations."""
 
 import os
+import signal
 from contextlib import contextmanager
 
 import jax
@@ -10,6 +11,8 @@ import pytest
 from whill_mjx import share_results
 
 share_results()
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; processes of tests need it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 if jaxlib.__version__.startswith("0.10."):
     # Half the time to compile; later versions of XLA do not know this flag, and end over one that they do not know.
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()

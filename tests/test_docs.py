@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,8 @@ from benchmarks.prose import sentences
 pytestmark = pytest.mark.quick
 ROOT = Path(__file__).parent.parent
 FIGURES = ROOT / "benchmarks" / "README.md"
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")), FIGURES,
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS, FIGURES,
          ROOT / "benchmarks" / "plant" / "README.md"]  # fmt: skip
 MOST_WORDS = 35
 """Of a sentence."""
@@ -94,7 +97,71 @@ def test_every_public_name_is_on_the_page_of_public_names(package):
     assert not missing, f"docs/api.md lacks {', '.join(missing)} of {package}."
 
 
-def test_every_page_of_docs_is_linked_from_readme():
-    text = (ROOT / "README.md").read_text()
-    missing = [page.name for page in sorted((ROOT / "docs").glob("*.md")) if f"docs/{page.name}" not in text]
-    assert not missing, f"README.md links no {', '.join(missing)}."
+def links(page: Path) -> set[Path]:
+    """Files of the repository to which a page links."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    targets = (target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in target)
+    return {(page.parent / target).resolve() for target in targets if target}
+
+
+def test_every_page_of_docs_is_at_most_two_links_away_from_readme():
+    first = links(ROOT / "README.md")
+    reached = first.union(*(links(page) for page in first if page.suffix == ".md"))
+    missing = [str(page.relative_to(ROOT)) for page in DOCS if page not in reached]
+    assert not missing, f"No page that README.md links to leads to {', '.join(missing)}."
+
+
+def test_every_page_of_docs_is_in_the_sites_navigation_and_no_other():
+    text = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]
+    named = set(re.findall(r"[\w/]+\.md", text))
+    pages = {str(page.relative_to(ROOT / "docs")) for page in DOCS}
+    made = {"figures.md", "plant.md", "changes.md",
+            "api/whill_mjx.md", "api/sysid.md", "api/dreamer.md", "api/bridge.md"}  # fmt: skip
+    assert pages <= named, f"Add to nav in mkdocs.yml: {', '.join(sorted(pages - named))}."
+    assert named <= pages | made, f"mkdocs.yml names what is not there: {', '.join(sorted(named - pages - made))}."
+
+
+def test_nine_of_ten_pages_of_docs_have_a_picture_or_a_diagram():
+    shown = re.compile(r"!\[|^```mermaid", re.MULTILINE)
+    without = [str(page.relative_to(ROOT)) for page in DOCS if not shown.search(page.read_text())]
+    assert len(without) <= 0.1 * len(DOCS), f"{len(without)} of {len(DOCS)} pages have none: {', '.join(without)}."
+
+
+@pytest.mark.parametrize("picture", sorted((ROOT / "docs" / "images").glob("[!.]*")), ids=lambda path: path.name)
+def test_a_picture_is_small_and_used(picture):
+    limit = 2_000_000 if picture.suffix == ".webp" else 450_000
+    assert picture.stat().st_size <= limit, f"{picture.name} has {picture.stat().st_size} bytes; at most {limit}."
+    assert any(f"images/{picture.name}" in page.read_text() for page in PAGES), f"no page shows {picture.name}."
+
+
+def test_pages_that_are_made_are_up_to_date():
+    from benchmarks import command_page, task_pages
+
+    assert command_page.PAGE.read_text() == command_page.page(), "write it again: python -m benchmarks.command_page"
+    for name in task_pages.names():
+        page = ROOT / "docs" / "reference" / "tasks" / f"{name}.md"
+        assert page.exists() and page.read_text() == task_pages.page(name), (
+            f"{page.name}: write it again: python -m benchmarks.task_pages page. "
+            f"A new task also needs its picture (... picture --tasks {name}) and a line in mkdocs.yml and index.md.")
+
+
+def test_links_of_the_repository_become_links_of_the_site():
+    spec = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    assert hooks.site_link("../benchmarks/README.md#fits", "docs/fit.md", "fit.md") == "figures.md#fits"
+    assert hooks.site_link("../../CHANGELOG.md", "docs/howto/gpus.md", "howto/gpus.md") == "../changes.md"
+    assert hooks.site_link("../docs/fit.md", "benchmarks/README.md", "figures.md") == "fit.md"
+    assert hooks.site_link("../whill_mjx/env.py", "docs/fit.md", "fit.md") is None  # code is not on the site
+    assert hooks.site_link("https://a.b/c", "docs/fit.md", "fit.md") == "https://a.b/c"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not importlib.util.find_spec("mkdocs"), reason="needs MkDocs: pip install -e '.[docs]'")
+def test_the_site_is_built_without_a_warning(tmp_path):
+    """Every link, anchor and picture is checked by MkDocs too, and every public name has its docstring."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "site" / "api" / "whill_mjx.html").read_text()
+    assert "make_batch" in text and "Args" not in (tmp_path / "site" / "index.html").read_text()

@@ -17,7 +17,7 @@ from bridge import drive as bridge_drive
 from sysid import close_loop, convert, design, fit, inspect, paper, report, searches
 from sysid.logs.conversion import ConvertConfig
 from sysid.pages.paper_page import PaperConfig
-from whill_mjx import drive, evaluate, export_mjcf, look, train
+from whill_mjx import drive, evaluate, export_mjcf, export_python, look, train, view
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import Range
 
@@ -32,11 +32,11 @@ COMMANDS = {
 }  # fmt: skip
 OTHERS = {
     "train": train.TrainOptions, "evaluate": evaluate.EvaluateOptions, "drive": drive.DriveOptions, "look": look.Look,
-    "export_mjcf": export_mjcf.Options,
+    "export_mjcf": export_mjcf.Options, "export_python": export_python.Options, "view": view.ViewOptions,
 }  # fmt: skip
 NEEDED = {"fit": "data", "close_loop": "data", "design": "whill_cr", "convert": "data", "inspect": "data",
           "paper": "data", "searches": "data", "report": "run", "evaluate": "planner", "drive": "--out new",
-          "export_mjcf": "whill_cr"}  # fmt: skip
+          "export_mjcf": "whill_cr", "export_python": "whill_cr", "view": "run"}  # fmt: skip
 """Words that a command cannot do without."""
 
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from whill_mjx.vehicle.vehicle_file import load_vehicle as load_vehicle
     from whill_mjx.vehicle.vehicle_file import save_vehicle as save_vehicle
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "make_env": "whill_mjx.env",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-COMMANDS = ("train", "evaluate", "drive", "look", "maps", "export_mjcf")
+COMMANDS = ("train", "evaluate", "drive", "look", "view", "maps", "export_mjcf", "export_python")
 
 
 def first_line(name: str) -> str:
@@ -17,7 +17,7 @@ def first_line(name: str) -> str:
 def main() -> None:
     """Print the list."""
     for name in COMMANDS:
-        print(f"python -m whill_mjx.{name:<12} {first_line(name)}")
+        print(f"python -m whill_mjx.{name:<14} {first_line(name)}")
     print("Each has --help.")
 
 

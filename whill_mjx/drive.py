@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, listen, refusing, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, listen, refusing, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax

@@ -31,18 +31,24 @@ from whill_mjx.vehicle.vehicle_file import load_vehicle
 from whill_mjx.world.collision import first_contact, free_distance, obstacles_of, poses_between, touches
 from whill_mjx.world.eye import develop, mounted
 from whill_mjx.world.maps.walls import shown
+from whill_mjx.world.people.contact import (
+    poses_among_people,
+    scene_with_people,
+    scene_without_people,
+    walk_around,
+)
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
 from whill_mjx.world.render import Quality, pinhole, render
 from whill_mjx.world.render.rich import floor_light
-from whill_mjx.world.rich import furnish, paint
+from whill_mjx.world.rich import furnish, paint, pictures_of
 from whill_mjx.world.scene import Scene, footprint
 
 END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode_return")
 """Metrics that are 0 except on the last frame of an episode; the endings of a task come on top (`end_names`)."""
 POSE_METRICS = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
 """Metrics of every frame."""
-RESERVED = (*POSE_METRICS, "timeout", "diverged", "time_s", "episode_return")
+RESERVED = (*POSE_METRICS, "bumped", "timeout", "diverged", "time_s", "episode_return")
 """Names that a task's endings may not have."""
 LOOKS = ("plain", "paper", "rich")
 """What changes the picture from episode to episode: nothing, what the paper randomises, a furnished room."""
@@ -150,15 +156,9 @@ def make_env(
     check_task(task)
     spec, params = as_vehicle(vehicle)
     chosen = task.observations() if observations is None else observations
-    if looks is None:
-        looks = task.looks if task.randomised else "plain"
-    else:
+    if looks is not None:
         random_looks = photometric = None
-    if looks not in LOOKS:
-        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
-    if looks == "rich" and not task.lane:
-        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
-                         "'rich'.")
+    looks = _looks_of(task, looks)
     env = Env(
         build_model(spec),
         task,
@@ -171,6 +171,18 @@ def make_env(
         as_sensors(chosen, known_sensors()),
     )
     return env, params
+
+
+def _looks_of(task: Task, looks: str | None) -> str:
+    """The looks asked for, or the task's own; raises ValueError where there are none such."""
+    if looks is None:
+        looks = task.looks if task.randomised else "plain"
+    if looks not in LOOKS:
+        raise ValueError(f"looks is {looks!r}; use one of {LOOKS}.")
+    if looks == "rich" and not task.lane:
+        raise ValueError(f"task {task.name!r} has no lane of three walls that could be furnished; use other looks than "
+                         "'rich'.")
+    return looks
 
 
 def as_vehicle(
@@ -230,12 +242,18 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
     key, world_key, looks_key, photometry_key = jax.random.split(key, 4)
     world = env.task.sample_world(world_key)
     if env.rich:
-        lone = world.scene.boxes.mask.shape[0] == env.task.walls + 1
-        scene = furnish(jax.random.fold_in(world_key, 1), world.scene, lone)
+        lone = world.scene.boxes.mask.shape[0] - pictures_of(world.scene) == env.task.walls + 1
+        world = dataclasses.replace(world, scene=furnish(jax.random.fold_in(world_key, 1), world.scene, lone))
+    if env.task.people:
+        people_key, dress_key = jax.random.split(jax.random.fold_in(world_key, 2))
+        people = env.task.populate(people_key, world)
+        world = dataclasses.replace(world, scene=scene_with_people(world.scene, people, dress_key))
+    scene = world.scene
+    if env.rich:
         scene = paint(looks_key, scene)
         world = dataclasses.replace(world, scene=scene)
-    else:
-        scene = randomize_looks(looks_key, world.scene) if env.random_looks else world.scene
+    elif env.random_looks:
+        scene = randomize_looks(looks_key, scene)
     photometry = draw_photometry(photometry_key) if env.photometric else neutral()
     start = world.start
     if env.exploring_starts:
@@ -296,7 +314,8 @@ def _control_period(
     task = env.task
     vehicle = drive(env.model, params, state.vehicle, command)
     vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
-    vehicle, collided = _stopped(env, state, vehicle)
+    scene, vehicle, collided = _stopped(env, state, vehicle)
+    state = dataclasses.replace(state, scene=scene)
     step_count = state.step_count + 1
     moment = moment_of(env, state, vehicle, command, step_count, collided)
     terms = task.rewards(moment)
@@ -323,18 +342,21 @@ def _control_period(
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 
-def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[VehicleState, jax.Array]:
-    """The vehicle after a control period, where it first touched something if it did, and whether it did."""
-    task, spec = env.task, env.model.spec
+def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[Scene, VehicleState, jax.Array]:
+    """Scene and vehicle after a control period, where it first touched something if it did, and whether it did."""
+    task, spec, scene = env.task, env.model.spec, state.scene
     before, after = (footprint(spec, *reference_pose(env.model, qpos)) for qpos in (state.vehicle.qpos, vehicle.qpos))
     fastest = max(abs(task.v_min), abs(task.v_max))
     duration = env.model.config.control_dt
-    poses = poses_between(fastest, task.omega_max, duration, spec.body_length / 2, spec.body_width / 2)
-    obstacles = obstacles_of(state.scene, after.x, after.y)
-    collided, share = first_contact(before, after, obstacles, poses)
+    motion = (fastest, task.omega_max, duration, spec.body_length / 2, spec.body_width / 2)
+    obstacles = obstacles_of(scene_without_people(scene), after.x, after.y)
+    collided, share = first_contact(before, after, obstacles, poses_between(*motion))
+    if scene.people is not None:
+        scene, ran_into, until = walk_around(scene, before, after, duration, poses_among_people(*motion))
+        collided, share = collided | ran_into, jnp.minimum(share, until)
     collided = collided & ~vehicle.diverged
     there = state.vehicle.qpos + share * (vehicle.qpos - state.vehicle.qpos)
-    return dataclasses.replace(vehicle, qpos=jnp.where(collided, there, vehicle.qpos)), collided
+    return scene, dataclasses.replace(vehicle, qpos=jnp.where(collided, there, vehicle.qpos)), collided
 
 
 def moment_of(
@@ -430,7 +452,13 @@ def _pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
         "omega": omega,
         "goal_distance": state.goal_distance,
         "clearance": free_distance(footprint(env.model.spec, x, y, yaw), state.scene),
-    }
+    } | _people_metrics(state)
+
+
+def _people_metrics(state: State) -> dict[str, jax.Array]:
+    """Count () of people who walked into the vehicle, which stood still, in the last period; of scenes with people."""
+    people = state.scene.people
+    return {} if people is None else {"bumped": jnp.sum(people.bumped).astype(jnp.float32)}
 
 
 def observe(env: Env, state: State) -> jax.Array:
@@ -466,7 +494,7 @@ def _observe_rich(env: Env, state: State) -> jax.Array:
     metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
     exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
     rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
-    scene = dataclasses.replace(state.scene, rich=rich)
+    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics, env.width)
     image = render(position, rotation, intrinsics, scene, env.height, env.width, RICH)
     turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
     return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)

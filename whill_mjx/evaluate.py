@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run, starts
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
     say_loading()
 
@@ -32,6 +32,7 @@ from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, run_sweep
 from whill_mjx.io.folders import RUN_FILE, claim_folder
+from whill_mjx.io.formats import stamp
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import Task, make_task
@@ -167,6 +168,7 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
             cell_keys = episode_keys(options.seed, options.sweep_episodes)
             results.append(run_sweep(axes, cell_keys, course, plan.driver))
         evaluation = {
+            **stamp("whill-mjx-evaluation"),
             "policy": options.policy,
             "sha256": policy.sha256 if policy else None,
             "task": {"name": task.name, **plain(task)},

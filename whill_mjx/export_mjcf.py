@@ -28,9 +28,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.io.command_line import PHYSICS_DT, listen, refusing, run
+from whill_mjx.io.command_line import PHYSICS_DT, listen, refusing, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax

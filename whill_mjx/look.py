@@ -3,41 +3,48 @@
 A task has one column per world: what the camera sees at the start, what it sees halfway, and the world from above;
 its video shows a planner driving. The gallery shows all that the camera can draw: plain, at its best, with lens and
 motion; depth, labels and normals; its video is a walk. `--scene all` writes every sheet beside FILE.
+With the ending .rrd, FILE is a recording for the Rerun viewer; `--live` opens that viewer.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, run
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run, starts
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
+from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
-from whill_mjx.tasks.options import named_task
+from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.gallery import gallery, walk
+from whill_mjx.world.maps.walls import nearest_walls
 from whill_mjx.world.render import Intrinsics, Quality, pinhole, render, render_frame
 from whill_mjx.world.render.film import Film, develop, motion_blur
 from whill_mjx.world.scene import box, footprint, stack_boxes
 
 VIDEOS = (".mp4", ".gif")
 """Endings of videos."""
+RECORDING = ".rrd"
+"""Ending of a recording for the Rerun viewer."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,11 @@ class Look:
     scene: str = "obstacle_course"
     """Name of a task, package.module:TASK, path/to/file.py:TASK, gallery, or all."""
     out: Path = Path("look.png")
-    """Picture to write, or video with the ending .mp4 or .gif."""
+    """Picture to write, video with the ending .mp4 or .gif, or recording for the Rerun viewer with the ending .rrd."""
+    live: bool = False
+    """Open the Rerun viewer and show a planner's drive as it comes; OUT is then written only if it ends in .rrd."""
+    set: tuple[str, ...] = ()
+    """Fields of the task, such as people=6."""
     layout: str = "randomised"
     """randomised or fixed."""
     looks: Literal["plain", "paper", "rich"] = "plain"
@@ -85,9 +96,13 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     marker = state.scene.marker
     edge = 2 * marker.half[1]
     extra.append(box(marker.position[0], marker.position[1], 0.15, edge, 1.4, marker.colour, marker.yaw))
-    scene = dataclasses.replace(state.scene, boxes=stack_boxes([state.scene.boxes, *extra]))
+    boxes, walls, eye = state.scene.boxes, state.scene.walls, jnp.array([2.6, 0.0, 12.0])
+    if walls is not None:  # the last boxes are those that the camera sees; from above, the nearest are seen
+        boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - walls.keep], boxes)
+        extra.append(nearest_walls(jnp.asarray(walls.segments), x, y, walls.keep, walls.height))
+        eye = jnp.stack([x, y, jnp.asarray(12.0)])
+    scene = dataclasses.replace(state.scene, boxes=stack_boxes([boxes, *extra]), walls=None)
     height, width = 2 * env.height, env.width
-    eye = jnp.array([2.6, 0.0, 12.0])
     down = jnp.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # right is -y, down is -x, forward is -z
     focal = jnp.asarray(height * 12.0 / 9.0)  # 9 m of ground over the height
     intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2))
@@ -194,19 +209,51 @@ def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10
 
 
 def _env(options: Look) -> tuple[Env, VehicleParams]:
-    return make_env(options.scene, layout=options.layout, looks=options.looks)
+    task = named_task(options.scene, "--scene")
+    with refusing():
+        task = dataclasses.replace(task, **read_fields(task, options.set), layout=options.layout)
+        return make_env(task, looks=options.looks)
+
+
+def record(options: Look) -> int:
+    """Drive an episode with the planner for the Rerun viewer; returns its number of control periods."""
+    env, params = _env(options)
+    env = dataclasses.replace(env, task=dataclasses.replace(env.task, action_repeat=1))
+    config = for_task(env.task)
+    key, plan_key = jax.random.split(jax.random.key(options.seed))
+    state = jax.jit(partial(reset_state, env, params))(key)
+    plan = first_plan(config, env, state, plan_key)
+
+    def one_step(state, plan, step_key):
+        action, plan = plan_action(config, env, state, plan, step_key)
+        return *step_with_terms(env, params, state, action), plan
+
+    step = jax.jit(one_step)
+    with whole_file(options.out) if options.out.suffix == RECORDING else nullcontext() as path:
+        with RerunLog(env, path, options.live) as log:
+            log.begin(state)
+            for number in tqdm(range(env.task.max_steps), unit="step", leave=False):
+                state, rewards, plan = step(state, plan, jax.random.fold_in(plan_key, number))
+                log.moment(state, rewards)
+                if bool(state.done):
+                    break
+    return int(state.step_count)
 
 
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
-    if ":" in options.scene:
+    if ":" in options.scene or options.scene.endswith(".py"):
         named_task(options.scene, "--scene")
     elif options.scene not in (*known, "all"):
         raise OptionError(f"--scene: unknown scene {options.scene!r} (known: {', '.join(known)}, all). Correct it.")
     check_known("--layout", options.layout, LAYOUTS)
-    if options.out.suffix not in (".png", *VIDEOS):
-        raise OptionError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video.")
+    if options.out.suffix not in (".png", *VIDEOS, RECORDING):
+        raise OptionError(f"--out {options.out}: must end in .png for a picture, {' or '.join(VIDEOS)} for a video, "
+                          f"{RECORDING} for the Rerun viewer.")
+    if options.scene in ("gallery", "all") and (options.live or options.set or options.out.suffix == RECORDING):
+        raise OptionError(f"--scene {options.scene}: is no single task, as --set, --live and {RECORDING} need. Name "
+                          "one task.")
     if options.out.is_dir():
         raise OptionError(f"--out {options.out}: is a folder. Give the name of a file.")
     check_place("--out", options.out)
@@ -214,6 +261,14 @@ def main(options: Look) -> None:
         for name in known:
             out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
             main(dataclasses.replace(options, scene=name, out=out))
+        return
+    if options.live or options.out.suffix == RECORDING:
+        try:
+            load_rerun()
+        except ImportError as error:
+            raise OptionError(f"--live and {RECORDING}: {error}") from error
+        steps = record(options)
+        print(f"{options.out if options.out.suffix == RECORDING else 'viewer'}: {steps} steps of {options.scene}")
         return
     if options.out.suffix in VIDEOS:
         frames = film_of(options)

@@ -1,28 +1,28 @@
-"""Make a scene of a map and show what came of it: `python -m whill_mjx.maps import FILE --out scene`."""
+"""Make a scene of a map and show what came of it: `python -m whill_mjx.maps FILE --out scene`."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import POSITIVE, OptionError, Range, listen, refusing, run
+from whill_mjx.io.command_line import POSITIVE, Range, listen, refusing, run, starts
 
-listen()
+if starts(__name__):
+    listen()
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from whill_mjx.io.folders import check_place, write_whole  # noqa: E402
-from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments  # noqa: E402
-from whill_mjx.world.maps.picture import from_above  # noqa: E402
+from whill_mjx.io.folders import check_place, write_whole
+from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments
+from whill_mjx.world.maps.picture import from_above
 
 
 @dataclass(frozen=True)
 class Import:
     """Options of the command."""
 
-    action: str
-    """import"""
     file: Path
     """nav2 map (.yaml), OpenStreetMap (.osm) or CityGML (.gml)."""
     out: Path = Path("scene")
@@ -37,8 +37,6 @@ class Import:
 
 def main(options: Import) -> None:
     """Write picture and scene, and print what was found."""
-    if options.action != "import":
-        raise OptionError(f"{options.action}: unknown action (known: import). Correct it.")
     picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
     check_place("--out", picture)
     with refusing():
@@ -61,7 +59,8 @@ def main(options: Import) -> None:
 
 def cli() -> None:
     """Command line."""
-    run(Import, main, __doc__)
+    words = sys.argv[1:]
+    run(Import, main, __doc__, args=words[1:] if words[:1] == ["import"] else words)  # "import" was once needed
 
 
 if __name__ == "__main__":

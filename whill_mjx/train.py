@@ -28,10 +28,11 @@ from whill_mjx.io.command_line import (
     listen,
     refusing,
     run,
+    starts,
 )
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
-if __name__ == "__main__":
+if starts(__name__):
     listen()
     say_loading()
 
@@ -39,7 +40,7 @@ import jax
 
 from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy, export_sensing
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
@@ -48,6 +49,7 @@ from whill_mjx.evaluation.novelty import largest_surprise, limits
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.folders import Claim, claim_folder, write_whole
+from whill_mjx.io.formats import stamp
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
@@ -420,14 +422,16 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
         options.out,
         stopper.total_steps(preset.total_steps),
         options.seed,
-        eval_fn=keep_best(options.out, preset, evaluate),
-        eval_ahead=lambda params: evaluate(params, 0),
-        eval_every=preset.eval_every,
-        checkpoint_every_s=options.checkpoint_every_s,
-        stop=stopper,
-        devices=devices,
-        tensorboard=options.tensorboard,
-        announce=stage,
+        TrainingOptions(
+            eval_fn=keep_best(options.out, preset, evaluate),
+            eval_ahead=lambda params: evaluate(params, 0),
+            eval_every=preset.eval_every,
+            checkpoint_every_s=options.checkpoint_every_s,
+            stop=stopper,
+            devices=devices,
+            tensorboard=options.tensorboard,
+            announce=stage,
+        ),
     )
     return Trained(jax.device_get(result.agent.acting), result.env_steps, result.updates, result.wall_s)
 
@@ -453,12 +457,16 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         return mean_figures({**episodes, "return": episodes["episode_return"]})
 
     stopper = Stopper(options.out, preset.stop_success)
-    return Trained(*train_ppo(
-        functional_env(batch, preset.safety), preset.ppo, options.out, preset.total_steps, options.seed, evaluate,
-        preset.eval_every, stopper, say, eval_ahead=not devices,
-        checkpoint_every_s=options.checkpoint_every_s, last_step=stopper.total_steps(preset.total_steps),
-        announce=stage, progress=True,
-    ))  # fmt: skip
+    how = TrainingOptions(
+        eval_fn=evaluate,
+        eval_ahead=None if devices else lambda params: evaluate(params, 0),
+        eval_every=preset.eval_every,
+        checkpoint_every_s=options.checkpoint_every_s,
+        stop=stopper,
+        announce=stage,
+    )
+    env, last_step = functional_env(batch, preset.safety), stopper.total_steps(preset.total_steps)
+    return Trained(*train_ppo(env, preset.ppo, options.out, preset.total_steps, options.seed, how, last_step))
 
 
 def evaluation_of(batch: BatchEnv, preset: Preset, seed: int) -> Evaluate:
@@ -530,8 +538,8 @@ def evaluate_policy(
             write_prediction(options.out / "prediction.gif", preset, vehicle, result.params, options.videos, key)
         except ImportError as error:
             say(f"prediction.gif is left out: {error}. Install the base package to draw it.")
-    return {"task": plain(preset.task), "learner": options.learner, "seed": options.seed,
-            "env_steps": result.env_steps, "updates": result.updates, **summary}
+    return {**stamp("whill-mjx-evaluation"), "task": plain(preset.task), "learner": options.learner,
+            "seed": options.seed, "env_steps": result.env_steps, "updates": result.updates, **summary}
 
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:

@@ -100,7 +100,7 @@ def make_uncalibrated(
             scale: list[Effect] = [OdometryScale(wrong.odometry, random, chair)]
             pose = tracked(outside_pose(drive, replace(noise, position=0.0, yaw=0.0), reading), wrong)
             pose[:, 1:] += reading.standard_normal((len(pose), 3)) * [noise.position, noise.position, noise.yaw]
-            results.append((f"{name}_{replicate}", odometry(drive, scale, noise, reading), pose))
+            results.append((f"{name}_{replicate}", odometry(drive, scale, noise, reading), pose, None))
     messages_of = {f"{name}_{k}": table for name, table in tables.items() for k in range(1, replicates + 1)}
     write_dataset(out, chair.nominal, messages_of, results, ground_truth)
     return out

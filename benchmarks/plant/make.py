@@ -17,9 +17,9 @@ from benchmarks.plant.base import Effect
 from benchmarks.plant.chair import SLOW, VEHICLES, Chair, Contact, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.sensors import odometry, outside_pose
+from benchmarks.plant.sensors import Gyro, odometry, outside_pose
 from benchmarks.plant.trial import Noise, Plant
-from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
+from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_text
 
 HELD_OUT = ("figure_eight_1", "figure_eight_2", "figure_eight_3", "s_curve_3", "random_3", "stop_and_go_3", "reverse_3")
 
@@ -44,12 +44,14 @@ class Setting:
     noise: float
     chair: Chair
     contact: Contact = SLOW
+    gyro: Gyro | None = None
 
 
 def make_log(
     out: Path | str, effects: Mapping[str, float] | None = None, seed: int = 0, noise: float = 1.0, day: bool = True,
     ground_truth: bool = True, manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
     answers: Path | str | None = None, processes: int = 1, vehicle: str = "chair", contact: Contact = SLOW,
+    gyro: Gyro | None = None,
 ) -> Path:  # fmt: skip
     """Drive a dataset and write it; returns its folder. The same arguments give the same files.
 
@@ -66,13 +68,14 @@ def make_log(
         processes: 1 drives here, more in as many processes.
         vehicle: of `chair.VEHICLES`.
         contact: how the contacts are computed.
+        gyro: what is written to `imu.csv`; nothing by default.
 
     Raises:
         ValueError, FileExistsError: naming the value, the rule and the remedy.
     """
     out = Path(out)
     setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates, vehicle)
-    setting = replace(setting, contact=contact)
+    setting = replace(setting, contact=contact, gyro=gyro)
     if out.exists():
         raise FileExistsError(f"{out}: exists. Name a new folder, or delete this one.")
     if answers is not None and Path(answers).resolve().is_relative_to(out.resolve()):
@@ -134,8 +137,8 @@ def _checked(name: str, table: np.ndarray) -> np.ndarray:
     return table
 
 
-Result = tuple[str, np.ndarray, np.ndarray]
-"""Name of the trial, odometry (M, 6), outside pose (M, 4)."""
+Result = tuple[str, np.ndarray, np.ndarray, np.ndarray | None]
+"""Name of the trial, odometry (M, 6), outside pose (M, 4), gyro (M, 2)."""
 
 
 def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
@@ -150,7 +153,9 @@ def drive_all(setting: Setting, jobs: Sequence[Job]) -> list[Result]:
         drive = plant.drive(job.messages, start, effects, noise, random, job.session)
         if not np.isfinite(drive.pose).all():
             raise ValueError(f"{job.name}: motion became non-finite with {dict(setting.effects)}. Use smaller sizes.")
-        results.append((job.name, odometry(drive, effects, noise, reading), outside_pose(drive, noise, reading)))
+        seen = odometry(drive, effects, noise, reading), outside_pose(drive, noise, reading)
+        own = np.random.default_rng([setting.seed, 6, job.index])
+        results.append((job.name, *seen, None if setting.gyro is None else setting.gyro.rows(drive, own)))
     return results
 
 
@@ -182,12 +187,14 @@ def write_dataset(
     """Write all trials, or nothing."""
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     try:
-        for name, rows, pose in results:
+        for name, rows, pose, turn in results:
             folder = partial / "trials" / name
             write_csv(folder / "command.csv", COMMAND_HEADER, messages[name])
             write_csv(folder / "odometry.csv", ODOMETRY_HEADER, rows)
             if ground_truth:
                 write_csv(folder / "ground_truth.csv", POSE_HEADER, pose)
+            if turn is not None:
+                write_csv(folder / "imu.csv", IMU_HEADER, turn)
         held_out = ", ".join(json.dumps(name) for name in HELD_OUT if name in messages)
         outside = 'ground_truth = "overhead motion capture"\n' if ground_truth else ""
         note = "   # trials to be predicted, never fitted"

@@ -1,13 +1,16 @@
-"""What is reported of a drive: odometry from encoders, and an outside pose."""
+"""What is reported of a drive: odometry from encoders, an outside pose, and a gyro."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.plant.base import FRAME, TICK, Effect
 from benchmarks.plant.trial import ENCODER, REPORT, Drive, Noise
+
+GYRO_PERIOD = 0.01  # s
 
 
 def odometry(drive: Drive, effects: list[Effect], noise: Noise, random: np.random.Generator) -> np.ndarray:
@@ -58,3 +61,22 @@ def outside_pose(drive: Drive, noise: Noise, random: np.random.Generator) -> np.
     pose += random.standard_normal(pose.shape) * [noise.position, noise.position, noise.yaw]
     pose[:, 2] = np.pi - np.mod(np.pi - pose[:, 2], 2 * np.pi)
     return np.column_stack([due, pose])
+
+
+@dataclass(frozen=True)
+class Gyro:
+    """A yaw rate measured on the chassis."""
+
+    bias: float = 0.0
+    """Reading at rest [rad/s]."""
+    scale: float = 1.0
+    """Negative where it is mounted upside down."""
+    noise: float = 0.004
+    """Of a sample [rad/s]."""
+
+    def rows(self, drive: Drive, random: np.random.Generator) -> np.ndarray:
+        """Rows (M, 2) t, rate every 10 ms: the mean since the sample before."""
+        due = np.arange(math.floor(drive.t[-1] / GYRO_PERIOD + 1e-6) + 1) * GYRO_PERIOD
+        yaw = np.interp(due, drive.t, np.unwrap(drive.pose[:, 2]))
+        rate = np.diff(yaw, prepend=yaw[:1]) / GYRO_PERIOD
+        return np.column_stack([due, self.scale * rate + self.bias + self.noise * random.standard_normal(len(due))])

@@ -28,7 +28,7 @@ def table_of(
     """Channels (R, M, 8) of every manoeuvre, driven by the nominal chair with these effects; nothing is written."""
     setting, jobs = plan(effects, seed, noise, False, manoeuvres or nine(seed), replicates)
     trials = {}
-    for name, odometry, pose in drive_all(setting, jobs):
+    for name, odometry, pose, _ in drive_all(setting, jobs):
         t = pose[:, 0]
         at = np.column_stack([t, *(np.interp(t, odometry[:, 0], column) for column in odometry.T[1:])])
         trials[name] = {"odometry": at, "ground_truth": pose}

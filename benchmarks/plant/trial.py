@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -65,6 +65,37 @@ class Drive:
     """(K, 2) drive torques [N m]."""
 
 
+@dataclass
+class Trial:
+    """One trial on its way: what acts on it, and what was true at its ticks so far."""
+
+    effects: list[Effect]
+    session: float
+    """Time since the dataset began, at its start [s]."""
+    target: np.ndarray
+    """(K, 2) wanted wheel speeds [rad/s]; those of the ticks to come may still change."""
+    force: np.ndarray
+    twist: np.ndarray
+    """(K,) of the road: along the chair [N], about its yaw axis [N m]."""
+    qpos: np.ndarray
+    qvel: np.ndarray
+    """(K, nq), (K, nv) states of the model."""
+    torque: np.ndarray
+    """(K, 2) drive torques [N m]."""
+    ticks: int = 0
+    """Ticks that are driven."""
+    integral: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    """Of the controllers' errors [rad]."""
+    moment: Moment = field(default_factory=Moment)
+
+    def record(self, plant: Plant) -> Drive:
+        """What was true so far."""
+        n = self.ticks
+        return _record(
+            plant.chair, np.arange(n) * TICK, self.qpos[:n], self.qvel[:n], self.torque[:n], plant.wheel_q
+        )  # fmt: skip
+
+
 class Plant:
     """A chair ready to drive: its model is compiled and settled once."""
 
@@ -100,23 +131,39 @@ class Plant:
             random: of the disturbances.
             session: time since the dataset began [s].
         """
-        chair, model, data = self.chair, self.model, self.data
         count = math.ceil((messages[-1, 0] + REPORT) / TICK - 1e-6) + 1
-        t = np.arange(count) * TICK
-        target = wheel_targets(chair, messages, t, effects)
-        force, twist = disturbances(noise, count, random)
-        model.pair_friction[:2, :2] = chair.friction * np.exp(noise.grip * random.standard_normal((2, 1)))
+        target = wheel_targets(self.chair, messages, np.arange(count) * TICK, effects)
+        trial = self.begin(count, start, effects, noise, random, session)
+        trial.target[:] = target
+        self.advance(trial, count)
+        return trial.record(self)
+
+    def begin(
+        self, longest: int, start: tuple[float, float, float], effects: list[Effect], noise: Noise,
+        random: np.random.Generator, session: float = 0.0,
+    ) -> Trial:  # fmt: skip
+        """Place the chair for a trial of at most so many ticks, with the arguments of `drive`."""
+        force, twist = disturbances(noise, longest, random)
+        grip = self.chair.friction * np.exp(noise.grip * random.standard_normal((2, 1)))
+        self.model.pair_friction[:2, :2] = grip
         self._place(start)
+        return Trial(
+            effects, session, np.zeros((longest, 2)), force, twist, np.empty((longest, self.model.nq)),
+            np.empty((longest, self.model.nv)), np.empty((longest, 2)),
+        )  # fmt: skip
+
+    def advance(self, trial: Trial, ticks: int) -> None:
+        """Drive the next ticks of a trial, whose targets must be there."""
+        chair, model, data = self.chair, self.model, self.data
+        effects, target, force, twist, session = trial.effects, trial.target, trial.force, trial.twist, trial.session
         makers = [effect for effect in effects if type(effect).torque is not Effect.torque]
         loaders = [effect for effect in effects if type(effect).load is not Effect.load]
         (left_q, right_q), (left_v, right_v), (left_m, right_m) = self.wheel_q, self.wheel_v, self.motor_v
         applied, kp, ki, limit = data.qfrc_applied, chair.kp, chair.ki, chair.torque_limit
-        qpos, qvel = np.empty((count, model.nq)), np.empty((count, model.nv))
-        torques = np.empty((count, 2))
+        qpos, qvel, torques = trial.qpos, trial.qvel, trial.torque
         origin, wheelbase = (self.rest[left_q], self.rest[right_q]), chair.nominal.wheelbase
-        integral = [0.0, 0.0]
-        moment = Moment(session=session)
-        for k in range(count):
+        integral, moment = trial.integral, trial.moment
+        for k in range(trial.ticks, trial.ticks + ticks):
             q, w = data.qpos.tolist(), data.qvel.tolist()
             qpos[k], qvel[k] = q, w
             yaw = math.atan2(2 * (q[3] * q[6] + q[4] * q[5]), 1 - 2 * (q[5] ** 2 + q[6] ** 2))
@@ -150,7 +197,7 @@ class Plant:
             applied[right_m] += right
             torques[k] = left, right
             mujoco.mj_step(model, data, self.substeps)
-        return _record(chair, t, qpos, qvel, torques, self.wheel_q)
+        trial.ticks += ticks
 
     def _place(self, start: tuple[float, float, float]) -> None:
         """At rest, settled, at x, y, yaw: the settled attitude is turned with the heading."""

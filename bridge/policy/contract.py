@@ -39,8 +39,10 @@ class Tensor:
     """Name, shape and type of an input, an output or one entry of the recurrent state."""
 
     name: str
+    """In the network and in `policy.json`."""
     shape: tuple[int, ...]
     dtype: str
+    """One of `DTYPES`, such as float32."""
 
 
 @dataclass(frozen=True)
@@ -48,20 +50,29 @@ class Contract:
     """What `policy.json` says about image, action, rate and state of a vehicle's policy."""
 
     height: int
+    """Of the image [pixels]."""
     width: int
+    """Of the image [pixels]."""
     low: tuple[float, float]
     """Command at action -1: v [m/s], omega [rad/s]."""
     high: tuple[float, float]
     """Command at action +1."""
     rate_hz: float
+    """Control periods per second [Hz]."""
     action_repeat: int
+    """Control periods that an action holds."""
     carry: tuple[Tensor, ...]
+    """Entries of the recurrent state."""
     inputs: tuple[str, ...]
+    """Names of the network's inputs, in order."""
     outputs: tuple[str, ...]
+    """Names of the network's outputs, in order."""
     camera: Mapping[str, Any]
     """Pose and field of view of the training's camera; `frame` is always there."""
     task: str
+    """That it was trained for."""
     vehicle_sha256: str
+    """Of the vehicle file that it was trained with."""
     novelty: tuple[float, float] | None = None
     """Surprise [nat] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
@@ -95,9 +106,13 @@ class AgentContract:
     size: int
     """Classes, or components of the vector."""
     carry: tuple[Tensor, ...]
+    """Entries of the recurrent state."""
     inputs: tuple[str, ...]
+    """Names of the network's inputs, in order."""
     outputs: tuple[str, ...]
+    """Names of the network's outputs, in order."""
     task: str
+    """That it was trained for."""
     commands: Commands | None = None
     """Of an agent that drives a vehicle by other sensors than its camera alone."""
 

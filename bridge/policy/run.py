@@ -32,7 +32,9 @@ class CheckedPolicy:
     """An exported policy of which every part was checked."""
 
     path: str
+    """Folder or zip that it was read from."""
     contract: Contract | AgentContract
+    """What `policy.json` says."""
     files: Mapping[str, str]
     """SHA-256 of each listed file."""
     network: bytes

@@ -23,6 +23,8 @@ CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.y
 The pose that the odometry adds up is left out: where a vehicle updates it in steps of its own clock, those steps would
 be taken for motion. Where rows are at the times of those steps it is exact to a fraction of a millimetre, more than any
 model of skidding wheels: fits with it foretold held-out drives worse (docs/fit.md)."""
+GYRO = "gyro.omega"
+"""Mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one."""
 MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
 LONG_AGO = -1e6  # s
 MAX_WIDE_GAP = 1.0  # the same of wider bins, where the outside pose comes seldom anyway
@@ -50,18 +52,20 @@ class _Edges:
 
 @dataclass(frozen=True)
 class Features:
-    """The map from measured or simulated samples of B trials to K bins of 5 channels."""
+    """The map from measured or simulated samples of B trials to K bins of C channels, 5 or with a gyro 6."""
 
     width: float
     pose: _Edges
     first: np.ndarray  # (B, K) first odometry sample of each bin
     last: np.ndarray  # (B, K) first sample after it
     start: np.ndarray  # (B, 3) pose at t = 0, the sample before the first one where it is a measurement
-    mask: np.ndarray  # (B, K, 5) 1 where measured
+    mask: np.ndarray  # (B, K, C) 1 where measured
     middle: np.ndarray  # (K,) time of each bin's middle [s]
+    gyro: _Edges | None = None
+    """None where no gyro is a channel."""
 
     def of(self, values: Measured | Simulated) -> np.ndarray:
-        """Features (..., B, K, 5); what was not measured is 0."""
+        """Features (..., B, K, C); what was not measured is 0."""
         xp = namespace(values.pose)
         pose, odometry = xp.asarray(values.pose, float), xp.asarray(values.odometry, float)
         total = xp.concatenate([xp.zeros_like(odometry[..., :1, 3:]), xp.cumsum(odometry[..., 3:], axis=-2)], axis=-2)
@@ -70,7 +74,18 @@ class Features:
         speeds = (total[..., row, self.last, :] - total[..., row, self.first, :]) / count
         start = np.broadcast_to(self.start[:, None], (*pose.shape[:-2], 1, 3))
         pose = xp.concatenate([start, pose], axis=-2)
-        return xp.concatenate([speeds, _motion(self.pose.at(pose)) / self.width], axis=-1) * self.mask
+        seen = [speeds, _motion(self.pose.at(pose)) / self.width]
+        if self.gyro is not None:
+            if values.gyro is None:  # no trial of these has one
+                seen.append(xp.zeros_like(speeds[..., :1]))
+            else:
+                seen.append(xp.diff(self.gyro.at(xp.asarray(values.gyro, float)), axis=-2) / self.width)
+        return xp.concatenate(seen, axis=-1) * self.mask
+
+
+def channel_names(count: int) -> tuple[str, ...]:
+    """Names of so many channels."""
+    return (*CHANNELS, GYRO)[:count]
 
 
 def bin_width(trials: Sequence[Trial]) -> float:
@@ -100,8 +115,12 @@ def pose_times(trial: Trial) -> np.ndarray:
     return np.concatenate([[0.0 if trial.start.measured and len(t) and t[0] > 0 else LONG_AGO], t])
 
 
-def make_features(trials: tuple[Trial, ...], width: float = BIN) -> Features:
-    """The feature map of trials that are padded as in `sysid.replay.rollout.make_batch`."""
+def make_features(trials: tuple[Trial, ...], width: float = BIN, gyro: bool | None = None) -> Features:
+    """The feature map of trials that are padded as in `sysid.replay.rollout.make_batch`.
+
+    Args:
+        gyro: whether a gyro is a channel; by default where a trial has one.
+    """
     bins = max(int(np.floor(trial.duration / width + 1e-6)) for trial in trials)
     edge = np.arange(bins + 1) * width
     start = np.array([[t.start.x, t.start.y, t.start.yaw] for t in trials])
@@ -115,7 +134,11 @@ def make_features(trials: tuple[Trial, ...], width: float = BIN) -> Features:
     last = np.stack([np.searchsorted(t, edge[1:] - 1e-9) for t in odometry_t])
     sampled = last > first
     mask = np.stack([sampled, sampled, pose.known, pose.known, pose.known], axis=-1).astype(float)
-    return Features(width, pose, first, last, start, mask, (edge[:-1] + edge[1:]) / 2)
+    turn = None
+    if gyro if gyro is not None else any(trial.gyro is not None for trial in trials):
+        turn = _edges([np.zeros(0) if trial.gyro is None else trial.gyro.t for trial in trials], edge)
+        mask = np.concatenate([mask, turn.known[..., None]], axis=-1)
+    return Features(width, pose, first, last, start, mask, (edge[:-1] + edge[1:]) / 2, turn)
 
 
 def _edges(times: list[np.ndarray], edge: np.ndarray) -> _Edges:

@@ -17,7 +17,7 @@ from sysid.replay.arrays import added, namespace
 
 ORDER = 4  # bins of memory of the filter
 RIDGE = 2e-3  # of the regression, as a share of its data
-USUAL = (0.01, 0.02, 0.02, 0.02, 0.03)
+USUAL = (0.01, 0.02, 0.02, 0.02, 0.03, 0.01)
 """Noise of the features where there are no replicates [m/s, rad/s]."""
 BIN_SHIFT = 0.05  # s that the commands of two drives may be apart while their bins still correspond
 FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
@@ -127,7 +127,7 @@ def first_scales(target: np.ndarray, mask: np.ndarray, groups: list[list[int]]) 
     """Noise of each channel without a memory: what replicates do not share, or that of usual sensors."""
     part = deviations(target, groups)
     inside = [i for group in groups if len(group) > 1 for i in group]
-    scale = np.array(USUAL)
+    scale = np.array(USUAL[: target.shape[-1]])
     if len(inside) >= 3:
         count = np.maximum(mask[inside].sum((0, 1)), 1)
         found = np.sqrt((np.square(part[inside]) * mask[inside]).sum((0, 1)) / count)

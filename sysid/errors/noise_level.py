@@ -24,7 +24,7 @@ BINS = 40  # of a channel that a size needs at least
 CONFIDENCE = 0.95
 SPOKEN = {"odometry.v": "reported speed", "odometry.omega": "reported yaw rate",
           "pose.forward": "outside pose, forward", "pose.left": "outside pose, sideways",
-          "pose.yaw": "outside pose, heading"}
+          "pose.yaw": "outside pose, heading", "gyro.omega": "gyro"}
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from sysid.replay.records import Measured, Simulated
 
 DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
 """x, y [m], yaw [rad] and x, y, yaw, v [m/s], omega [rad/s]; only their ratio matters until they are re-estimated."""
+GYRO_NOISE = 0.02  # rad/s, until it is re-estimated: that of replicates does not say what a model leaves of its rate
 MIN_NOISE = 1e-3  # keeps a noiseless channel from dominating
 HUGE = 1e3  # residual, in noise scales, of a sample of a diverged simulation
 
@@ -39,18 +40,22 @@ class Noise:
     pose: np.ndarray  # (3,)
     odometry: np.ndarray  # (5,)
     source: str  # "replicates", "defaults" or "residuals"
+    gyro: float | None = None
+    """Of a gyro's mean rate between two samples [rad/s]; None where no trial has one."""
 
     def as_dict(self) -> dict[str, float]:
         names = ["ground_truth.x", "ground_truth.y", "ground_truth.yaw",
                  "odometry.x", "odometry.y", "odometry.yaw", "odometry.v", "odometry.omega"]
-        return {name: float(value) for name, value in zip(names, [*self.pose, *self.odometry], strict=True)}
+        scales = {name: float(value) for name, value in zip(names, [*self.pose, *self.odometry], strict=True)}
+        return scales if self.gyro is None else {**scales, "gyro.omega": self.gyro}
 
 
 def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     """Noise from the replicates among `trials`; channels without replicates keep the defaults."""
     found = replicate_noise(trials)
+    gyro = GYRO_NOISE if any(trial.gyro is not None for trial in trials) else None
     if found is None:
-        return Noise(DEFAULT_NOISE["ground_truth"], DEFAULT_NOISE["odometry"], "defaults")
+        return Noise(DEFAULT_NOISE["ground_truth"], DEFAULT_NOISE["odometry"], "defaults", gyro)
 
     def known(channel: str) -> np.ndarray:
         return np.where(np.isfinite(found[channel]), np.maximum(found[channel], MIN_NOISE), DEFAULT_NOISE[channel])
@@ -58,7 +63,7 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     pose, odometry = known("ground_truth"), known("odometry")
     pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))  # along and across the start heading: a later turn swaps them
     odometry[:2] = np.sqrt(np.mean(odometry[:2] ** 2))
-    return Noise(pose, odometry, "replicates")
+    return Noise(pose, odometry, "replicates", gyro)
 
 
 class Told(Residuals, Protocol):
@@ -100,7 +105,7 @@ class Objective:
     @property
     def counted(self) -> int:
         """Number of measured values."""
-        return int(sum(mask.sum() for mask in self._masks))
+        return int(sum(mask.sum() for mask in self._masks)) + (0 if self._rates is None else int(self._rates[1].sum()))
 
     @cached_property
     def _masks(self) -> tuple[np.ndarray, np.ndarray]:
@@ -113,10 +118,21 @@ class Objective:
                     mask[i, : int((stream.t <= trial.start.rest).sum()), :3] = 0.0
         return pose, odometry
 
+    @cached_property
+    def _rates(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Of the gyro's samples, one over the time between each and the next (B, G - 1, 1), and 1 where both are there;
+        None without a gyro."""
+        one = self.measured
+        if one.gyro_t is None or one.gyro_mask is None or self.noise.gyro is None:
+            return None
+        gap = np.diff(one.gyro_t, axis=1)[..., None]
+        known = one.gyro_mask[:, 1:] * one.gyro_mask[:, :-1] * (gap > 0)
+        return known / np.where(gap > 0, gap, 1.0), known
+
     @property
     def arrays(self) -> tuple[Any, ...]:
         """What it may differ in from others of the same replay and `kind`."""
-        return self.noise.pose, self.noise.odometry, self.prior
+        return self.noise.pose, self.noise.odometry, self.prior, self.noise.gyro
 
     @property
     def kind(self) -> Any:
@@ -125,7 +141,7 @@ class Objective:
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
         """The same with other `arrays`."""
-        noise = replace(self.noise, pose=arrays[0], odometry=arrays[1])
+        noise = replace(self.noise, pose=arrays[0], odometry=arrays[1], gyro=arrays[3])
         return replace(self, noise=noise, prior=arrays[2])
 
     @cached_property
@@ -184,24 +200,33 @@ class Objective:
 
     def renewed(self, u: np.ndarray) -> Objective:
         """The same with the noise that u (P,) leaves, where it was not known."""
-        return self.with_noise(self.residual_noise(u)) if self.noise.source == "defaults" else self
+        if self.noise.source == "defaults":
+            return self.with_noise(self.residual_noise(u))
+        if self._rates is None:
+            return self
+        return self.with_noise(replace(self.noise, gyro=self.residual_noise(u).gyro))
 
     def pieces(self, count: int) -> np.ndarray:
         """(K,) in which of so many pieces of its drive each residual is, errors of starts apart."""
         tables = (self.measured.pose, self.measured.odometry)
         piece = np.concatenate([np.repeat(np.arange(table.shape[1]) * count // max(table.shape[1], 1), table.shape[2])
                                 for table in tables])
-        return piece
+        if self._rates is None:
+            return piece
+        pairs = self._rates[1].shape[1]
+        return np.concatenate([piece, np.arange(pairs) * count // max(pairs, 1)])
 
     def own_frame(self, residual: np.ndarray) -> np.ndarray:
-        """(B, K) residuals of pose and odometry; those of the outside position along and across the start's heading."""
+        """(B, K) residuals of pose, odometry and gyro; those of the outside position along and across the start's
+        heading."""
         tables = (self.measured.pose, self.measured.odometry)
         sizes = [table[0].size for table in tables]
         pose = residual[:, : sizes[0]].reshape(tables[0].shape)
         yaw = np.array([trial.start.yaw for trial in self.trials])[:, None]
         x, y = pose[..., 0], pose[..., 1]
         turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
-        return np.concatenate([*turned, residual[:, sizes[0] : sum(sizes)]], axis=1)
+        end = sum(sizes) + (0 if self._rates is None else self._rates[1].shape[1])
+        return np.concatenate([*turned, residual[:, sizes[0] : end]], axis=1)
 
     def residual_noise(self, u: np.ndarray) -> Noise:
         """Noise re-estimated as the size of the residual (robustly) at one point u (P,)."""
@@ -215,7 +240,15 @@ class Objective:
         pose = np.where(np.isfinite(scales[0]), np.maximum(scales[0], MIN_NOISE), self.noise.pose)
         odometry = np.where(np.isfinite(scales[1]), np.maximum(scales[1], MIN_NOISE), self.noise.odometry)
         pose[:2] = np.sqrt(np.mean(pose[:2] ** 2))
-        return Noise(pose, odometry, "residuals")
+        return Noise(pose, odometry, "residuals", self._gyro_noise(simulated))
+
+    def _gyro_noise(self, simulated: Simulated) -> float | None:
+        """Robust size of what one replay leaves of the gyro's rates [rad/s]."""
+        if self._rates is None or simulated.gyro is None:
+            return None
+        error = np.abs(np.diff(np.asarray(simulated.gyro[0]) - self.measured.gyro, axis=1) * self._rates[0])
+        known = error[self._rates[1] > 0]
+        return max(1.4826 * float(np.median(known)), MIN_NOISE) if len(known) else self.noise.gyro
 
     def bad(self, simulated: Simulated) -> Any:
         """(N, B) replays that diverged."""
@@ -230,18 +263,25 @@ class Objective:
         pose_weight, odometry_weight = (
             mask / scale for mask, scale in zip(self._masks, (noise.pose, noise.odometry), strict=True))
 
-        def flat(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
-            return xp.concatenate([pose.reshape(count, trials, -1, *pose.shape[4:]),
-                                   odometry.reshape(count, trials, -1, *odometry.shape[4:])], axis=2)
+        def flat(*tables: np.ndarray) -> np.ndarray:
+            return xp.concatenate([one.reshape(count, trials, -1, *one.shape[4:]) for one in tables], axis=2)
 
-        weights = flat(xp.broadcast_to(pose_weight, simulated.pose.shape),
-                       xp.broadcast_to(odometry_weight, simulated.odometry.shape)) > 0
-        residual = flat((simulated.pose - measured.pose) * pose_weight,
-                        (simulated.odometry - measured.odometry) * odometry_weight)
+        rate_weight = None if self._rates is None else self._rates[0] / noise.gyro
+        shown, left = [xp.broadcast_to(pose_weight, simulated.pose.shape),
+                       xp.broadcast_to(odometry_weight, simulated.odometry.shape)], [
+            (simulated.pose - measured.pose) * pose_weight, (simulated.odometry - measured.odometry) * odometry_weight]
+        if rate_weight is not None:
+            turn: Any = simulated.gyro
+            rates = xp.diff(turn - measured.gyro, axis=2) * rate_weight
+            shown, left = [*shown, xp.broadcast_to(rate_weight, rates.shape)], [*left, rates]
+        weights, residual = flat(*shown) > 0, flat(*left)
         residual = xp.where(bad, HUGE * weights, residual)
         jacobian = None
         if derivative is not None:
-            jacobian = flat(derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None])
+            slopes = [derivative.pose * pose_weight[..., None], derivative.odometry * odometry_weight[..., None]]
+            if rate_weight is not None:
+                slopes.append(np.diff(np.asarray(derivative.gyro), axis=2) * rate_weight[..., None])
+            jacobian = flat(*slopes)
             jacobian = np.where(bad[..., None] | ~np.isfinite(jacobian), 0.0, jacobian)
         return self._solve_start(simulated, residual, jacobian)
 

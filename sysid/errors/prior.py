@@ -22,7 +22,7 @@ UNKNOWN = 0.29  # of the range: standard deviation of a parameter of which only 
 EXPECTED = {
     "wheel_radius_difference.common": 0.03, "wheel_radius_difference.difference": 0.02, "track_width.error": 0.05,
     "wheels.difference": 0.02, "odometry_scale.linear": 0.03, "odometry_scale.angular": 0.05,
-    "pose_mount.x": 0.2, "pose_mount.y": 0.2, "pose_mount.yaw": 0.2,
+    "pose_mount.x": 0.2, "pose_mount.y": 0.2, "pose_mount.yaw": 0.2, "gyro_bias.bias": 0.02, "gyro_bias.scale": 0.02,
 }
 """How far data sheets, rulers and hand-drawn markers are usually off: standard deviations around where a parameter does
 nothing, of those whose bounds say much less."""

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.log import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
 from sysid.logs.metrics import ideal_replay
 from sysid.missing.catalogue import Hypothesis, base_values
@@ -28,7 +28,7 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.joint_fit import Start as FitStart
 from sysid.missing.refit import Refitter, own_sizes
 from sysid.missing.signatures import base_columns
-from sysid.pages.loop_page import command_of
+from sysid.pages.loop_words import command_of
 from sysid.replay.quotients import Quotients
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
@@ -188,12 +188,13 @@ def _fitting(name: str, v: float, omega: float, seconds: float, heading: float, 
     return None
 
 
-def _as_trial(command: Command, start: Start, duration: float, poses: int, readings: int) -> Trial:
-    """A trial yet to be measured, with so many samples of outside pose and odometry; none for 0."""
+def _as_trial(command: Command, start: Start, duration: float, poses: int, readings: int, turns: int = 0) -> Trial:
+    """A trial yet to be measured, with so many samples of outside pose, odometry and gyro; none for 0."""
     t, s = np.linspace(0.0, duration, max(poses, 2)), np.linspace(0.0, duration, max(readings, 2))
     truth = PoseStream(t, 0 * t, 0 * t, 0 * t) if poses else None
     odometry = OdometryStream(s, None, None, None, 0 * s, 0 * s) if readings else None
-    return Trial("next", "next", command, odometry, truth, start)
+    turn = GyroStream(np.linspace(0.0, duration, turns), np.zeros(turns)) if turns else None
+    return Trial("next", "next", command, odometry, truth, start, gyro=turn)
 
 
 def plan_drives(result: Result, drives: Drives, library: Sequence[Drive]) -> Drives:
@@ -202,7 +203,7 @@ def plan_drives(result: Result, drives: Drives, library: Sequence[Drive]) -> Dri
     longest = max(trial.duration for trial in trials)
     rates = [max((len(stream.t) / trial.duration for trial in trials
                   if (stream := getattr(trial, channel)) is not None), default=0.0)
-             for channel in ("ground_truth", "odometry")]
+             for channel in ("ground_truth", "odometry", "gyro")]
     counts = [round(rate * longest) for rate in rates]
     moving = any(trial.start.v or trial.start.omega for trial in trials)
     planned = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sysid.missing.joint_fit import Refit, Start
@@ -29,32 +31,70 @@ def contradicted(result: Result) -> list[str]:
     return [each for one in result.stood for each in one.against(result.config.thresholds)]
 
 
+@dataclass(frozen=True)
+class Doubt:
+    """What speaks against taking a name as certain, and what to do about it."""
+
+    text: str
+    remedy: str
+    about_rest: bool = False
+    """Whether it is about what the named effects leave, which does not matter where drives are predicted as well as
+    they repeat."""
+
+
 def warnings(result: Result) -> list[str]:
     """What speaks against taking the names as certain."""
+    return [one.text for one in doubts(result)]
+
+
+def advice(result: Result, as_good_as_repeats: bool) -> list[str]:
+    """Of the doubts those that change what a reader should do, each with what that is.
+
+    Args:
+        as_good_as_repeats: with the named effects, drives are predicted to within what repeats differ by.
+    """
+    return [f"{one.text[0].upper()}{one.text[1:]}. {one.remedy}" for one in doubts(result)
+            if not (one.about_rest and as_good_as_repeats)]
+
+
+def as_good_as_repeats(errors: np.ndarray, floor: float | None) -> bool:
+    """Whether errors of drives (B,) are, as far as so few show, no larger than what repeats differ by."""
+    if floor is None or len(errors) == 0:
+        return False
+    drawn = np.random.default_rng(0).integers(0, len(errors), (2000, len(errors)))
+    return bool(np.quantile(errors[drawn].mean(1), 0.025) <= floor)
+
+
+def doubts(result: Result) -> list[Doubt]:
+    """All doubts about the names of a result."""
     found, alpha = result.search, result.config.thresholds.alpha
     if found.verdict != "named":
         return []
-    said = [f"{', '.join(found.crowd)} cannot be separated from it either: more than a class may have for a name to be "
-            "worth much"] if found.crowd else []
-    said += [f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
-             "catalogue does not have may do what is left of both"
+    said = [Doubt(f"{', '.join(found.crowd)} cannot be separated from it either: more than a class may have for a name "
+                  "to be worth much", "Drive other manoeuvres before you rely on the name.")] if found.crowd else []
+    said += [Doubt(f"{first} and {second} undo most of what the other does ({1 - left:.0%} of it): one effect that the "
+                   "catalogue does not have may do what is left of both",
+                   "Use them together only, and for drives like these.")
              for first, second, left in undone(found.final) if left < UNDONE]
-    said += [f"{name} is nearly as large as is looked for: another effect may do it with less"
-             for name in at_the_end(result)]
+    said += [Doubt(f"{name} is nearly as large as is looked for: another effect may do it with less",
+                   "Check on the vehicle whether it can be so large.") for name in at_the_end(result)]
     named = {one.hypothesis.effect for one in found.accepted}
-    said += [f"these drives do not show whether {one.effect} {each.falsifier.says}: an effect of another law may do it"
+    said += [Doubt(f"these drives do not show whether {one.effect} {each.falsifier.says}: an effect of another law may "
+                   "do it", f"Drive the same manoeuvres with another {each.falsifier.by} to find out.")
              for one in result.stood if one.effect in named for each in one.falsifiers
              if each.falsifier.by in LAW and each.outcome == "untold"]
-    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width)
+    gains = held_back_gains(result.log.training, result.log.spec, found.final.residual, result.reference.width,
+                            result.reference.channels)
     quantity = max(gains, key=lambda name: gains[name])
     if gains[quantity] > result.prepared.wander.smooth_limit(alpha) * len(found.final.residual):
-        said.append(f"what is left is a smooth function of {quantity} more than on reference days: the form is another "
-                    "one, or another effect")
+        said.append(Doubt(f"what is left is a smooth function of {quantity} more than on reference days: the form is "
+                          "another one, or another effect", f"Do not trust predictions at another {quantity} than "
+                          "these drives have.", True))
     if found.excess[1] > result.prepared.wander.excess_limit(alpha):
         names = " and ".join(one.hypothesis.effect for one in found.accepted)
-        said.append(f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} has "
-                    "another form here than in the catalogue, or is imitated by an effect that the catalogue does not "
-                    "have")
+        said.append(Doubt(f"what is left is {found.excess[1]:.0%} above the noise, more than days differ by: {names} "
+                          "has another form here than in the catalogue, or is imitated by an effect that the catalogue "
+                          "does not have", "Take the name as a hint, and the prediction below as what it is.", True))
     return said
 
 

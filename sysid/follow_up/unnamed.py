@@ -104,7 +104,8 @@ class Bench:
         self.names = [name for name in describe(self.params) if name.startswith("unnamed.")] + self.base_names
         self.neutral = np.asarray(get_values(self.params, self.names), float)
         self.u = base.u
-        drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width)
+        drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width,
+                             gyro=reference.gyro)
         self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
         weight = 0.01 * result.log.spec.mass * 9.81
         self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m

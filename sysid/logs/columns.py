@@ -40,9 +40,9 @@ SPELLED = {
 }
 STREAM_WORDS = {
     "command": ("cmd", "command", "commands", "commanded", "desired", "des", "ref", "reference", "setpoint", "target",
-                "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested"),
+                "input", "u", "soll", "joy", "joystick", "control", "teleop", "request", "requested", "action"),
     "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc",
-                 "fb", "reported"),
+                 "fb", "reported", "state"),
     "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
                      "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
 }
@@ -55,13 +55,15 @@ QUANTITY_WORDS = {
           "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
 }
-TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime")
+TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime", "date", "datetime",
+              "uhrzeit", "datum")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
 SAID = "as said"  # why a column has its role where somebody gave no unit
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
+GAP = 2.0  # s without samples, over which nothing is interpolated
 
 
 @dataclass(frozen=True)
@@ -215,6 +217,10 @@ def _quantity(words: list[str]) -> str | None:
         angle = re.search(r"angle|pos|position|enc(oder)?$|ticks", text) and not re.search(r"vel|speed|rpm", text)
         return f"{side}_angle" if angle else side
     last = words[-1]
+    if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
+        return {"x": "v", "y": None, "z": None}.get(match[1], "omega")
+    if match := re.fullmatch(r"(?:\w+ )?(x|y|theta|yaw|heading) (?:pos|position)", text):
+        return match[1] if match[1] in "xy" else "yaw"
     if re.search(r"(orientation|quat\w*|rotation|^q) [wxyz]$", text):
         return f"q{last}"
     if last in "xyz" and re.search(r"angular|gyro|rate|^w |omega", text):
@@ -390,7 +396,7 @@ def _size_of(
     """The unit in which a signal is as large as a reference; None where they are not alike or no unit fits."""
     if reference is None:
         return None
-    t = np.arange(max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]), 0.05)
+    t = _grid(mine[0], max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]))
     if len(t) < 40:
         return None
     ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
@@ -407,10 +413,18 @@ def _size_of(
 
 def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rate of a signal (T,) over 0.2 s, at 20 Hz."""
-    grid = np.arange(t[0] + 0.1, t[-1] - 0.1, 0.05)
+    grid = _grid(t, t[0] + 0.1, t[-1] - 0.1)
     if len(grid) < 2:
         return t[:1], np.zeros(1)
     return grid, (np.interp(grid + 0.1, t, values) - np.interp(grid - 0.1, t, values)) / 0.2
+
+
+def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Times at 20 Hz from `begin` to `end`, but for gaps of more than GAP in the samples' times (T,)."""
+    inside = np.unique(np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])) if end > begin else np.zeros(0)
+    pieces = [np.arange(one[0], one[-1], 0.05) for one in np.split(inside, np.flatnonzero(np.diff(inside) > GAP) + 1)
+              if len(one)]  # fmt: skip
+    return np.concatenate([*pieces, np.zeros(0)])
 
 
 def _way(x: tuple[np.ndarray, np.ndarray] | None, y: tuple[np.ndarray, np.ndarray] | None

@@ -12,17 +12,19 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from sysid.logs import lerobot
 from sysid.logs.coverage import sanity
 from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
-from sysid.logs.rosbag import PACKED, clock_notes, find_bags, in_order, read_bag, stream_times
-from sysid.logs.text_files import integrate_speeds, read_drives, text_files
+from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
 from whill_mjx.io.command_line import Range
-from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
+from whill_mjx.io.fields import COLUMNS
+from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
-HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER}
+HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER, "imu": IMU_HEADER}
 STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow
 MOVING = {"v": 0.02, "omega": 0.03}  # m/s, rad/s of the odometry above which the vehicle counts as moving
 LEAD = 2.0  # s of standstill kept before and after a drive
@@ -34,9 +36,13 @@ class ConvertConfig:
     """Options of the command."""
 
     source: Path
-    """ROS bag, CSV or TUM file, folder of one of them, or a measured set."""
+    """ROS bag, CSV or TUM file, folder of one of them, LeRobotDataset, or a measured set."""
     out: Path = Path("runs/dataset")
     """Dataset folder; made where it does not exist, else the trials are added."""
+    to: Literal["dataset", "lerobot"] = "dataset"
+    """What is written: a driving-log dataset, or a LeRobotDataset v3 of a driving-log dataset."""
+    fps: Annotated[int | None, Range(1, 1000)] = None
+    """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
     wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
@@ -51,6 +57,8 @@ class ConvertConfig:
     """The vehicle's own Odometry; '' goes without."""
     truth_topic: str | None = None
     """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
+    imu_topic: str | None = None
+    """Imu with the yaw rate of the body about its z axis; '' goes without."""
     truth_ahead: Annotated[float, Range(-10, 10)] = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
     truth_turned: Annotated[float, Range(-360, 360)] = 0.0
@@ -83,6 +91,7 @@ class Drive:
     command: np.ndarray  # (T, 3)
     odometry: np.ndarray | None  # (T, 6)
     ground_truth: np.ndarray | None  # (T, 4)
+    imu: np.ndarray | None = None  # (T, 2)
 
 
 @dataclass(frozen=True)
@@ -108,10 +117,21 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
-    if not bags and not is_known(config.source) and text_files(config.source):
+    held_out = config.held_out
+    if lerobot.is_lerobot(config.source):
+        episodes = lerobot.read(config.source)
+        spec = _spec(config, episodes.spec)
+        found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
+                            (spec.wheel_radius, spec.track), config.input == "wheels")
+        drives, said, fields = _text_drives(found, config)
+        notes, more = [*episodes.notes, *left, *said], more | fields
+        held_out = held_out or (() if (config.out / "dataset.toml").exists() else episodes.held_out)
+    elif not bags and not is_known(config.source) and text_files(config.source):
         spec = _spec(config)
-        drives, notes, found = _text_drives(config, spec)
-        more |= found
+        found, left = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track),
+                                  config.input == "wheels")
+        drives, said, fields = _text_drives(found, config)
+        notes, more = [*left, *said], more | fields
     elif bags:
         spec = _spec(config)
         wheels = config.input == "wheels"
@@ -139,11 +159,11 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
-    unknown = sorted(set(config.held_out) - {drive.name for drive in drives})
+    unknown = sorted(set(held_out) - {drive.name for drive in drives})
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    notes += write_dataset(config.out, spec, drives, config.held_out, more)
+    notes += write_dataset(config.out, spec, drives, held_out, more, config.source)
     log = load_log(config.out)
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
@@ -169,11 +189,12 @@ def _bags_drives(
     return drives, notes, refused
 
 
-def _text_drives(config: ConvertConfig, spec: VehicleSpec) -> tuple[list[Drive], list[str], dict[str, Any]]:
-    """Trials of CSV and TUM files, notes, and what dataset.toml says of them."""
+def _text_drives(
+    found: Sequence[TextDrive], config: ConvertConfig
+) -> tuple[list[Drive], list[str], dict[str, Any]]:
+    """Trials of drives out of columns, notes, and what dataset.toml says of them."""
     drives: list[Drive] = []
     notes: list[str] = []
-    found = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track), config.input == "wheels")
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
         raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
@@ -200,12 +221,24 @@ def bag_drives(
         spec: nominal geometry, of wheels whose angles or rates were recorded.
         wheels: the input is measured wheel speeds.
     """
-    asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic}
+    asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic,
+             "imu": config.imu_topic}
     topics = {name: topic for name, topic in asked.items() if topic is not None}
     bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
+    imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
+    bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
     times = stream_times(bag, config.stamp)
+    said = clock_notes(bag, config.stamp)
+    try:
+        more = stream_times(imu, config.stamp), clock_notes(imu, config.stamp)
+        _check_rates(imu)
+        times, said, bag = {**times, **more[0]}, [*said, *more[1]], replace(bag, streams={**bag.streams, **imu.streams})
+    except ValueError as error:  # nothing else depends on it
+        if config.imu_topic is not None:
+            raise
+        said = [*said, f"the gyro is left out: {error}"]
     notes = [*bag.notes, *(f"{name} from {stream.topic} ({stream.kind}), {len(stream.received)} messages"
-                           for name, stream in bag.streams.items()), *clock_notes(bag, config.stamp)]
+                           for name, stream in bag.streams.items()), *said]
     if config.stamp == "header" and not np.isfinite(bag.streams["command"].stamped).all():
         notes.append("commands have no header: their time is that of receipt, the other streams' that of their header")
     tables = {}
@@ -220,6 +253,15 @@ def bag_drives(
     return drives, [*notes, *said]
 
 
+def _check_rates(bag: Bag) -> None:
+    """Raise ValueError where a gyro turns faster than any vehicle."""
+    for stream in bag.streams.values():
+        most, field = float(np.abs(stream.values).max()), COLUMNS["gyro"]
+        if most > field.high:
+            raise ValueError(f"{bag.path}: topic {stream.topic} turns at up to {most:.3g} rad/s; it must be below "
+                             f"{field.high:g}. {field.remedy}")
+
+
 def cut_drives(
     stem: str, tables: dict[str, np.ndarray], source: Source, config: ConvertConfig
 ) -> tuple[list[Drive], list[str]]:
@@ -228,8 +270,8 @@ def cut_drives(
         tables["ground_truth"][:, 3] -= np.deg2rad(config.truth_turned)
     notes = []
     if config.split == "bag":
-        spans = [(max(table[0, 0] for name, table in tables.items() if name != "command"),
-                  min(table[-1, 0] for name, table in tables.items() if name != "command"))]
+        ends = [(table[0, 0], table[-1, 0]) for name, table in tables.items() if name not in ("command", "imu")]
+        spans = [(max(begin for begin, _ in ends), min(end for _, end in ends))]
     else:
         spans = drive_spans(tables, config.pause)
         notes.append(f"{len(spans)} drives between standstills of {config.pause:g} s")
@@ -264,6 +306,8 @@ def cut(
             before = table[table[:, 0] <= begin + 1e-6]
             first = before[-1, 1:] if len(before) else np.zeros(2)
             inside = np.vstack([[begin, *first], inside[inside[:, 0] > begin + 1e-6]])
+        if len(inside) < 2 and stream == "imu":
+            continue
         if len(inside) < 2:
             raise ValueError(f"{source.path}: {source.streams[stream]} has {len(inside)} messages in the drive "
                              f"from {begin - _origin(tables):.1f} to {end - _origin(tables):.1f} s; at least 2 are "
@@ -279,7 +323,7 @@ def cut(
         truth[:, 1] -= truth_ahead * np.cos(truth[:, 3])
         truth[:, 2] -= truth_ahead * np.sin(truth[:, 3])
         truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
-    return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"))
+    return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"), found.get("imu"))
 
 
 def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float, float]]:
@@ -294,7 +338,7 @@ def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float
         else:
             merged.append((begin, end))
     merged = [(begin, end) for begin, end in merged if end - begin >= SHORTEST]
-    measured = [table for name, table in tables.items() if name != "command"]
+    measured = [table for name, table in tables.items() if name not in ("command", "imu")]
     first, last = max(table[0, 0] for table in measured), min(table[-1, 0] for table in measured)
     spans = []
     for k, (begin, end) in enumerate(merged):
@@ -335,7 +379,10 @@ def trial_drive(trial: Trial) -> Drive:
         if pose[0, 0] > 1e-6:
             pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
         pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
-    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose)
+    imu = None
+    if trial.gyro is not None and len(trial.gyro.t) > 1:
+        imu = np.column_stack([trial.gyro.t, np.gradient(trial.gyro.turn, trial.gyro.t)])
+    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose, imu)
 
 
 def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
@@ -352,12 +399,13 @@ def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
 
 def write_dataset(
     folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
-    more: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] | None = None, source: Path | None = None,
 ) -> list[str]:
     """Write the trials that the loader accepts into a dataset folder; an existing dataset keeps its fields and trials.
 
     Args:
         more: further fields of a new dataset.toml.
+        source: what they come from, for errors.
 
     Returns:
         Notes on the trials that were left out.
@@ -389,7 +437,8 @@ def write_dataset(
         missing = sorted(set(held_out) & set(refused))
         if not accepted or missing:
             reason = notes[0] if not missing else f"{missing[0]} is held out, but it is {notes[0]}"
-            raise ValueError(f"{reason.removeprefix('left out: ')} Nothing was written.")
+            came = f"{source}: made into a trial, " if source else ""
+            raise ValueError(f"{came}{reason.removeprefix('left out: ')} Nothing was written.")
         if not known:
             write_fields(partial, spec, held_out, more)
             spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
@@ -419,9 +468,12 @@ def _write_accepted(folder: Path, drives: Sequence[Drive]) -> tuple[list[str], d
     return accepted, refused
 
 
-def _spec(config: ConvertConfig) -> VehicleSpec:
+def _spec(config: ConvertConfig, noted: VehicleSpec | None = None) -> VehicleSpec:
+    """Nominal geometry: as the options say, else as the source notes it."""
     changes = {key: value for key in ("wheel_radius", "track", "mass")
                if (value := getattr(config, key)) is not None}
+    if noted is not None and config.vehicle == ConvertConfig.vehicle:
+        return replace(noted, **changes)
     if config.vehicle in SPECS:
         return replace(find_spec(config.vehicle), **changes)
     missing = [key for key in ("wheel_radius", "track") if key not in changes]

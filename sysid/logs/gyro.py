@@ -7,11 +7,18 @@ odometry shows which way the vehicle really turned.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+Trial = Any
+"""`sysid.logs.log.Trial`, which is loaded by what is here."""
+
 SURE = 0.9
 """Least correlation of both turns, of either sign, that settles the sign."""
+LARGEST = 1.25
+"""Factor by which a gyro may turn more or less than what is seen otherwise: as far as `gyro_bias.scale` goes."""
 LEAST_TURN = 0.5
 """Root of the summed squares of the turns [rad] below which nothing turned."""
 
@@ -29,3 +36,58 @@ def told_sign(turns: Sequence[tuple[float, float]]) -> float | None:
     if min(np.linalg.norm(gyro), np.linalg.norm(seen)) < LEAST_TURN or abs(gyro @ seen) < SURE * size:
         return None
     return float(np.sign(gyro @ seen))
+
+
+def with_sign(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
+    """Trials with the gyro's turns counter-clockwise, and notes on what was changed.
+
+    A gyro whose turns do not follow those that the outside pose, or else the odometry, shows is left out: another axis,
+    or another unit. Errors of scale within its maker's reach are left to the fit.
+    """
+    turns = [each for trial in trials if (each := _turns(trial)) is not None]
+    if not any(trial.gyro is not None for trial in trials):
+        return tuple(trials), []
+    sign = told_sign(turns)
+    if sign is None:
+        if float(np.linalg.norm([seen for _, seen in turns])) < LEAST_TURN:
+            return tuple(trials), ["nothing turns enough to show the gyro's sign: it is taken as logged"]
+        return _without(trials), ["the gyro does not follow the turns that pose or odometry show: it is left out. "
+                                  "Record the yaw rate about the vertical axis, in rad/s"]
+    gyro, seen = np.asarray(turns, float).T
+    factor = float(gyro @ seen / (gyro @ gyro)) * sign
+    if not 1 / LARGEST < factor < LARGEST:
+        return _without(trials), [f"the gyro turns {1 / factor:.3g} times as far as pose or odometry show: it is left "
+                                  "out. Record its yaw rate in rad/s"]
+    if sign > 0:
+        return tuple(trials), []
+    turned = tuple(trial if trial.gyro is None else replace(trial, gyro=replace(trial.gyro, turn=-trial.gyro.turn))
+                   for trial in trials)
+    return turned, ["the gyro turns against the yaw that is seen otherwise: its sign is changed"]
+
+
+def _turns(trial: Trial) -> tuple[float, float] | None:
+    """What the gyro turned, and what the outside pose, or else the odometry, shows [rad]; None without both.
+
+    Absolute turns would not show the sign, and whole drives may end as they began: the longest turn in either
+    direction counts, from its lowest to its highest heading.
+    """
+    if trial.gyro is None:
+        return None
+    if trial.ground_truth is not None and len(trial.ground_truth.t) > 1:
+        t, seen = trial.ground_truth.t, trial.ground_truth.yaw
+    elif trial.odometry is not None and len(trial.odometry.t) > 1:
+        t, omega = trial.odometry.t, trial.odometry.omega
+        seen = np.concatenate([[0.0], np.cumsum(np.diff(t) * (omega[1:] + omega[:-1]) / 2)])
+    else:
+        return None
+    inside = (t >= trial.gyro.t[0]) & (t <= trial.gyro.t[-1])
+    if inside.sum() < 2:
+        return None
+    t, seen = t[inside], seen[inside]
+    gyro = np.interp(t, trial.gyro.t, trial.gyro.turn)
+    low, high = int(np.argmin(seen)), int(np.argmax(seen))
+    return float(gyro[high] - gyro[low]), float(seen[high] - seen[low])
+
+
+def _without(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    return tuple(replace(trial, gyro=None) for trial in trials)

@@ -154,13 +154,12 @@ def text(found: dict[str, Any]) -> str:
     for blind in found["blind_spots"]:
         lines += [f"  {blind['cause']} -> {blind['hidden']}", f"      remedy: {blind['remedy']}"]
     if found.get("next_drives"):
-        lines += ["", "Next drives (ramped, within the space; --out writes them as t,v,omega; keep a hand on the stop)"]
+        lines += ["", "Next drives (ramped, within the space; --out writes them; keep a hand on the stop)"]
     for one in found.get("next_drives", ()):
-        (length, width), (x, y, yaw) = one["length_width"], one["start"]
-        lines.append(f"  {one['file']} {one['manoeuvre']}, {one['seconds']:.0f} s, to {one['v']:.2f} m/s and "
-                     f"{one['omega']:.2f} rad/s: {one['why']}")
-        lines.append(f"      path of {length:.1f} x {width:.1f} m; start {x:.1f}, {y:.1f} m from a corner, heading "
-                     f"{np.rad2deg(yaw):.0f} deg")
+        length, width = one["floor"]
+        lines += [f"  {one['file']} {one['manoeuvre']}, {one['seconds']:.0f} s, to {one['v']:.2f} m/s and "
+                  f"{one['omega']:.2f} rad/s: {one['why']}",
+                  f"      needs {length:.1f} x {width:.1f} m of free floor, margins included: {one['drive_it']}"]
     return "\n".join(lines)
 
 

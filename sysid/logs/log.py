@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.gyro import with_sign
 from whill_mjx.io import fields as tables
 from whill_mjx.io.folders import RUN_FILE
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
@@ -34,6 +36,9 @@ TIME_UNITS = (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)
 COMMAND_COLUMNS = ("t", "v", "omega")
 ODOMETRY_COLUMNS = ("t", "x", "y", "yaw", "v", "omega")
 POSE_COLUMNS = ("t", "x", "y", "yaw")
+GYRO_COLUMNS = ("t", "gyro")
+GYRO_SPACING = 0.05
+"""Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Command:
 
     @property
     def table(self) -> np.ndarray:
-        """(T, 3) of t, v and omega."""
+        """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
         return np.column_stack([self.t, self.v, self.omega])
 
 
@@ -56,14 +61,14 @@ class OdometryStream:
 
     t: np.ndarray  # (T,) s
     x: np.ndarray | None  # (T,) m, from the trial's start
-    y: np.ndarray | None
+    y: np.ndarray | None  # (T,) m
     yaw: np.ndarray | None  # (T,) rad, unwrapped
     v: np.ndarray  # (T,) m/s
     omega: np.ndarray  # (T,) rad/s
 
     @property
     def values(self) -> np.ndarray:
-        """(T, 5) of x, y, yaw, v and omega; nan where not logged."""
+        """(T, 5) of x, y [m], yaw [rad], v [m/s] and omega [rad/s]; nan where not logged."""
         absent = np.full(len(self.t), np.nan)
         pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
         return np.stack([*pose, self.v, self.omega], axis=-1)
@@ -75,13 +80,42 @@ class PoseStream:
 
     t: np.ndarray  # (T,) s
     x: np.ndarray  # (T,) m
-    y: np.ndarray
+    y: np.ndarray  # (T,) m
     yaw: np.ndarray  # (T,) rad, unwrapped
 
     @property
     def values(self) -> np.ndarray:
-        """(T, 3) of x, y and yaw."""
+        """(T, 3) of x, y [m] and yaw [rad]."""
         return np.stack([self.x, self.y, self.yaw], axis=-1)
+
+
+@dataclass(frozen=True)
+class GyroStream:
+    """The turn of the body, added up from a yaw rate that is measured on the vehicle."""
+
+    t: np.ndarray  # (T,) s
+    turn: np.ndarray  # (T,) rad, from the first sample
+
+    @classmethod
+    def of_rates(cls, t: np.ndarray, omega: np.ndarray) -> GyroStream:
+        """That of yaw rates (T,) [rad/s], at samples that are at least `GYRO_SPACING` apart."""
+        turn = np.concatenate([[0.0], np.cumsum(np.diff(t) * (omega[1:] + omega[:-1]) / 2)])
+        kept, last = [], -np.inf
+        for i, now in enumerate(t):
+            if now - last >= GYRO_SPACING - 1e-9:
+                kept.append(i)
+                last = now
+        return cls(t[kept], turn[kept])
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 1) of the turn."""
+        return self.turn[:, None]
+
+    def until(self, end: float) -> GyroStream:
+        """The samples up to a time [s]."""
+        inside = self.t <= end
+        return GyroStream(self.t[inside], self.turn[inside])
 
 
 @dataclass(frozen=True)
@@ -112,17 +146,25 @@ class Trial:
     """One drive (or one window of a longer one)."""
 
     name: str
+    """Of its folder, or of the window."""
     manoeuvre: str
     """Trials of one manoeuvre with equal commands are replicates."""
     command: Command
+    """What the vehicle was told."""
     odometry: OdometryStream | None
+    """What it reported; None where that was not logged."""
     ground_truth: PoseStream | None
+    """Its pose as measured from outside; None where that was not logged."""
     start: Start
+    """Pose and speed at t = 0."""
     held_out: bool = False
+    """Whether a fit must not look at it."""
     group: str = ""
     """Terrain or robot; part of a selection."""
     breaks: tuple[tuple[float, float], ...] = ()
     """Times between which the outside pose moved by an unknown amount [s]."""
+    gyro: GyroStream | None = None
+    """Turn of the body by a yaw rate measured on the vehicle, counter-clockwise."""
 
     @property
     def duration(self) -> float:
@@ -135,18 +177,26 @@ class Log:
     """All trials of one vehicle."""
 
     name: str
+    """Of its folder."""
     spec: VehicleSpec
+    """Nominal vehicle that was driven."""
     trials: tuple[Trial, ...]
+    """All drives, training and held out."""
     sha256: str
+    """Over names and contents of its files."""
     notes: tuple[str, ...] = ()
+    """What its reader found worth saying."""
     fields: dict[str, Any] = field(default_factory=dict)
+    """Content of dataset.toml."""
 
     @property
     def training(self) -> tuple[Trial, ...]:
+        """The trials that are fitted."""
         return tuple(trial for trial in self.trials if not trial.held_out)
 
     @property
     def held_out(self) -> tuple[Trial, ...]:
+        """The trials that are kept aside."""
         return tuple(trial for trial in self.trials if trial.held_out)
 
     def select(self, keep: Callable[[Trial], bool]) -> Log:
@@ -176,6 +226,8 @@ def load_log(folder: str | Path) -> Log:
                          "Correct the names, or nothing is really held out.")
     timeout = fields.get("command_timeout")
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    trials, said = with_sign(trials)
+    notes += said
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
@@ -210,7 +262,19 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
         ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
     if timeout is not None:
         command = with_timeout(command, timeout)
-    return make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
+    trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
+    return replace(trial, gyro=_read_gyro(folder / "imu.csv", trial.duration))
+
+
+def _read_gyro(path: Path, end: float) -> GyroStream | None:
+    """What a gyro turned until a time [s]; None where there is no file, or fewer than two samples in it."""
+    if not path.exists():
+        return None
+    columns = read_csv(path, GYRO_COLUMNS)
+    inside = (columns["t"] >= 0) & (columns["t"] <= end)
+    if inside.sum() < 2:
+        return None
+    return GyroStream.of_rates(columns["t"][inside], columns["gyro"][inside])
 
 
 def make_trial(
@@ -346,6 +410,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     """Checked fields of a dataset.toml."""
     content = read_toml(path, "missing. A dataset needs it to name the vehicle, its geometry and the held-out trials; "
                               "see docs/log_format.md.", "Strings need quotes, decimals a point.")
+    content = upgraded("driving-log-dataset", content)
     schema = next(field for field in tables.DATASET if field.name == "schema")
     tables.check(str(path), schema, content.get("schema"))  # before the fields, which follow from it
     return tables.check_table(str(path), tables.DATASET, content)
@@ -422,6 +487,7 @@ class Prediction:
 
     ground_truth: PoseStream | None
     odometry: OdometryStream | None
+    gyro: GyroStream | None = None
 
 
 def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:

@@ -23,12 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.gyro import told_sign
-from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial, hash_files
+from sysid.logs.log import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
-from whill_mjx.io.fields import shown
+from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
@@ -212,7 +213,7 @@ def _drive_windows(path: Path, run: str, chained: bool
                 wheel_omega[rows]).sum() < MOVING:
             continue
         trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
-                            breaks=tuple(breaks)))
+                            breaks=tuple(breaks), gyro=GyroStream.of_rates(t, gyro[rows].ravel())))
         rates[name] = t, gyro[rows].ravel()
     note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
     if sign != 1.0:
@@ -368,7 +369,7 @@ def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
         times.append(row[index["ros_time"]])
         states.append(row[index["calib_state"]] == "calib")
     if len(times) < 2:
-        raise ValueError(f"{path}: {len(times)} rows of data; at least 2 are needed. {CONVERT}.")
+        raise ValueError(f"{path}: {counted(len(times), 'row')} of data; at least 2 are needed. {CONVERT}.")
     return columns, times, states
 
 
@@ -483,13 +484,14 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
 
     Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.lost_pose`), and so are a
-    dataset's rows that were held between updates (`sysid.logs.streams.without_held`); a note says either.
+    dataset's rows that were held between updates (`sysid.logs.streams.without_held`). A base that stops by itself where
+    no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """
     from sysid.logs.log import load_log
 
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
-        log: Log = _without_held(load_log(path))
+        log: Log = with_own_timeout(_without_held(load_log(path)))
         return split(log, train, held_out) if train else log
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "

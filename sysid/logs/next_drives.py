@@ -1,22 +1,32 @@
 """The next three drives of a log: manoeuvres that show what it lacks, slow, ramped and within a stated space.
 
-They are scripts, `t,v,omega` as in command.csv. No vehicle model is asked; `sysid.design` plans with a fitted one.
+They are scripts, `t,v,omega` as in command.csv, which `bridge.manoeuvre` drives: they keep to the floor as it measures
+it. No vehicle model is asked; `sysid.design` plans with a fitted one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from sysid.logs.coverage import Blind
 from sysid.logs.log import Command, Log
-from sysid.logs.manoeuvre_library import CLEARANCE, Candidate, Limits, as_trial, library, placement
-from sysid.logs.metrics import ideal_replay
+from sysid.logs.manoeuvre_library import FRACTIONS, REVERSING, make_command
+from whill_mjx.vehicle.specs import VehicleSpec
 
 COUNT = 3
 RAMPS = (0.5, 1.0)  # m/s^2 and rad/s^2 that no script exceeds
+SIZES = (1.0, 0.7, 0.5, 0.35)  # of the speeds that are tried where the floor is too small
+LONGEST = 20.0  # s of motion
+DT = 0.1  # s between commands
+UNCERTAINTY, REACTION = 0.15, 0.25
+"""How much faster or slower the vehicle may be than commanded, and for how long [s] it drives on before a stop takes
+effect: those of `bridge.manoeuvre`, so that it takes the scripts."""
+STEP = 0.05  # s of the floor that is needed
 SHARE = 0.5  # of the vehicle's limits that a script uses
 FASTEST = (0.5, 0.8)  # m/s and rad/s that no script exceeds by default
 CURES = {
@@ -36,29 +46,27 @@ class NextDrive:
     name: str
     why: str
     command: Command
-    start: tuple[float, float, float]
-    """Where it starts in the space: x, y [m] from a corner, heading [rad]."""
-    size: tuple[float, float]
-    """Length and width that its path takes, seen from the start [m]."""
+    floor: tuple[float, float]
+    """Free floor that it needs [m], along its first heading and across it, margins included."""
+    radius: float
+    """Of the vehicle around its drive-axle centre [m], as the floor was reckoned."""
 
 
 def next_drives(
-    log: Log, blind: Sequence[Blind], space: tuple[float, float] = (4.0, 4.0), v_max: float | None = None
+    log: Log, blind: Sequence[Blind], space: tuple[float, float] = (4.0, 4.0), v_max: float | None = None,
+    radius: float | None = None,
 ) -> list[NextDrive]:
     """Up to three drives that show what a log lacks, each within the space.
 
     Args:
         blind: its blind spots.
-        space: length and width of the free floor [m]; the axle's centre stays a track away from its edges.
+        space: length and width of the free floor [m].
         v_max: fastest speed [m/s]; by default half of the vehicle's limit, at most 0.5 m/s.
+        radius: of the vehicle around its drive-axle centre [m]; by default that of its nominal body.
     """
     v = v_max or min(SHARE * log.spec.v_max, FASTEST[0])
-    omega = min(SHARE * log.spec.omega_max, FASTEST[1])
-    limits = Limits(max(-v, min(log.spec.v_min, 0.0)), v, omega, space, min(log.spec.track, 0.45 * min(space)))
-    try:
-        known = {candidate.name: candidate for candidate in library(limits)}
-    except ValueError:  # nothing fits
-        return []
+    speeds = v, min(SHARE * log.spec.omega_max, FASTEST[1])
+    radius = radius or reach_of_body(log.spec)
     causes = {one.cause for one in blind}
     wanted = {name: cause for cause, name in reversed(CURES.items()) if cause in causes}
     order = [(name, wanted[name]) for name in dict.fromkeys(CURES.values()) if name in wanted]
@@ -67,28 +75,57 @@ def next_drives(
     order += [(name, "one more repeat") for name in OTHERS if name in driven]
     found: list[NextDrive] = []
     for name, why in order:
-        candidate = known.get(name) or known.get(f"{name}_50")
-        drive = None if candidate is None else _ramped(candidate, why, limits)
+        if name in REVERSING and log.spec.v_min >= 0:
+            continue
+        drive = _largest(name, why, speeds, space, radius)
         if drive is not None and len(found) < COUNT:
             found.append(drive)
     return found
 
 
-def _ramped(candidate: Candidate, why: str, limits: Limits) -> NextDrive | None:
-    """The manoeuvre with ramps, a second of standstill after it, and a place in the space; None where it has none."""
-    command = candidate.command
-    rest = np.arange(1, round(2.0 / limits.dt) + 1) * limits.dt
-    t = np.concatenate([command.t, command.t[-1] + rest])
-    v, omega = (_slew(np.append(one, 0.0 * rest), step * limits.dt)
+def reach_of_body(spec: VehicleSpec) -> float:
+    """Distance from the drive-axle centre that no part of the body is beyond, wherever the axle is [m]."""
+    return math.ceil(20 * math.hypot(spec.body_length, spec.body_width / 2)) / 20
+
+
+def needed_floor(command: Command, radius: float) -> tuple[float, float]:
+    """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m].
+
+    Speed and yaw rate may each be UNCERTAINTY too large or too small; each place is widened by the body's radius and by
+    what is driven until a stop takes effect.
+    """
+    t = np.arange(0.0, command.t[-1] + STEP, STEP)
+    held = np.maximum(np.searchsorted(command.t, t + 1e-9, side="right") - 1, 0)
+    low, high = np.full(2, -radius), np.full(2, radius)
+    for faster, sharper in product((-UNCERTAINTY, 0.0, UNCERTAINTY), repeat=2):
+        speed, rate = (1 + faster) * command.v[held], (1 + sharper) * command.omega[held]
+        heading = np.cumsum(rate) * STEP - rate * STEP / 2
+        place = np.cumsum(speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0) * STEP
+        margin = radius + np.abs(speed)[:, None] * REACTION
+        low, high = np.minimum(low, (place - margin).min(0)), np.maximum(high, (place + margin).max(0))
+    return float(high[0] - low[0]), float(high[1] - low[1])
+
+
+def _largest(
+    name: str, why: str, speeds: tuple[float, float], space: tuple[float, float], radius: float
+) -> NextDrive | None:
+    """The manoeuvre as fast, then as long, as the space allows; None where it does not fit."""
+    for size, fraction in product(SIZES, FRACTIONS):
+        v, omega = (size * one for one in speeds)
+        command = _ramped(make_command(name, v, omega, fraction * LONGEST, DT))
+        length, width = needed_floor(command, radius)
+        if command.t[-1] <= LONGEST + 10.0 and (
+                length <= space[0] and width <= space[1] or length <= space[1] and width <= space[0]):
+            return NextDrive(name, why, command, (length, width), radius)
+    return None
+
+
+def _ramped(command: Command) -> Command:
+    """The commands with ramps, and time to come to rest in."""
+    rest = np.arange(1, round(2.0 / DT) + 1) * DT
+    v, omega = (_slew(np.append(one, 0.0 * rest), step * DT)
                 for one, step in zip((command.v, command.omega), RAMPS, strict=True))
-    ramped = Command(t, v, omega)
-    ideal = ideal_replay(as_trial(Candidate(candidate.name, ramped))).ground_truth
-    assert ideal is not None
-    path = CLEARANCE * np.column_stack([ideal.x, ideal.y])
-    start = placement(path, limits)
-    if start is None:
-        return None
-    return NextDrive(candidate.name, why, ramped, start, (float(np.ptp(path[:, 0])), float(np.ptp(path[:, 1]))))
+    return Command(np.concatenate([command.t, command.t[-1] + rest]), v, omega)
 
 
 def _slew(values: np.ndarray, step: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 Known are the paper's topics, the maker's, and those of `bridge.ros`; others are named by the caller or found by their
 type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
-PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose.
+PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and the yaw rate of an Imu.
 """
 
 from __future__ import annotations
@@ -33,17 +33,21 @@ TOPICS = {
     "command": ("/whill/controller/cmd_vel", "/cmd_vel", "/whill/cmd_vel"),
     "odometry": ("/whill/odom", "/odom", "/whill/odometry", "/whill/states/model_cr2"),
     "ground_truth": ("/ground_truth/odom", "/ground_truth/pose"),
+    "imu": ("/whill/imu", "/imu/data", "/imu", "/imu/data_raw"),
 }
 """Names that are looked for, the first found is taken. Odometry topics are never guessed to be ground truth."""
 TYPES = {
     "command": ("Twist", "TwistStamped"),
     "odometry": ("Odometry", CHAIR_STATE),
     "ground_truth": ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"),
+    "imu": ("Imu",),
 }
-COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"), "ground_truth": ("x", "y", "yaw")}
+COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"), "ground_truth": ("x", "y", "yaw"),
+           "imu": ("gyro",)}
 WHEELS = ("JointState", CHAIR_STATE, "Odometry")
 """Types of the input where wheel speeds stand for commands, the first found is taken."""
-OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic"}
+OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic",
+           "imu": "--imu-topic"}
 SUFFIXES = (".db3", ".mcap", ".bag")
 PACKED = (".zst", ".zstd")
 UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
@@ -92,7 +96,7 @@ def read_bag(
 
     Args:
         path: folder of a rosbag2, or a .db3, .mcap or .bag file.
-        topics: "command", "odometry", "ground_truth" -> topic; those left out are looked for, "" leaves one out.
+        topics: "command", "odometry", "ground_truth", "imu" -> topic; those left out are looked for, "" leaves one out.
         geometry: nominal wheel radius and track [m], for angles and rates of wheels.
         wheels: take measured wheel speeds in place of the commands.
 
@@ -135,8 +139,9 @@ def read_bag(
                          "repairs one.") from None
     streams = {}
     for stream, topic in chosen.items():
+        if len(rows[stream]) < 2:
+            raise _too_few(path, topic, len(rows[stream]), stream)
         table = np.array([values for _, _, values in rows[stream]], float)
-        table = table.reshape(len(rows[stream]), -1)
         unset = np.isinf(table).any(axis=1)
         finite = np.isfinite(table).all(axis=1) | (short_type(known[topic]) == "JointState") & ~unset
         if unset.all() and len(unset):
@@ -150,9 +155,11 @@ def read_bag(
         if not (finite | unset).all():
             notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
         times, stamps = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
+        if len(times) < 2 and stream == "imu" and stream not in (topics or {}):
+            notes.append(f"{topic}: {len(times)} usable messages; it is left out")
+            continue
         if len(times) < 2:
-            raise ValueError(f"{path}: topic {topic} has {len(times)} usable messages; at least 2 are needed. Name "
-                             f"another topic with {OPTIONS[stream]}, or '' to go without.")
+            raise _too_few(path, topic, len(times), stream)
         values = table[finite]
         if values.shape[1] != len(COLUMNS[stream]):
             kind = short_type(known[topic])
@@ -162,6 +169,11 @@ def read_bag(
                              "Ask the driver for 20 ms (publish_interval_ms)")
         streams[stream] = BagStream(topic, known[topic], times, stamps, values)
     return Bag(path, streams, notes)
+
+
+def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
+    return ValueError(f"{path}: topic {topic} has {count} usable messages; at least 2 are needed. Name another topic "
+                      f"with {OPTIONS[stream]}, or '' to go without.")
 
 
 def _of_wheels(
@@ -264,6 +276,8 @@ def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
 def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
     if kind == CHAIR_STATE:
         return chair_row(message)
+    if kind == "Imu":
+        return (float(message.angular_velocity.z),)
     if kind == "JointState":
         return joint_row(message)
     if kind == "Odometry" and stream == "command":

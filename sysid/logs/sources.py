@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from sysid.logs.lerobot import is_lerobot
 from sysid.logs.rosbag import SUFFIXES, find_bags, is_bag
 
 HEAD = 4000  # bytes of a text that are looked at
@@ -23,8 +24,9 @@ def about(path: Path) -> str:
 def refuse_recording(path: str | Path, needed: str) -> None:
     """Raise ValueError where a path is a recording or a dataset, with what is needed instead."""
     path = Path(path)
-    if path.exists() and (is_bag(path) or find_bags(path) or path.suffix in (".csv", ".txt", ".tum", *PACKED)
-                          or (path / "trials").is_dir() or (path / "command.csv").exists()):
+    if path.exists() and (is_bag(path) or find_bags(path) or is_lerobot(path)
+                          or path.suffix in (".csv", ".txt", ".tum", *PACKED) or (path / "trials").is_dir()
+                          or (path / "command.csv").exists()):
         raise ValueError(f"{path}: {about(path).removesuffix('.')}. Needed here: {needed}")
 
 
@@ -32,6 +34,8 @@ def _about_folder(path: Path) -> str:
     convert = f"Convert it first: python -m sysid.convert {path} --out DATASET"
     if is_bag(path):
         return f"a ROS bag. {convert}"
+    if is_lerobot(path):
+        return f"a LeRobotDataset. {convert}"
     if (path / "dataset.toml").exists() or (path / "trials").is_dir():
         return f"a dataset. Look at it with python -m sysid.inspect {path}, fit it with python -m sysid.fit {path}"
     if any((path / name).exists() for name in TRIAL_FILES):

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision, shown_units
+from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LEAST = 10  # rows of a stream
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+LONGEST_NAME = 200  # characters
+DAY = 86400.0  # s
+PREAMBLE = 30  # lines above the names
+BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
 NAMED = 12  # columns that an error lists
 
 
@@ -45,8 +52,8 @@ def text_files(source: Path) -> list[list[Path]]:
 
 def read_drives(
     source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
-) -> list[TextDrive]:
-    """The drives of a CSV file, a TUM file or a folder of them.
+) -> tuple[list[TextDrive], list[str]]:
+    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out.
 
     Args:
         said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
@@ -57,20 +64,46 @@ def read_drives(
         ValueError: in one line, what is not clear, what was guessed and what to give.
     """
     groups: list[tuple[str, list[Table]]] = []
+    refused: list[ValueError] = []
     for files in text_files(source):
-        tables = [read_table(path) for path in files]
+        tables = []
+        for path in files:
+            try:
+                tables.append(read_table(path))
+            except ValueError as error:
+                refused.append(error)
+        if not tables:
+            continue
         if source.is_file() or len(tables) > 1 and _each_whole(tables):
             groups += [(table.stem, [table]) for table in tables]
         else:
             groups.append((files[0].absolute().parent.name, tables))
+    if not groups and refused:
+        raise refused[0]
+    drives, notes = join_drives(source, groups, said, geometry, wheels)
+    return drives, [*(f"left out: {error}" for error in refused), *notes]
+
+
+def join_drives(
+    source: Path, groups: Sequence[tuple[str, list[Table]]], said: Sequence[str], geometry: tuple[float, float],
+    wheels: bool = False,
+) -> tuple[list[TextDrive], list[str]]:
+    """Drives of tables, by the name of each drive; otherwise as `read_drives`. One that is not clear does not keep out
+    the others."""
     units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
     drives: list[TextDrive] = []
+    refused: list[ValueError] = []
     agreed: list[str] = list(said)
     for name, tables in groups:
-        columns, agreed = _decide(source, tables, agreed, units)
-        columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
-        drives.append(_join(name, source, tables, columns, geometry))
-    return drives
+        try:
+            columns, agreed = _decide(source, tables, agreed, units)
+            columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
+            drives.append(_join(name, source, tables, columns, geometry))
+        except ValueError as error:
+            refused.append(error)
+    if not drives and refused:
+        raise refused[0]
+    return drives, [f"left out: {error}" for error in refused]
 
 
 def read_table(path: Path) -> Table:
@@ -82,7 +115,8 @@ def read_table(path: Path) -> Table:
     comments = [line.lstrip("#% \t") for _, line in lines if line.lstrip().startswith(("#", "%"))]
     if not data:
         raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
-    split = _splitter(data[0][1])
+    split = _splitter(data[len(data) // 2][1])
+    data = _without_preamble(data, split)
     if path.read_bytes()[:1] == b"%" and comments and len(_cells(comments[0], split)) == len(_cells(data[0][1], split)):
         header = _cells(comments[0], split)  # of `rostopic echo -p`
     elif not _is_numbers([cell.replace(",", ".") for cell in _cells(data[0][1], split)]):
@@ -99,12 +133,16 @@ def read_table(path: Path) -> Table:
         if len(row) != width:
             raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save it again.")
     if len(rows) < LEAST:
-        raise ValueError(f"{path}: {len(rows)} rows; at least {LEAST} are needed. Give the whole recording.")
+        raise ValueError(f"{path}: {counted(len(rows), 'row')}; at least {LEAST} are needed. Give the whole recording.")
     numbers = {}
     if header is None:
         header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
+    odd = next((name for name in header if not name.isprintable() or len(name) > LONGEST_NAME), None)
+    if odd is not None:
+        raise ValueError(f"{path}: column {shown(odd)}: a name has at most {LONGEST_NAME} printable characters. "
+                         "Correct it.")
     for k, name in enumerate(header):
-        values = np.array([_number(row[k]) for row in rows])
+        values = _numbers([row[k] for row in rows])
         if np.isfinite(values).sum() > 2 and name.strip() and name.strip() not in numbers:
             numbers[name.strip()] = values
     return Table(path.stem, _with_whole_stamps(numbers))
@@ -122,6 +160,35 @@ def _splitter(line: str) -> str | None:
 
 def _cells(line: str, split: str | None) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in (line.split(split) if split else line.split())]
+
+
+def _without_preamble(data: list[tuple[int, str]], split: str | None) -> list[tuple[int, str]]:
+    """Lines from the first that has as many cells as most: above it a logger may say who it is."""
+    counts = [len(_cells(line, split)) for _, line in data]
+    usual = Counter(counts).most_common(1)[0][0]
+    first = counts.index(usual)
+    return data[first:] if first <= PREAMBLE else data
+
+
+def _numbers(cells: Sequence[str]) -> np.ndarray:
+    """Numbers of cells (T,), nan where a cell is none; of dates and times of day, seconds."""
+    values = np.array([_number(cell) for cell in cells])
+    if np.isfinite(values).any() or not any(":" in cell for cell in cells):
+        return values
+    values = np.array([_seconds(cell) for cell in cells])
+    days = np.cumsum(np.diff(values, prepend=values[:1]) < -DAY / 2)  # past midnight
+    return values + DAY * days
+
+
+def _seconds(cell: str) -> float:
+    """Seconds since 1970 of a date with a time of day, or since midnight; nan of anything else."""
+    if match := re.fullmatch(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)", cell):
+        return 3600 * float(match[1]) + 60 * float(match[2]) + float(match[3].replace(",", "."))
+    try:
+        found = datetime.fromisoformat(cell.replace(",", "."))
+    except ValueError:
+        return float("nan")
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
 
 
 def _number(cell: str) -> float:
@@ -281,12 +348,13 @@ def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> 
         size = (wheel if one.role.endswith(("left", "right")) else UNITS[kind_of(one.role)])[one.unit]
         found[one.role.partition(".")[2]] = table.columns[one.name] * size
     whole = np.isfinite(list(found.values())).all(axis=0)
+    _check_clock(file, found["t"][whole])
     order = np.argsort(found["t"][whole], kind="stable")
     found = {key: values[whole][order] for key, values in found.items()}
     later = np.append(True, np.diff(found["t"]) > 1e-6) if len(found["t"]) else np.zeros(0, bool)
     found = {key: values[later] for key, values in found.items()}
     if len(found["t"]) < 2:
-        raise ValueError(f"{file}: {stream} has {len(found['t'])} rows without an empty cell; at least 2 are needed.")
+        raise ValueError(f"{file}: {stream} needs at least 2 rows without an empty cell, and has {len(found['t'])}.")
     if {"qx", "qy", "qz", "qw"} <= set(found):
         from sysid.logs.rosbag import yaw_of
 
@@ -295,6 +363,18 @@ def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> 
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found
+
+
+def _check_clock(file: str, t: np.ndarray) -> None:
+    """Refuse a stream whose time (T,) goes back by more than rows out of order do; sorted, it would mix two moments."""
+    steps = np.diff(t)
+    if not len(steps) or (steps <= 0).mean() > 0.5:
+        return  # the newest row comes first
+    least = max(BACK[0] * float(np.median(np.abs(steps))), BACK[1])
+    if len(back := np.flatnonzero(steps < -least)):
+        k = int(back[0])
+        raise ValueError(f"{file}: its time goes back by {-steps[k]:.2f} s after row {k + 1} ({t[k] - t[0]:.1f} s into "
+                         "it): the clock was set back, or the recording began again. Cut the file there.")
 
 
 def _with_rates(wheels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sysid.logs.command_timeout import command_timeout
 from sysid.logs.log import OdometryStream, Trial
-from sysid.logs.streams import speeds
 
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at
 MOVED = 0.5  # share of the way that a speed gives over a gap, below which the gap was none
 LEAST = 0.1  # m or rad of that way
-QUIET = 2.5  # usual intervals between commands, beyond which they pause
-ASKED = (0.05, 0.1)  # m/s and rad/s of a command in force that shows whether the vehicle follows it
-RESPONSE = (0.1, 0.6)  # share of a speed that counts as stopped, and as driving
-SETTLED = 0.2  # s for which the vehicle must have stopped
 
 
 def time_faults(trials: Sequence[Trial]) -> list[str]:
@@ -29,14 +25,13 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
             found.append(f"{name}: its rows come in bursts, {max(bursts):.2g} s apart, while most follow one "
                          "another at once: t is a time of receipt. Use the times of measurement; sysid.convert takes "
                          "them with --stamp header.")
-    stops = [(trial.name, *stop) for trial in trials for stop in timeout_stops(trial)]
-    if stops:
-        name, at, pause, _ = stops[0]
-        timeout = float(np.median([stop[3] for stop in stops]))
-        found.append(f"command: in {len({stop[0] for stop in stops})} of {len(trials)} trials ({name}, at {at:.1f} s) "
-                     f"no command comes for {pause:.2g} s, and the vehicle stops {timeout:.2g} s after the last one: "
-                     "its base has a time-out. A replay would drive on: write "
-                     f"command_timeout = {max(timeout, 0.01):.2f} into dataset.toml.")
+    timeout = command_timeout(trials)
+    if timeout is not None:
+        found.append(f"command: in {timeout.trials} of {len(trials)} trials ({timeout.first}, at {timeout.at:.1f} s) "
+                     f"no command comes for {timeout.pause:.2g} s, and the vehicle stops {timeout.value:.2f} s "
+                     f"({timeout.low:.2f} to {timeout.high:.2f}) after the last one: its base has a time-out. Fits "
+                     f"take it from the log; to state it, write command_timeout = {max(timeout.value, 0.01):.2f} into "
+                     "dataset.toml.")
     jumps = [(trial.name, *jump) for trial in trials if (jump := forward_jump(trial)) is not None]
     if jumps:
         name, at, seconds = jumps[0]
@@ -76,44 +71,6 @@ def forward_jump(trial: Trial) -> tuple[float, float] | None:
         if other is None or not (np.abs(other.t - middle) < gaps[k] / 4).any():  # the outside pose has the gap as well
             return float(stream.t[k]), float(gaps[k])
     return None
-
-
-def timeout_stops(trial: Trial) -> list[tuple[float, float, float]]:
-    """Pauses of the commands in which the vehicle stops though the last one was to move: when the pause begins, how
-    long it is, and how long after the last command the base stops [s].
-
-    How late the vehicle responds is taken out, by how late it starts after the next command.
-    """
-    command = trial.command
-    rates = next((one for name in ("odometry", "ground_truth") if (one := speeds(trial, name)) is not None), None)
-    if rates is None or len(command.t) < 10:
-        return []
-    gaps = np.diff(command.t)
-    usual = float(np.median(gaps))
-    t, found = rates[0], []
-    for k in np.flatnonzero(gaps > max(QUIET * usual, SETTLED)):
-        begin, end = float(command.t[k]), float(command.t[k + 1])
-        channel, asked = max(((rate, value / least) for rate, value, least in zip(
-            rates[1:], (command.v[k], command.omega[k]), ASKED, strict=True)), key=lambda one: abs(one[1]))
-        if abs(asked) < 1.0:
-            continue
-        before, inside = (t >= begin) & (t <= begin + SETTLED), (t > begin) & (t < end)
-        if not before.any() or inside.sum() < 5:
-            continue
-        usual_speed = float(np.median(channel[before]))
-        share = channel[inside] / usual_speed if abs(usual_speed) > 0.02 else np.ones(int(inside.sum()))
-        stopped = np.abs(share) < RESPONSE[0]
-        if stopped.sum() * float(np.median(np.diff(t))) < SETTLED or share[:3].min() < RESPONSE[1]:
-            continue
-        first = np.flatnonzero(stopped)[0]
-        if (np.abs(share[first:]) > RESPONSE[1])[t[inside][first:] < end - SETTLED].any():
-            continue  # it stopped and drove on without a command: something else held it
-        falls = float(t[inside][np.flatnonzero(share < 0.5)[0]]) - begin
-        after = (t >= end) & (t < end + 2.0)
-        back = np.flatnonzero(np.abs(channel[after]) > 0.5 * abs(usual_speed))
-        rises = float(t[after][back[0]]) - end if len(back) else 0.0
-        found.append((begin, end - begin, max(falls - rises, 0.0)))
-    return found
 
 
 def _in_bursts(t: np.ndarray) -> bool:

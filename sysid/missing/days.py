@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sysid.errors.features import CHANNELS
 from sysid.errors.noise import BIN_SHIFT, Whitener, replicate_groups, scatter
 from sysid.errors.space import Space
 from sysid.logs.log import START_NOISE, Trial
@@ -64,6 +65,18 @@ class Reference:
     """(C,) noise of the drives in question over that of the reference days."""
     simulated: bool = False
     """Whether `leftovers` are drawn from what a vehicle file says of its fit: there are no reference days."""
+    blocks: bool = False
+    """Whether the days are blocks of one run."""
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of motion."""
+        return int(self.leftovers[0].series.shape[1])
+
+    @property
+    def gyro(self) -> bool:
+        """Whether a gyro is one of them."""
+        return self.channels > len(CHANNELS)
 
     @property
     def shared(self) -> float:
@@ -87,7 +100,7 @@ class Reference:
     def expected(self, trial: Trial, bins: int) -> np.ndarray:
         """(K, C) mean leftover of reference drives with commands of the same course; 0 where there is none."""
         same = [one for one in self.leftovers if alike(one.trial, trial)]
-        return mean_by_day(same, bins) if self.known else np.zeros((bins, self.leftovers[0].series.shape[1]))
+        return mean_by_day(same, bins, self.channels) if self.known else np.zeros((bins, self.channels))
 
     def expected_on_others(self, one: Leftover) -> np.ndarray:
         """(K, C) mean leftover of the other days' drives of the same course, for a reference drive itself."""
@@ -114,9 +127,8 @@ def alike(a: Trial, b: Trial) -> bool:
     return a.manoeuvre == b.manoeuvre and same_start and near(course_of(a), course_of(b), BIN_SHIFT)
 
 
-def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
+def mean_by_day(leftovers: Sequence[Leftover], bins: int, channels: int = len(CHANNELS)) -> np.ndarray:
     """(K, C) mean over days of the mean over a day's drives, shrunk towards 0 where few days were seen."""
-    channels = leftovers[0].series.shape[1] if leftovers else 5
     days: dict[int, list[np.ndarray]] = {}
     for one in leftovers:
         days.setdefault(one.day, []).append(_fit_length(one.series * (one.mask > 0), bins))
@@ -130,7 +142,7 @@ def mean_by_day(leftovers: Sequence[Leftover], bins: int) -> np.ndarray:
 def expected_without(leftovers: Sequence[Leftover], one: Leftover) -> np.ndarray:
     """(K, C) mean leftover of the other days' drives of the same course."""
     others = [other for other in leftovers if other.day != one.day and alike(other.trial, one.trial)]
-    return mean_by_day(others, len(one.series))
+    return mean_by_day(others, *one.series.shape)
 
 
 def difference_sizes(spread: np.ndarray) -> np.ndarray:

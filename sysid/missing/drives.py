@@ -16,7 +16,7 @@ from sysid.logs.log import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.quotients import Quotients
-from sysid.replay.records import ODOMETRY, POSE, Batch, Measured, Plant, Simulated
+from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import get_values, set_values
@@ -137,7 +137,8 @@ class Drives:
         one = self.batch
         pose = at(one.pose_index, one.pose_weight, POSE)
         odometry = at(one.odometry_index, one.odometry_weight, ODOMETRY)
-        return Simulated(pose, odometry, paths[of_trial, -1, 8])  # type: ignore[arg-type]
+        gyro = None if one.gyro_index is None else at(one.gyro_index, one.gyro_weight, TURN)
+        return Simulated(pose, odometry, paths[of_trial, -1, 8], gyro)  # type: ignore[arg-type]
 
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
@@ -152,8 +153,10 @@ class Drives:
 
     def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
         """Other trials through the same compiled replay."""
+        gyro = self.features.gyro is not None
+        trials = trials if gyro else without_gyro(trials)
         batch, measured = make_batch(trials, dt, RECORD_DT)
-        features = make_features(trials, self.features.width)
+        features = make_features(trials, self.features.width, gyro)
         courses = _courses(batch, self.courses.room, self.courses.shared)
         return Drives(trials, self.names, self.paths, batch, courses, measured, features,
                       features.of(measured))
@@ -167,12 +170,15 @@ def began_at(trial: Trial) -> float:
 
 
 def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],
-                width: float | None = None, paths: PathReplay | None = None) -> Drives:
+                width: float | None = None, paths: PathReplay | None = None, gyro: bool | None = None) -> Drives:
     """Drives of trials, replayed with the named parameters of `params` free.
 
     `width`: of the bins [s]; by default what the outside poses allow (`bin_width`).
     `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
+    `gyro`: whether a gyro is a channel; by default where a trial has one.
     """
+    if gyro is False:
+        trials = without_gyro(trials)
     batch, measured = make_batch(trials, plant.dt, RECORD_DT)
     names = tuple(names)
 
@@ -187,10 +193,15 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
     if DRAIN in names and SESSION in names:
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
-    features = make_features(trials, bin_width(trials) if width is None else width)
+    features = make_features(trials, bin_width(trials) if width is None else width, gyro)
     paths = paths or PathReplay(plant, vehicle, rows_of_call(10 * len(courses.first)))
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
+
+
+def without_gyro(trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
+    """The trials as if they had no gyro."""
+    return tuple(trial if trial.gyro is None else replace(trial, gyro=None) for trial in trials)
 
 
 def rows_of_call(most: int = CHUNK) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors.features import CHANNELS, bin_width, make_features
+from sysid.errors.features import CHANNELS, GYRO, bin_width, channel_names, make_features
 from sysid.errors.noise import (
     ROUGH,
     Whitener,
@@ -130,7 +130,7 @@ def leftovers_in_bins(
     for number, group in enumerate(replicate_groups(trials)):
         courses[group] = number
     apart = scatter(white, courses)
-    measured = tuple(name for c, name in enumerate(CHANNELS) if (mask[..., c] > 0).any())
+    measured = tuple(name for c, name in enumerate(channel_names(mask.shape[-1])) if (mask[..., c] > 0).any())
     return Leftovers(len(trials), width, measured, whitener, factors,
                      float(np.clip(-apart, 0.0, 1.0)) if np.isfinite(apart) else 0.0)
 
@@ -156,12 +156,15 @@ def _table(motions: Sequence[Any]) -> Measured:
     """Poses and odometry of trials or predictions in padded tables."""
     pose, odometry = (padded([getattr(one, name) for one in motions], width)[1:]
                       for name, width in (("ground_truth", 3), ("odometry", 5)))
-    return Measured(*pose, *odometry)
+    if all(one.gyro is None for one in motions):
+        return Measured(*pose, *odometry)
+    return Measured(*pose, *odometry, *padded([one.gyro for one in motions], 1)[1:])
 
 
 def _from_table(path: Path, table: Mapping[str, Any]) -> FitStatistics:
     """The checked section of a file; ValueError names the field whose length is wrong."""
-    channels, names = len(CHANNELS), tuple(table["parameters"])
+    known = channel_names(len(CHANNELS) + (GYRO in table["channels"]))
+    channels, names = len(known), tuple(table["parameters"])
     shapes = {"scale": (channels,), "memory": (-1, channels, channels), "inverse": (channels, channels),
               "factors": (len(ROUGH) + 1, channels), "standard_error": (len(names),),
               "correlation": (len(names), len(names))}
@@ -173,10 +176,10 @@ def _from_table(path: Path, table: Mapping[str, Any]) -> FitStatistics:
             raise ValueError(f"{path}: statistics.{name} has {values.size} numbers; {step} are needed for {channels} "
                              f"channels and {len(names)} parameters. Fit the vehicle again.")
         arrays[name] = values.reshape(shape)
-    unknown = [name for name in table["channels"] if name not in CHANNELS]
+    unknown = [name for name in table["channels"] if name not in known]
     if unknown:
-        raise ValueError(f"{path}: statistics.channels has {shown(unknown[0])} (known: {', '.join(CHANNELS)}). Fit the "
-                         "vehicle again.")
+        raise ValueError(f"{path}: statistics.channels has {shown(unknown[0])} (known: "
+                         f"{', '.join((*CHANNELS, GYRO))}). Fit the vehicle again.")
     if abs(np.linalg.det(arrays["inverse"])) < 1e-12:
         raise ValueError(f"{path}: statistics.inverse is a singular matrix. Fit the vehicle again.")
     whitener = Whitener(arrays["scale"], arrays["memory"], arrays["inverse"])

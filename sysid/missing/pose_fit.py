@@ -82,7 +82,7 @@ def fit_poses(
         others: (S, P) further starts, in unit coordinates.
     """
     start = space.to_unit(space.initial)
-    noise, measured = estimate_noise(tuple(trials)), by_own_noise(trials, drives.measured)
+    noise, measured = estimate_noise(drives.trials), by_own_noise(trials, drives.measured)
 
     def objective(at: np.ndarray) -> Objective:
         replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
@@ -90,6 +90,8 @@ def fit_poses(
 
     if noise.source == "defaults":
         noise = objective(start).residual_noise(start)
+    elif noise.gyro is not None:
+        noise = replace(noise, gyro=objective(start).residual_noise(start).gyro)
     starts = [start] if others is None else [start, *others]
     fits = [least_squares.fit(objective(one), space, starts=one[None], iterations=iterations) for one in starts]
     best = min(fits, key=lambda fit: fit.cost)

@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.errors.features import CHANNELS, bin_width
+from sysid.errors.features import GYRO, bin_width, channel_names
 from sysid.errors.noise import (
     first_scales,
     fit_roughness,
@@ -18,6 +18,7 @@ from sysid.errors.noise import (
     replicate_groups,
     roughness,
 )
+from sysid.errors.prior import expected_sd
 from sysid.errors.space import Space, make_space
 from sysid.logs.log import Log, Trial
 from sysid.missing.base_fit import BaseFit
@@ -34,6 +35,8 @@ ASSUMED_DAYS = 4.0
 """How many days of reference drives that assumption counts as."""
 LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
 WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
+BLOCK = "block"
+"""Field of a log that is one part of a long run."""
 LEAST_DRAWN = 24
 """Drives that are simulated, at least, to show the noise that a vehicle file states."""
 
@@ -85,6 +88,7 @@ def make_reference(
         factors = fit_roughness(left, drives.features.mask, roughness(at, drives.features.width, spec.track))
         drives = drives.weighted(at, factors, spec.track)
         whitener = fit_whitener(left, drives.mask)
+    blocks = all(BLOCK in log.fields for log in logs)
     spread, remark = _spread(space, u, days, known)
     leftovers = tuple(Leftover(trial, int(day[i]), left[i], drives.mask[i]) for i, trial in enumerate(trials))
     if known:
@@ -92,7 +96,7 @@ def make_reference(
                                 drives.mask)
     params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
     return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
-                     known, remark)
+                     known, remark, blocks=blocks)
 
 
 def of_vehicle(
@@ -116,9 +120,13 @@ def of_vehicle(
         spread = assumed + _within(errors, WEAK_PRIOR)
         remark += ", beside the standard errors of its fit; how far effects seem to wander is assumed"
     width = bin_width(log.training) if known is None else known.leftovers.width
-    drives = make_drives(plant, params, space.names, log.training, width)
+    gyro = None if known is None else GYRO in known.leftovers.measured
+    if gyro is False and any(trial.gyro is not None for trial in log.training):
+        remark += "; its fit had no gyro, so that of these drives is left out"
+    drives = make_drives(plant, params, space.names, log.training, width, gyro=gyro)
     at = drives.simulate(space.to_values(u)[None])[0]
-    measured = {name for c, name in enumerate(CHANNELS) if (drives.features.mask[..., c] > 0).any()}
+    names_of = channel_names(drives.target.shape[-1])
+    measured = {name for c, name in enumerate(names_of) if (drives.features.mask[..., c] > 0).any()}
     if known is not None and measured <= set(known.leftovers.measured):
         left = known.leftovers
     else:
@@ -177,13 +185,19 @@ def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:
     """(P,) standard deviations in unit coordinates where drives do not show them."""
     value = np.abs(space.to_values(u))
     scale = np.where(value > 0, value, space.high - space.low)
-    return np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)
+    spread = np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)
+    return np.where(_of_gyro(space), np.minimum(spread, expected_sd(space)), spread)
+
+
+def _of_gyro(space: Space) -> np.ndarray:
+    """(P,) bool: errors of a gyro, which its maker states."""
+    return np.array([name.startswith("gyro_bias.") for name in space.names], bool)
 
 
 def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool) -> tuple[np.ndarray, str]:
     """Covariance of a new day's parameters and what it rests on."""
     if not known:
-        return WEAK_PRIOR**2 * np.eye(space.size), (
+        return np.diag(np.where(_of_gyro(space), expected_sd(space), WEAK_PRIOR) ** 2), (
             "no reference drives: base parameters are free, so effects that they imitate (mass, track, scrub, "
             "friction, drag, traction) cannot be seen")
     assumed = np.diag(assumed_spread(space, u) ** 2)

@@ -27,10 +27,10 @@ WHEELS = ("left wheel's angle", "right wheel's angle")
 REST = 0.02  # m/s and rad/s below which a vehicle rests
 
 
-def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float) -> dict[str, float]:
+def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float,
+                    channels: int = len(CHANNELS)) -> dict[str, float]:
     """By how much smooth functions of each quantity, fitted to two thirds of the trials, lower the sum of squares of
-    the white residual (B, n) of the others, in bins of a width [s]."""
-    channels = len(CHANNELS)
+    the white residual (B, n) of the others, in bins of a width [s] with so many channels."""
     bins = residual.shape[1] // channels
     residual = residual.reshape(len(trials), bins, channels)
     found = [quantities(trial, bins, width, spec) for trial in trials]
@@ -53,9 +53,10 @@ def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, wi
     return out
 
 
-def best_gain(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float) -> float:
+def best_gain(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float,
+              channels: int = len(CHANNELS)) -> float:
     """What the best of the quantities gains; 0 where none does."""
-    return max(0.0, *held_back_gains(trials, spec, residual, width).values())
+    return max(0.0, *held_back_gains(trials, spec, residual, width, channels).values())
 
 
 def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np.ndarray]:

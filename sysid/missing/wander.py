@@ -51,7 +51,7 @@ def estimate(
     measured = (drives.mask > 0).reshape(len(day), -1)
     excess = [np.square(left[day == number]).sum() / measured[day == number].sum() - 1 for number in range(count)]
     usual = [best_gain([one.trial for one in reference.leftovers if one.day == number], spec, left[day == number],
-                       reference.width)
+                       reference.width, reference.channels)
              / float((day == number).sum()) for number in range(count)]
     repeats = drives.repeats
     apart = [scatter(left[day == number], repeats[day == number]) for number in range(count)]

@@ -12,8 +12,8 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
-from sysid.pages.svg import PALETTE, Line, line_chart
 from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
+from whill_mjx.io.svg import PALETTE, Line, line_chart
 from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed
@@ -38,6 +38,14 @@ def text(
     if blind:
         lines.append("no candidate determines: " + ", ".join(blind))
     return "\n".join(lines)
+
+
+def meaning(chosen: Sequence[Plan], space: Space, before: np.ndarray) -> str:
+    """One sentence: what to drive, and what becomes of the parameter that is known worst."""
+    index = int(np.argmax(before))
+    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in chosen)
+    return (f"Drive {drives} next: the uncertainty of {space.names[index]}, the largest, shrinks from "
+            f"{before[index]:.1%} to {chosen[-1].deviation[index]:.1%} of its range.")
 
 
 def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
@@ -76,7 +84,8 @@ def write_page(
                 + table(["manoeuvre", "seconds", "sum of variances", "volume (log)"], ranking))]
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
-                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}")
+                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}", kind="Next drive",
+                     lead=meaning(chosen, space, before))
     write_text(path, page)
     return path
 

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
+from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
-from sysid.pages.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from whill_mjx.io.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
 
 REPLAYS = ("ideal", "initial", "fitted")
+REPLAY_WORDS = {"ideal": "a vehicle that follows its commands at once", "initial": "the model before the fit",
+                "fitted": "the fitted vehicle"}
 CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
 COLUMNS = {"ground_truth": ("along [m]", "left [m]", "yaw [rad]"),
            "odometry": ("along [m]", "left [m]", "yaw [rad]", "v [m/s]", "omega [rad/s]")}
@@ -31,7 +34,7 @@ def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[
         series: motion of the trials; without any, the charts are left out.
     """
     drawn = choose(series)
-    sections = [Section("Summary", summary(report)), Section("Parameters", parameters(report))]
+    sections = [Section("Summary", summary(report, series)), Section("Parameters", parameters(report))]
     if report.get("profiles"):
         sections.append(Section("Profile likelihoods", profiles(report)))
     if drawn:
@@ -54,27 +57,71 @@ def _repetition(name: str) -> int:
     return int(tail) if tail.isdigit() else 0
 
 
-def summary(report: dict[str, Any]) -> str:
-    """The headline and the mean errors, held-out trials first and apart."""
+def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
+    """Three sentences and three pictures, then the mean errors, held-out trials first and apart."""
     held, train = report["summary"]["held_out"], report["summary"]["training"]
     dataset = report["dataset"]
     notes = dataset.get("notes") or []
-    limits = [note for note in notes if note.startswith(("not fitted", "the log has no commands"))]
-    parts = [paragraph(headline(report), "lead"), *(paragraph(f"{note[0].upper()}{note[1:]}.") for note in limits),
-             paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} trials "
-                       f"fitted, {len(dataset['held_out'])} held out. Model: {report['model']['preset']} with "
-                       f"{', '.join(report['model']['effects'])}.")]
+    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:]}.")
+                                                          for note in notes if _is_limit(note))]
+    shown = shown_drive(series_paths(series, list(REPLAY_WORDS)))
+    if shown is not None:
+        parts += [drive_pictures(shown, REPLAY_WORDS), drive_table(shown, REPLAY_WORDS)]
+    parts.append(paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} "
+                           f"trials fitted, {len(dataset['held_out'])} held out. Model: {report['model']['preset']} "
+                           f"with {', '.join(report['model']['effects'])}."))
     for title, part in (("Held-out trials: predicted, never fitted", held), ("Training trials", train)):
         if part:
             parts += [heading(title), _summary_table(part)]
-    if not held:
-        parts.append(paragraph("Nothing was held out: how well this vehicle predicts is not known."))
     parts.append(paragraph('"Ideal" follows its commands at once and without slip; "initial" is the model before the '
                            "fit. The floor is the spread between replicates, which no model of the mean motion can "
                            "beat. Root mean squares, averaged over trials.", "dim"))
-    others = [note for note in notes if note not in limits]
+    others = [note for note in notes if not _is_limit(note)]
     parts += [bullets(others)] if others else []
     return "".join(parts)
+
+
+def lead(report: dict[str, Any]) -> list[str]:
+    """Three sentences: how good the fit is, what it changed, and what it does not know."""
+    known = [one for one in report["parameters"] if one["identifiable"]]
+    unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
+    moved = sorted(known, key=_change, reverse=True)[:2]
+    changed = "; ".join(f"{_spoken(one['name'])} from {number(one['initial'])} to {number(one['value'])}"
+                        + ("" if one["unit"] == "-" else f" {one['unit']}") for one in moved)
+    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; most surely changed: "
+              f"{changed}." if known else "This log determines none of the parameters.")
+    if not report["summary"]["held_out"]:
+        third = "Nothing was held out, so how well the vehicle predicts other drives is not known."
+    elif unknown:
+        listed = ", ".join(map(_spoken, unknown[:3])) + (f" and {len(unknown) - 3} more" if len(unknown) > 3 else "")
+        third = f"It does not determine {listed}: do not rely on their values."
+    else:
+        third = "Nothing that was fitted is left open."
+    return [headline(report), second, third]
+
+
+def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[Paths]:
+    """Paths of trials of a fit whose position was measured."""
+    found = []
+    for trial in series:
+        channel = next((name for name in CHANNEL_NAMES if name in trial.channels and np.isfinite(
+            trial.channels[name].values["measured"][:, :3]).all()), None)
+        if channel is not None:
+            one = trial.channels[channel]
+            found.append(Paths(trial.name, trial.held_out, channel, one.t, one.values["measured"][:, :3],
+                               {name: one.values[name][:, :3] for name in replays}))
+    return found
+
+
+def _is_limit(note: str) -> bool:
+    """Whether a note says what the log does not determine."""
+    return note.startswith(("not fitted", "the log has no commands"))
+
+
+def _spoken(name: str) -> str:
+    """A dotted parameter as one says it."""
+    effect, _, parameter = name.rpartition(".")
+    return f"{effect} {parameter}".replace("_", " ").strip()
 
 
 def headline(report: dict[str, Any]) -> str:
@@ -85,11 +132,18 @@ def headline(report: dict[str, Any]) -> str:
     one = channels.get(channel, {}).get("trajectory")
     if not one:
         return "No position was measured; see the table."
-    text = (f"Position error on {'held-out' if part == 'held_out' else 'training'} trials "
-            f"({CHANNEL_NAMES[channel]}): {number(one['initial'])} m before the fit, {number(one['fitted'])} m after")
+    which = "On drives that were never fitted" if part == "held_out" else "On the drives that were fitted"
+    where = "" if channel == "ground_truth" else " of the odometry"
+    text = (f"{which}, the predicted position{where} is off by {_cm(one['fitted'])}, by {_cm(one['initial'])} before "
+            f"the fit, and by {_cm(one['ideal'])} for a vehicle that follows its commands at once")
     if one.get("noise_floor") and one["fitted"] is not None:
-        text += f"; {number(one['fitted'] / one['noise_floor'])} times the spread between replicates"
-    return text + f" (ideal vehicle: {number(one['ideal'])} m)."
+        text += (f"; two repeats of one drive differ by {_cm(one['noise_floor'])} (ratio "
+                 f"{number(one['fitted'] / one['noise_floor'])})")
+    return text + "."
+
+
+def _cm(metres: float | None) -> str:
+    return "an unknown length" if metres is None else f"{100 * metres:.1f} cm"
 
 
 def in_words(report: dict[str, Any], shown: int = 6) -> list[str]:

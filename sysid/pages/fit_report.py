@@ -45,7 +45,9 @@ def make_report(
                               *calibration_notes(fit.uncertainty.estimates, log.spec, log.training),
                               *(fit.model.notes if fit.model is not None else ())],
                     "training": [trial.name for trial in log.training],
-                    "held_out": [trial.name for trial in log.held_out], **(source or {})},
+                    "held_out": [trial.name for trial in log.held_out],
+                    **({"command_timeout": dict(zip(("value", "low", "high"), found, strict=True))} if (
+                        found := log.fields.get("found_timeout")) else {}), **(source or {})},
         "code": code_hashes(),
         "settings": {**asdict(config), "storage": without_secrets(config.storage),
                      "vehicle": None if config.vehicle is None else str(config.vehicle)},

@@ -6,19 +6,25 @@
                       `changed`; empty without reference days
     noise_sentence    the channels that changed, null where none did
     warnings          what speaks against taking a name as certain, in sentences
+    advice            of these, what changes what a reader should do, with a remedy
+    known             whether there is a reference: drives of other days, or a vehicle file
     question          what was asked: against a reference, or of the model family
-    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, open, unit},
-                      p_value, equation, evidence; an interval lies within the physical range, and drives that allow
-                      values beyond an end of it leave that end `open`
-    before, after     training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
-                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not
-    alone             as `after`, of the vehicle before with only the named effects' own parameters fitted; null unless
-                      named
+    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, open, unit,
+                      `was` in the vehicle as it was, `neutral`, description}, p_value, equation, evidence; an interval
+                      lies within the physical range, and drives that allow values beyond an end of it leave that end
+                      `open`
+    before            training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
+                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not. It is
+                      that of the vehicle as it was: none of its parameters has moved
+    refitted, after   the same, refitted to these drives within its day-to-day spread without, and with what was found
+    alone             the same, of the vehicle of `refitted` with only the named effects' own parameters fitted; null
+                      unless named
+    shown             one drive as measured and in these three replays (keys: `sysid.pages.before_after.shown_drive`)
     change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
                       resampled trials, and how many trials got worse
     by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
                       (`sysid.follow_up.changes`)
-    worse             those of these rows whose error surely grew
+    worse             rows of the same from `refitted` to `after` whose error surely grew
     missing           p-value of "nothing is missing", against reference days calibrated
     (`sysid.follow_up.calibrated`), and
                       `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
@@ -49,11 +55,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from sysid.errors.noise_level import said
@@ -61,7 +69,15 @@ from sysid.follow_up.calibrated import calibrated
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
 from sysid.follow_up.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
-from sysid.follow_up.trust import CONFIDENCE, beside_still_base, contradicted, intervals, warnings
+from sysid.follow_up.trust import (
+    CONFIDENCE,
+    advice,
+    as_good_as_repeats,
+    beside_still_base,
+    contradicted,
+    intervals,
+    warnings,
+)
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
 from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, own_floor
@@ -69,7 +85,8 @@ from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
 from sysid.missing.days import Reference
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.unexplained import held_back_gains
-from sysid.pages.loop_page import describe_unnamed, not_determined, sentence
+from sysid.pages.before_after import replayed_paths, shown_drive
+from sysid.pages.loop_words import FAR, describe_unnamed, lead, not_determined, sentence, title
 from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
@@ -94,11 +111,12 @@ def make_report(result: Result) -> dict[str, Any]:
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
     trials = (*result.log.training, *result.log.held_out)
     wrench = find_unnamed(result)
-    before = replay(result, fitted_before(result), trials)
+    before = replay(result, result.reference.params, trials)
+    refitted = replay(result, fitted_before(result), trials)
     after = replay(result, fitted_after(result), trials) if wrench is None or not wrench.kept else replay_unnamed(
         result, wrench, trials)
     rows = error_rows(trials, before, after)
-    moved = by_manoeuvre(trials, before, after)
+    refitted_rows = error_rows(trials, before, refitted)
     days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
                           found.scan, seed=result.config.seed)
     about = [one.name for one in result.references]
@@ -110,15 +128,20 @@ def make_report(result: Result) -> dict[str, Any]:
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
         "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
-        "warnings": warnings(result), "question": asked, "remark": result.reference.remark,
+        "warnings": warnings(result),
+        "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
+        "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
                     "held_out": [t.name for t in result.log.held_out]},
         "references": [{"name": one.name, "sha256": one.sha256} for one in result.references],
         "effects": effects(result) if found.verdict == "named" else [],
-        "before": table(rows, trials, "initial"), "after": table(rows, trials, "fitted"),
+        "before": table(rows, trials, "initial"), "refitted": table(refitted_rows, trials, "fitted"),
+        "after": table(rows, trials, "fitted"),
+        "shown": shown_drive(replayed_paths(trials, {"before": before, "refitted": refitted, "after": after})),
         "alone": alone(result, trials, before), "change": change(rows),
-        "by_manoeuvre": moved, "worse": worse(moved), "operating": operating(result, days),
+        "by_manoeuvre": by_manoeuvre(trials, before, after),
+        "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
         "contradicted": contradicted(result), "pairs": pairs_of(result),
         "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
                     "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
@@ -134,6 +157,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "detectable": detectable(result, days),
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
+        "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
         "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
@@ -144,7 +168,16 @@ def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Pred
 
     drives, values = drives_of(result, trials, vehicle)
     simulated = drives.replay(values[None])
-    return predictions(trials, type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0]))
+    return predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+
+
+def predicts_well(trials: tuple[Trial, ...], rows: list[dict[str, Any]]) -> bool:
+    """Whether drives that were not fitted are predicted, with what was found, to within what repeats differ by."""
+    held = any(trial.held_out for trial in trials)
+    mine = [row for row in rows if row["held_out"] is held and "trajectory" in row["metrics"]]
+    channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in mine) else "odometry"
+    errors = np.array([row["metrics"]["trajectory"]["fitted"] for row in mine if row["channel"] == channel])
+    return as_good_as_repeats(errors, (own_floor(trials, held).get(channel) or {}).get("trajectory"))
 
 
 def alone(result: Result, trials: tuple[Trial, ...], before: list[Prediction]) -> dict[str, Any] | None:
@@ -235,7 +268,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
     ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
     low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
     values = dict(zip(result.names, final.values.tolist(), strict=True))
-    base = base_values(result.full)
+    base, was = base_values(result.full), base_values(result.reference.params)
     for index, name in enumerate(result.reference.space.names):
         base[name] = float(result.reference.space.to_values(final.u)[index])
     kept = {one.hypothesis.key for one in found.accepted}
@@ -251,7 +284,9 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
                     **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
-                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter)} for axis in one.axes},
+                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter), "was": was.get(axis.parameter),
+                    "neutral": about_of(axis.parameter).neutral,
+                    "description": about_of(axis.parameter).description} for axis in one.axes},
                 "p_value": found.accepted[index].p, "equation": equation_of(one),
                 "evidence": evidence_for(result, slice(start, stop), one.effect)})
         start = stop
@@ -349,50 +384,49 @@ def base_table(result: Result) -> list[dict[str, Any]]:
                                              for name in space.names)]
 
 
-def shifts(rows: list[dict[str, Any]], least: float = 2.0) -> list[str]:
+def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
     """Base parameters that the last refit moved by more than so many day-to-day spreads, in words, furthest first."""
     far = sorted((row for row in rows if abs(row["away"]) > least), key=lambda row: -abs(row["away"]))
     return [f"{row['name']} {row['reference']:.4g} -> {row['after']:.4g} {row['unit']} ({row['away']:+.1f} spreads)"
             for row in far]
 
 
-def summary(report: dict[str, Any]) -> str:
-    """What a person reads first."""
-    lines = [f"verdict: {report['verdict']} - {report['reason']}", f"asked: {report['question']}; {report['remark']}"]
+def summary(report: dict[str, Any], width: int = 100) -> str:
+    """What a person reads first, in lines of at most `width` characters."""
+    lines = [title(report), *lead(report), *report["advice"]]
     if report["noise_sentence"] is not None:
         lines.append(f"noise: {report['noise_sentence']}")
-    lines += [f"  warning: {one}" for one in report["warnings"]]
+    lines += ["", f"verdict: {report['verdict']} - {report['reason']}",
+              f"asked: {report['question']}; {report['remark']}"]
     for one in report["effects"]:
-        values = ", ".join(f"{name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
-                           for name, p in one["parameters"].items())
-        lines.append(f"  {one['name']} ({one['kind']}; class: {', '.join(one['class'])}): {values}")
-        lines += [f"    {text}" for text in not_determined(one["parameters"])]
-    if report["alone"] is not None:
-        for part in ("training", "held_out"):
-            for channel, metrics in report["alone"][part].items():
-                if "trajectory" in metrics:
-                    lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} m where only what was "
-                                 "named may move")
+        lines += [f"  {name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
+                  for name, p in one["parameters"].items()]
+        lines += [f"  {text}" for text in not_determined(one["parameters"])]
+    if report["floor"] is not None and report["floor"]["sentence"]:
+        lines.append(f"  changed: {report['floor']['sentence']}")
     moved = shifts(report["base"])
     if moved:
-        lines.append(f"  base parameters further than from day to day: {'; '.join(moved)}")
+        lines += ["  base parameters further than from day to day:", *(f"    {one}" for one in moved)]
     if report["next_manoeuvre"] is not None:
         lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
-    for part in ("training", "held_out"):
-        for channel, metrics in report["before"][part].items():
-            if "trajectory" in metrics:
-                after = report["after"][part][channel]["trajectory"]
-                lines.append(f"  {part} {channel}: trajectory {metrics['trajectory']:.4f} -> {after:.4f} m")
     for one in report["lives_in"][:4]:
         lines.append(f"  lives in {one['quantity']}: {one['share']:.0%} of what is left")
     if report["unnamed"] is not None:
         lines.append(f"  {describe_unnamed(report['unnamed'])}")
-    return "\n".join(lines)
+    return "\n".join(wrapped(line, width) for line in lines)
+
+
+def wrapped(line: str, width: int) -> str:
+    """A line folded at `width`; what follows is indented by two more."""
+    indent = " " * (len(line) - len(line.lstrip()))
+    return textwrap.fill(line.strip(), width, initial_indent=indent, subsequent_indent=f"{indent}  ",
+                         break_long_words=False, break_on_hyphens=False) if line.strip() else ""
 
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
-    """Write report.json, report.html, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
+    """Write report.json, both pages, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
     from sysid.pages.loop_page import write_page
+    from sysid.pages.method_page import write_method
     from sysid.pages.report import write_report
     from whill_mjx.vehicle.vehicle_file import save_vehicle
 
@@ -411,6 +445,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     write_next_command(out, report["next_manoeuvre"])
     write_report(out / "report.json", report)
     write_page(out, report)
+    write_method(out, report)
 
 
 def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:
@@ -431,7 +466,8 @@ def where_it_lives(result: Result) -> list[dict[str, Any]]:
     """Quantities by the share of the systematic residual that they predict on other drives, best first."""
     residual, excess = result.search.final.residual, result.search.excess[1]
     beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
-    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width)
+    gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width,
+                            result.reference.channels)
     out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
     return sorted(out, key=lambda one: -one["share"])
 
@@ -441,5 +477,5 @@ def write_result(out: Path, result: Result) -> dict[str, Any]:
     report = make_report(result)
     write_run(out, result, report)
     print(summary(report))
-    print(f"wrote report.json, report.html and vehicle.toml into {out}")
+    print(f"wrote report.json, report.html, method.html and vehicle.toml into {out}")
     return report

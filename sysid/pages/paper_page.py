@@ -14,9 +14,9 @@ from sysid.logs.log import Log
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
-from sysid.pages.svg import COLOURS, line_chart, replay_line
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
+from whill_mjx.io.svg import COLOURS, line_chart, replay_line
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 
@@ -126,15 +126,20 @@ def write(folder: Path, content: dict[str, Any], fit: Any, series: Sequence[Tria
     write_text(folder / "paper.html", html_page(
         f"The paper's experiment on {log.name}", sections(content, series, figures),
         f"TPE, {content['settings']['trials']} trials, seed {content['settings']['seed']}; J over "
-        f"{content['settings']['channel'].replace('_', ' ')}; data SHA-256 {log.sha256[:16]}"))
+        f"{content['settings']['channel'].replace('_', ' ')}; data SHA-256 {log.sha256[:16]}",
+        kind="The paper's experiment", lead=headline(content)))
+
+
+def headline(content: dict[str, Any]) -> str:
+    """One sentence: what the search made of the paper's objective."""
+    search = content["search"]
+    return (f"J, the sum of position RMSE over the drives fitted: {search['J_initial']:.3f} m before, "
+            f"{search['J']:.3f} m after {search['evaluations']} evaluations in {search['seconds']:.0f} s.")
 
 
 def sections(content: dict[str, Any], series: Sequence[TrialSeries], figures: Sequence[Path] = ()) -> list[Section]:
     """Sections of paper.html, for other pages as well."""
-    search = content["search"]
-    parts = [paragraph(f"J, the sum of position RMSE over the drives fitted: {search['J_initial']:.3f} m before, "
-                       f"{search['J']:.3f} m after {search['evaluations']} evaluations in {search['seconds']:.0f} s.",
-                       "lead"), paragraph(caution(content))]
+    parts = [paragraph(caution(content))]
     for channel, entries in content["table"].items():
         parts.append(_html_table(channel, entries))
     values = table(["parameter", "unit", "initial", "optimised here", "optimised in the paper"], [

@@ -14,6 +14,7 @@ from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.pages.series import TrialSeries
 from whill_mjx.io.fields import Field, check_table, shown
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.html import Section
 from whill_mjx.io.reading import read_json
 from whill_mjx.logs.dataset import write_text
@@ -85,6 +86,7 @@ def read_report(run: Path) -> dict[str, Any]:
     """Content of RUN/report.json; FileNotFoundError, ValueError where it is missing or none of a fit."""
     path = Path(run) / "report.json"
     report = read_json(path, "missing. Give the folder that `python -m sysid.fit DATASET --out RUN` wrote.", AGAIN)
+    report = upgraded(KIND, report)
     if report.get("kind") != KIND or report.get("schema") != SCHEMA:
         raise ValueError(f"{path}: kind {shown(report.get('kind'))}, schema {shown(report.get('schema'))}; this "
                          f"program reads {KIND!r}, schema {SCHEMA}. {AGAIN}")
@@ -100,7 +102,7 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
         sections: more sections, shown first.
     """
-    from sysid.pages.fit_page import fit_sections
+    from sysid.pages.fit_page import fit_sections, headline
     from sysid.pages.series import FILE, load, replay
     from whill_mjx.io.html import html_page
 
@@ -110,7 +112,8 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
         series = load(run) if (run / FILE).is_file() else replay(run, report)
     try:
         page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
-                         [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}")
+                         [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}",
+                         kind="Fit", lead=headline(report))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise ValueError(f"{run / 'report.json'}: is not whole, or not of this {FILE} ({type(error).__name__}: "
                          f"{str(error)[:160]}). {AGAIN}") from error

@@ -60,8 +60,12 @@ class CourseReplay:
         whole = replace(batch, command=batch.command[first], start=jnp.asarray(from_start, float_type),
                         pose_index=jnp.asarray(every), pose_weight=jnp.asarray(last, float_type),
                         odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
+        if batch.gyro_index is not None:
+            whole = replace(whole, gyro_index=jnp.asarray(every), gyro_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
+        if batch.gyro_index is not None:
+            self._times["gyro"] = np.asarray(batch.gyro_index), np.asarray(batch.gyro_weight, float)
         self._replay, self._compiled = replay_of(plant, whole, set_values), set[int]()
         self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
         self._trials = [trials[i] for i in first]
@@ -118,7 +122,7 @@ class CourseReplay:
     def _spread(self, simulated: Simulated, motion: bool) -> Simulated:
         """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...); derivatives are turned but not moved."""
         xp = namespace(simulated.pose)
-        pose, odometry = (self._at(name, xp.asarray(getattr(simulated, name), float)) for name in self._times)
+        pose, odometry, *gyro = (self._at(name, xp.asarray(getattr(simulated, name), float)) for name in self._times)
         diverged: Any = simulated.diverged[:, self._course]
         extra = (1,) * (pose.ndim - 4)
         turn = (self._to[:, 2] - self._from[:, 2]).reshape(-1, 1, *extra)  # (B, 1)
@@ -130,7 +134,7 @@ class CourseReplay:
         if motion:
             x, y = x + self._to[:, :1], y + self._to[:, 1:2]
         moved: Any = xp.stack([x, y, yaw], axis=3)
-        return Simulated(moved, odometry, diverged)
+        return Simulated(moved, odometry, diverged, *gyro)
 
     def _at(self, name: str, values: np.ndarray) -> Any:
         index, weight = self._times[name]

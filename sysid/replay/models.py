@@ -103,6 +103,11 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
     return (*rolling, "sensor_delay", "pose_delay") if receipt else (*rolling, "sensor_delay")
 
 
+def gyro_effects(trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Errors of a gyro, where trials have one: its bias, and its scale, which an outside pose shows."""
+    return ("gyro_bias",) if any(trial.gyro is not None for trial in trials) else ()
+
+
 def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
     """What a usual first calibration finds, where it is known to show: sizes of the wheels, and of what measures them.
 

@@ -12,6 +12,7 @@ from flax import struct
 
 RECORD_DT = 0.01  # s between recorded states: speeds that pass a low-pass of 40 ms bend by 1 mm/s between them
 POSE, ODOMETRY = slice(0, 3), slice(3, 8)  # of what `Plant.observe` returns
+TURN = slice(9, 10)  # of a path with what a gyro turns
 SPEEDS = slice(6, 8)
 YAW_COLUMNS = (2, 5)
 
@@ -69,6 +70,8 @@ class Batch:
     pose_weight: jax.Array  # (B, M) share of the record after it
     odometry_index: jax.Array  # (B, L)
     odometry_weight: jax.Array  # (B, L)
+    gyro_index: jax.Array | None = None  # (B, G); None where no trial has a gyro
+    gyro_weight: jax.Array | None = None  # (B, G)
     warm_up: int = struct.field(pytree_node=False, default=0)
     """Physics steps at the start's speeds before the trial; 0 where all trials start at rest."""
     speeds: jax.Array | None = None  # (B, W, 2) m/s, rad/s where W pieces of drives begin (`sysid.replay.pieces`)
@@ -82,6 +85,9 @@ class Measured:
     pose_mask: np.ndarray  # (B, M, 3)
     odometry: np.ndarray  # (B, L, 5)
     odometry_mask: np.ndarray  # (B, L, 5)
+    gyro: np.ndarray | None = None  # (B, G, 1) rad turned since the first sample; None where no trial has a gyro
+    gyro_mask: np.ndarray | None = None  # (B, G, 1)
+    gyro_t: np.ndarray | None = None  # (B, G) s
 
 
 @struct.dataclass
@@ -91,3 +97,4 @@ class Simulated:
     pose: jax.Array  # (B, M, 3)
     odometry: jax.Array  # (B, L, 5)
     diverged: jax.Array  # (B,) above 0.5 where the state became non-finite
+    gyro: jax.Array | None = None  # (B, G, 1) rad that a gyro turned, up to a constant

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import os
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from whill_mjx.io.reading import MB, decoded, read_bytes
+from sysid.replay import xacro_text
+from sysid.replay.xacro_text import around, package_folders
+from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
 
 MODEL_BYTES = 20 * MB
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
-PARENTS = 4  # folders above the file in which packages are looked for
+LONGEST = 60  # s that a xacro file may take, processor time or not
 BOX = 0.1  # m, of a mesh whose body says nothing of its size
 XACRO = "pip install xacro"
 
@@ -57,52 +62,24 @@ def _frictions(top: ElementTree.Element) -> dict[str, float]:
 
 
 def expand_xacro(path: Path) -> str:
-    """Text of a xacro file with all macros expanded; `$(find PACKAGE)` is looked for in the folders around it."""
-    try:
-        import xacro
-    except ImportError:
+    """Text of a xacro file with all macros expanded, in a process of its own: what stands in it may never end."""
+    if importlib.util.find_spec("xacro") is None:
         raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
-                         "you have ROS: xacro FILE > robot.urdf.") from None
+                         "you have ROS: xacro FILE > robot.urdf.")
     try:
-        with _packages_around(path.resolve().parent):
-            return str(xacro.process_file(str(path)).toxml())
-    except Exception as error:  # xacro's errors have no common class
-        raise ValueError(f"{path}: xacro cannot expand it: {' '.join(str(error).split()) or type(error).__name__}. "
-                         "Correct the file, or expand it where you have ROS: xacro FILE > robot.urdf.") from None
-
-
-@contextmanager
-def _packages_around(folder: Path) -> Iterator[None]:
-    """Let xacro find packages in the folders around a file where no ROS is installed."""
-    from xacro import substitution_args
-
-    before = substitution_args._eval_find
-
-    def find(package: str) -> str:
-        try:
-            return str(before(package))
-        except Exception:  # of ROS where it is not sourced, or lacks the package
-            for place in _package_folders(folder, package):
-                return str(place)
-            raise ValueError(f"package {package!r} is neither installed nor a folder around the file") from None
-
-    substitution_args._eval_find = find
-    try:
-        yield
-    finally:
-        substitution_args._eval_find = before
-
-
-def _around(folder: Path) -> list[Path]:
-    return [folder, *list(folder.parents)[:PARENTS]]
-
-
-def _package_folders(folder: Path, package: str) -> list[Path]:
-    """Folders of that name, among those around a file, the nearest first."""
-    found = []
-    for place in _around(folder):
-        found += [one for one in (place / package, place) if one.name == package and one.is_dir()]
-    return found
+        done = subprocess.run(
+            [sys.executable, xacro_text.__file__, str(path), str(xacro_text.SECONDS)], capture_output=True,
+            timeout=LONGEST, env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )  # fmt: skip
+        said = done.stdout.decode("utf-8", errors="replace")
+        if done.returncode == 0:
+            return said
+        limit = f"it takes more than {xacro_text.SECONDS} s of processor time"
+        reason = said[:LONGEST_REASON] if done.returncode == 1 else limit
+    except subprocess.TimeoutExpired:
+        reason = f"it is not done after {LONGEST} s"
+    raise ValueError(f"{path}: xacro cannot expand it: {reason}. Correct the file, or expand it where you have ROS: "
+                     "xacro FILE > robot.urdf.")
 
 
 def find_mesh(folder: Path, name: str) -> Path | None:
@@ -117,9 +94,9 @@ def find_mesh(folder: Path, name: str) -> Path | None:
     places = [Path(rest), folder / rest] if scheme in ("", "file") else []
     if scheme in ("package", "model"):
         package, _, inside = rest.partition("/")
-        places += [place / inside for place in (*_package_folders(folder, package), *_around(folder))]
+        places += [place / inside for place in (*package_folders(folder, package), *around(folder))]
     else:
-        places += [place / rest.lstrip("/") for place in _around(folder)]
+        places += [place / rest.lstrip("/") for place in around(folder)]
     file = Path(rest).name
     places += [folder / file, *sorted((folder / "meshes").rglob(file)), *sorted((folder.parent / "meshes").rglob(file))]
     for place in places:  # a mesh for pictures often lies beside one that MuJoCo can read

@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial, command_in_force
+from sysid.logs.log import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
 from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.delays import delayed, without
-from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, YAW_COLUMNS, Batch, Measured, Plant, Simulated
+from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.processor import as_one_function
@@ -101,11 +101,17 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     pose_index, pose_weight = _grid(pose_t, record, records)
     odometry_index, odometry_weight = _grid(odometry_t, record, records)
     floats = [command.reshape(len(trials), records, stride, 2), start]
-    command_array, start_array = (jnp.asarray(array, jnp.result_type(float)) for array in floats)
+    floats_type = jnp.result_type(float)
+    command_array, start_array = (jnp.asarray(array, floats_type) for array in floats)
     batch = Batch(command_array, start_array, jnp.asarray(pose_index), jnp.asarray(pose_weight, jnp.result_type(float)),
                   jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)),
-                  round(WARM_UP / dt) if start[:, 3:].any() else 0)
-    return batch, Measured(pose, pose_mask, odometry, odometry_mask)
+                  warm_up=round(WARM_UP / dt) if start[:, 3:].any() else 0)
+    if all(trial.gyro is None for trial in trials):
+        return batch, Measured(pose, pose_mask, odometry, odometry_mask)
+    gyro_t, gyro, gyro_mask = padded([trial.gyro for trial in trials], 1)
+    gyro_index, gyro_weight = _grid(gyro_t, record, records)
+    batch = replace(batch, gyro_index=jnp.asarray(gyro_index), gyro_weight=jnp.asarray(gyro_weight, floats_type))
+    return batch, Measured(pose, pose_mask, odometry, odometry_mask, gyro, gyro_mask, gyro_t)
 
 
 def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
@@ -187,15 +193,18 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
         if trial.odometry is not None:
             table = np.asarray(simulated.odometry[i, : len(trial.odometry.t)], float)
             odometry = OdometryStream(trial.odometry.t, *table.T)
-        results.append(Prediction(truth, odometry))
+        gyro = None
+        if trial.gyro is not None and simulated.gyro is not None:
+            gyro = GyroStream(trial.gyro.t, np.asarray(simulated.gyro[i, : len(trial.gyro.t), 0], float))
+        results.append(Prediction(truth, odometry, gyro))
     return results
 
 
 def path_of(
     plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None,
-    few: bool = False,
+    few: bool = False, gyro: bool = False,
 ) -> jax.Array:
-    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive.
+    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive; with a gyro (R + 1, 10).
 
     Args:
         command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].
@@ -203,6 +212,7 @@ def path_of(
         warm_up: physics steps at the start's speeds before it.
         speeds: (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`).
         few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
+        gyro: whether the last column is what a gyro turned [rad].
     """
     params, latency = without(params, SensorDelay.name)
     params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
@@ -240,13 +250,18 @@ def path_of(
         path = path.at[:, column].set(_unwrap(path[:, column]))
     if lag is not None and plant.frame:
         path = path.at[:, SPEEDS].set(odometry.framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
+    turned = path[:, 2]
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "turned"):
+            turned = effect.turned(turned, gap)
     if latency is not None:
         path = path.at[:, ODOMETRY].set(odometry.late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "outside"):
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
     # The measured yaw may count full turns from another origin than the simulated one.
-    return path.at[:, 2].add(turns)
+    path = path.at[:, 2].add(turns)
+    return jnp.concatenate([path, turned[:, None]], axis=1) if gyro else path
 
 
 class PathReplay:
@@ -256,11 +271,11 @@ class PathReplay:
     """
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
-        def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> jax.Array:
-            return path_of(plant, set_values(values), command, start, warm_up, few=rows <= IN_ONE)
+        def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
+            return path_of(plant, set_values(values), command, start, warm_up, few=rows <= IN_ONE, gyro=gyro)
 
         self.rows, self._compiled = rows, False
-        self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), static_argnums=3)
+        self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None, None)), static_argnums=(3, 4))
 
     def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
         """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""
@@ -273,7 +288,7 @@ class PathReplay:
         def part(first: int) -> jax.Array:
             chosen = trials[first : first + self.rows]
             return self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
-                             command[chosen], start[chosen], batch.warm_up)
+                             command[chosen], start[chosen], batch.warm_up, batch.gyro_index is not None)
 
         firsts = range(0, len(values), self.rows)
         if on_processor():
@@ -288,14 +303,17 @@ class PathReplay:
 
 def simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
     """Replay one trial of a batch with one parameter set."""
-    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few)
+    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few, one.gyro_index is not None)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]
         return before + weight[:, None] * (after - before)
 
+    turned = None
+    if one.gyro_index is not None and one.gyro_weight is not None:
+        turned = at(one.gyro_index, one.gyro_weight, TURN)
     return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
-                     path[-1, 8])
+                     path[-1, 8], turned)
 
 
 def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
@@ -342,7 +360,7 @@ def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.nd
 
 
 def padded(
-    streams: Sequence[PoseStream | OdometryStream | None], columns: int
+    streams: Sequence[PoseStream | OdometryStream | GyroStream | None], columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (B, M), values (B, M, C) and mask (B, M, C) of streams of different length; nan values are masked."""
     tables = [_table(stream, columns) for stream in streams]
@@ -358,7 +376,7 @@ def padded(
     return time, values, mask
 
 
-def _table(stream: PoseStream | OdometryStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
+def _table(stream: PoseStream | OdometryStream | GyroStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
     return (np.zeros(0), np.zeros((0, columns))) if stream is None else (stream.t, stream.values)
 
 

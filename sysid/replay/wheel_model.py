@@ -16,9 +16,10 @@ from sysid.replay.models import Model, function_model, with_effects
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, VehicleParams
 
-DT = 0.01  # s
+DT = 0.005  # s; halves of the usual intervals between samples are multiples of it
 NOTE = ("the log has no commands: measured wheel speeds are the input. Radius and track are effective ones, slip and "
-        "scrub included; drive, delays of commands and their scale are left out")
+        "scrub included; drive, delays of commands and their scale are left out. The outside pose's delay is how much "
+        "older it is than the wheel speeds, which a filter may have made old themselves")
 
 
 def wheel_model(spec: VehicleSpec) -> Model:
@@ -26,7 +27,8 @@ def wheel_model(spec: VehicleSpec) -> Model:
 
     Its parameters are the mean `radius` of the wheels [m], `radius_difference` (right less left, over the mean), the
     effective `track` [m], the tracked point's place `ahead` and `left` of the point that does not slide sideways [m],
-    and the age of the outside pose [s].
+    and how much older the outside pose is than the wheel speeds [s]. Drivers filter these: where they are 30 ms late,
+    a pose that is 100 ms old shows as 70 ms.
     """
     nominal_radius, nominal_track = spec.wheel_radius, spec.track
     reach = max(2 * nominal_track, 0.5)

@@ -28,6 +28,7 @@ from sysid.replay.models import (
     calibration_effects,
     describe_parameters,
     get_parameters,
+    gyro_effects,
     measured_effects,
     model_space,
     set_parameters,
@@ -242,7 +243,7 @@ def _subject(
             raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
-        model = model.with_effects(config.effects)
+        model = model.with_effects((*config.effects, *gyro_effects(trials)))
         if config.calibrate and not config.parameters:
             model, alone = calibrated(model, trials)
         plant, params = model.plant, model.params if params is None else params
@@ -261,7 +262,7 @@ def _subject(
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
         sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
-        params = with_effects(params, (*config.effects, *measured, *sizes))
+        params = with_effects(params, (*config.effects, *measured, *sizes, *gyro_effects(trials)))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals

@@ -70,6 +70,7 @@ class Thresholds:
     """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
     more one in six would find the opposite."""
     rounds: int = 3
+    """Effects that are searched for one after the other, at most."""
     pairs: int = 3
     """Pairs of effects that are refitted."""
     worthwhile: float = 0.15

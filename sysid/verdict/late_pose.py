@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.space import make_space
-from sysid.logs.pose_lag import pose_lag
+from sysid.logs.log import Log
+from sysid.logs.pose_lag import Rates, pose_lag
 from sysid.missing.catalogue import PARAMETER
 from sysid.missing.evidence import with_values
 from sysid.missing.pose_fit import fit_poses
@@ -33,7 +34,8 @@ def told_late(result: Result, alpha: float) -> Result:
     """The result with a late outside pose named, where it follows what was measured on the vehicle with a delay; else
     as it is."""
     search, evidence = result.search, result.evidence
-    lag = pose_lag(result.log.training, evidence.groups, result.log.fields.get("yaw_rate"))
+    rates = yaw_rates(result.log)
+    lag = pose_lag(result.log.training, evidence.groups, rates)
     if lag is None:
         return result
     result.seconds["p of a late pose"] = lag.p
@@ -52,13 +54,22 @@ def told_late(result: Result, alpha: float) -> Result:
                   residual=left[1], jacobian=jacobian, values=late)
     base_fit = replace(search.base, u=units[0], cost=float(np.square(left[0]).sum()), residual=left[0], values=null)
     named = Candidate(one, 0.0, lag.p, lag.share, fit)
-    means = "yaw rate" if "yaw_rate" in result.log.fields else "odometry"
+    means = "odometry" if rates is None else "yaw rate"
     reason = (f"the outside pose follows the vehicle's own {means} {lag.delay:.2f} s late ({lag.low:.2f} to "
               f"{lag.high:.2f} s): {lag.share:.0%} less error in blocks of drives that were held back")
     return replace(
         result, config=replace(result.config, held=(*result.config.held, PARAMETER)),
         search=replace(search, verdict="named", base=base_fit, final=fit,
                        accepted=[named], classes=[[NAME]], share=lag.share, reason=reason))
+
+
+def yaw_rates(log: Log) -> Rates | None:
+    """Yaw rates of the body, of the trials that have a gyro; None where none has."""
+    known: Rates | None = log.fields.get("yaw_rate")
+    if known is not None:
+        return known
+    gyros = {trial.name: trial.gyro for trial in log.training if trial.gyro is not None and len(trial.gyro.t) > 1}
+    return {name: (one.t, np.gradient(one.turn, one.t)) for name, one in gyros.items()} or None
 
 
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:

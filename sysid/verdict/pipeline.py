@@ -19,6 +19,7 @@ from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from sysid.verdict.alone import judged, stands_alone
+from sysid.verdict.floor import floor_change
 from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
@@ -54,7 +55,7 @@ def find_missing(
     reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
     base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths)
+    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths, reference.gyro)
     at = drives.simulate(np.array([base[name] for name in names])[None])[0]
     drives = drives.weighted(at, reference.factors, log.spec.track)
     noise = compared(drives, at, reference, config.thresholds.alpha)
@@ -66,7 +67,7 @@ def find_missing(
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width)
+        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
     outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     searched, nulls = time.perf_counter(), None
@@ -84,7 +85,8 @@ def find_missing(
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise)
+    floor = floor_change(reference, log.training, config.thresholds.alpha)
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result

@@ -15,10 +15,10 @@ from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call
 from sysid.missing.fit_statistics import FittedVehicle
-from sysid.missing.reference import make_reference, of_vehicle
+from sysid.missing.reference import BLOCK, make_reference, of_vehicle
 from sysid.missing.signatures import PARTS
 from sysid.missing.wander import estimate
-from sysid.replay.models import with_effects
+from sysid.replay.models import gyro_effects, with_effects
 from sysid.replay.records import Plant
 from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
@@ -46,7 +46,7 @@ def prepare(
     base = base_values(full)
     paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
     drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
-                         paths)
+                         paths, reference.gyro)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
     wander = estimate(drives, reference, found, full, spec, progress)
     return Prepared(reference, plant, found, full, tuple(base), paths, wander)
@@ -78,7 +78,8 @@ def days_of(references: Sequence[Log]) -> tuple[Log, ...]:
         if repeated(trials) or len(trials) < BLOCKS * LEAST_WINDOWS:
             days.append(log)
             continue
-        days += [replace(log, name=f"{log.name}, block {number}", trials=tuple(trials[i] for i in part))
+        days += [replace(log, name=f"{log.name}, block {number}", fields={**log.fields, BLOCK: number},
+                         trials=tuple(trials[i] for i in part))
                  for number, part in enumerate(np.array_split(np.arange(len(trials)), BLOCKS), start=1)]
     return tuple(days)
 
@@ -95,12 +96,15 @@ def reference_for(
     plant = _plant(log.spec, config)
     if vehicle is not None:
         fitted = vehicle if isinstance(vehicle, FittedVehicle) else FittedVehicle(vehicle)
+        shown = [trial for one in references or (log,) for trial in one.training]
+        fitted = replace(fitted, params=with_effects(fitted.params, gyro_effects(shown)))
         free = _free(fitted.params, config)
         if not references:
             return of_vehicle(plant, fitted, log, free, progress)
         return make_reference(plant, fitted.params, days_of(references), True, 0, free, progress, True)
     start = preset_params(log.spec, config.preset) if start is None else start
-    start = with_effects(start, config.with_effects)
+    start = with_effects(start, (*config.with_effects, *gyro_effects(
+        [trial for one in references or (log,) for trial in one.training])))
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     return make_reference(plant, start, days_of(references) or (log,), bool(references), iterations,
                           _free(start, config), progress)

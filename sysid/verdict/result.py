@@ -18,6 +18,7 @@ from sysid.replay.records import Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
+from sysid.verdict.floor import FloorChange
 from sysid.verdict.found import NullRefits, Search, Thresholds
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
@@ -123,6 +124,8 @@ class Result:
     """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
     noise: NoiseLevels | None = None
     """Noise of each channel over that of the reference days; None without such days."""
+    floor: FloorChange | None = None
+    """Whether the floor is another than on the reference days; None where nothing could show it."""
 
     @property
     def reference(self) -> Reference:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.errors.features import CHANNELS
+from sysid.errors.features import channel_names
 from sysid.errors.noise import replicate_groups
 from sysid.errors.noise_level import NoiseLevels, NoisyDrives, noise_levels, steady_bins
 from sysid.missing.days import Reference
@@ -33,7 +33,7 @@ def compared(drives: Drives, at: np.ndarray, reference: Reference, alpha: float)
         np.stack([one.series - reference.expected_on_others(one) for one in days]),
         np.stack([one.mask for one in days]), replicate_groups_by_day(theirs, np.array([one.day for one in days])),
         np.stack([steady_bins(one, len(days[0].series), reference.width) for one in theirs]))
-    return noise_levels(ours, usual, CHANNELS, alpha)
+    return noise_levels(ours, usual, channel_names(drives.target.shape[-1]), alpha)
 
 
 def with_noise(ready: Prepared, levels: NoiseLevels | None) -> Prepared:

@@ -62,6 +62,17 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     return _to_poses(result, vehicle, names, iterations)
 
 
+def on_other_floor(result: Result) -> Any:
+    """The reference vehicle on the floor of these drives: of all its parameters those alone are fitted that say what
+    changed. The reference vehicle itself where the floor is the same."""
+    vehicle, change = result.reference.params, result.floor
+    if change is None or not change.named:
+        return vehicle
+    have = describe(vehicle)
+    names = list(dict.fromkeys(one.quantity.parameter for one in change.members if one.quantity.parameter in have))
+    return _to_poses(result, vehicle, names, 12) if names else vehicle
+
+
 def named_parameters(result: Result, vehicle: Any) -> list[str]:
     """Those of the named effects that a vehicle has and that a fit may move."""
     have = describe(vehicle)
@@ -91,12 +102,13 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
     vehicle does not have are neutral.
     """
     ready, width, values = result.prepared, result.reference.width, base_values(vehicle)
+    gyro = result.reference.gyro
     if set(values) <= set(ready.names):
         values = {**base_values(ready.full), **values}
-        drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths)
+        drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths, gyro)
         return drives, np.array([values[name] for name in ready.names])
     kind = ready.plant, jax.tree.structure(vehicle)
-    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width, ready.others.get(kind))
+    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width, ready.others.get(kind), gyro)
     ready.others[kind] = drives.paths
     return drives, np.array(list(values.values()))
 
@@ -106,7 +118,7 @@ def refitter_of(result: Result) -> Refitter:
     base = base_values(result.full)
     values = np.array([base[name] for name in result.names])
     drives = make_drives(result.plant, result.full, result.names, result.log.training, result.reference.width,
-                         result.prepared.paths)
+                         result.prepared.paths, result.reference.gyro)
     drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 

@@ -1,10 +1,11 @@
 """A point on a plane instead of a chair: its camera image is one colour that changes as it moves."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from bridge.simulate import Frame
+from bridge.simulated import Frame, Grid
 
 
 class PointRobot:
@@ -14,6 +15,7 @@ class PointRobot:
     goal = 0.3
     longest = 100
     intrinsics = (60.0, 60.0, 32.0, 32.0)
+    grid = Grid(np.array([[False, False, True], [False] * 3]), 0.5, -1.0, 0.0)
 
     def __init__(self, task="", vehicle=None):
         self.reset(0)
@@ -38,6 +40,15 @@ class PointRobot:
         return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
                      odometry=(self.x, self.y, self.yaw, v, omega),
                      ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 10.0, 1.0]))
+
+
+class CrashingRobot(PointRobot):
+    """Meets a wall after half a second, whatever it is told."""
+
+    def step(self, v, omega):
+        frame = super().step(0.0, 0.0)
+        hit = self.steps >= 5
+        return replace(frame, collided=hit, done=hit, terminated=hit)
 
 
 class EndlessRobot(PointRobot):

@@ -33,17 +33,34 @@ def free_domain():
             return
 
 
+WAIT = 120
+"""Seconds after which a condition counts as one that never comes true; a machine that tests in parallel is slow."""
+SIGNAL_AGE = ("--signal-age", "20")
+"""Of nodes that drive: on a busy machine an emergency stop may be silent for longer than the usual 0.5 s."""
+
+
+def segments(pid):
+    """Files of shared memory that a process has mapped; one that is killed leaves them behind."""
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/maps") as file:
+        return {line.split()[-1] for line in file if "/dev/shm/fastrtps_" in line}
+    return set()
+
+
 class Graph:
     """Processes of one ROS domain that end with the test."""
 
     def __init__(self, folder, domain):
         self.folder, self.domain, self.processes, self.peers = folder, domain, {}, []
+        self.leftovers = set()
         python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
         self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
                             "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log")}
 
     def start(self, name, *arguments, key=None):
         key = key or name
+        if name in ("drive", "manoeuvre") and "--signal-age" not in arguments:
+            at = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+            arguments = (*arguments[:at], *SIGNAL_AGE, *arguments[at:])
         log = open(self.folder / f"{key}.log", "w")
         command = [sys.executable, "-m", f"bridge.{name}", *map(str, arguments)]
         self.processes[key] = subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=log, stderr=log)
@@ -60,16 +77,17 @@ class Graph:
 
     def end(self, name, number=signal.SIGTERM):
         """Send a signal and return the exit code."""
+        self.leftovers |= segments(self.processes[name].pid) if number == signal.SIGKILL else set()
         self.processes[name].send_signal(number)
         return self.wait(name)
 
-    def wait(self, name, seconds=60):
+    def wait(self, name, seconds=WAIT):
         try:
             return self.processes[name].wait(seconds)
         except subprocess.TimeoutExpired:
             pytest.fail(f"{name} did not end in {seconds} s: {self.log(name)}")
 
-    def wait_for(self, name, text, seconds=60):
+    def wait_for(self, name, text, seconds=WAIT):
         """Wait until a process has said something."""
         end = time.monotonic() + seconds
         while text not in self.log(name):
@@ -81,5 +99,8 @@ class Graph:
             peer.close()
         for process in self.processes.values():
             if process.poll() is None:
+                self.leftovers |= segments(process.pid)
                 process.kill()
                 process.wait()
+        for path in self.leftovers:
+            Path(path).unlink(missing_ok=True)

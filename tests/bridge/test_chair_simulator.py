@@ -5,7 +5,8 @@ import argparse
 import numpy as np
 import pytest
 
-from bridge.simulate import ChairSimulator, _halfway, field
+from bridge.simulate import ChairSimulator, field
+from bridge.simulated import halfway
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def test_pose_between_two_frames_takes_the_short_way_round(chair):
     b = chair.step(0.0, 0.0)
     a, b = (type(f)(f.image, x, 0.0, yaw, 0.0, 0.0, odometry=(0.0, 0.0, 0.0, v, 0.0))
             for f, x, yaw, v in ((a, 1.0, 3.1, 0.1), (b, 2.0, -3.1, 0.3)))
-    middle = _halfway(a, b)
+    middle = halfway(a, b)
     assert middle.x == 1.5 and abs(abs(middle.yaw) - np.pi) < 1e-6 and middle.odometry[3] == pytest.approx(0.2)
 
 
@@ -78,3 +79,20 @@ def test_a_field_without_a_value_is_refused():
 def test_a_field_that_the_task_does_not_have_is_named():
     with pytest.raises(ValueError, match="no field 'doors' .*known: .*box_x"):
         ChairSimulator("corridor", doors=3)
+
+
+def test_the_map_shows_as_occupied_what_the_scanner_meets_and_the_start_as_free():
+    simulator = ChairSimulator("corridor", layout="fixed")
+    frame = simulator.reset(0)
+    grid = simulator.grid
+
+    def occupied(x, y):
+        return grid.occupied[int((y - grid.y) / grid.resolution), int((x - grid.x) / grid.resolution)]
+
+    assert not occupied(frame.x, frame.y)
+    angles = frame.yaw + np.arange(len(frame.ranges)) * 2 * np.pi / len(frame.ranges)
+    met = [(r, a) for r, a in zip(frame.ranges, angles, strict=True) if r < 5]
+    assert len(met) > 50
+    hits = [occupied(frame.x + (r + 0.03) * np.cos(a), frame.y + (r + 0.03) * np.sin(a)) for r, a in met]
+    before = [occupied(frame.x + (r - 0.15) * np.cos(a), frame.y + (r - 0.15) * np.sin(a)) for r, a in met]
+    assert np.mean(hits) > 0.95 and np.mean(before) < 0.2

@@ -49,7 +49,7 @@ def test_a_command_beyond_the_limits_is_refused_and_not_cut():
 @pytest.mark.parametrize(("text", "words"), [
     ("", "begins with nothing"),
     ("t,x,y\n0,0,0\n", "begins with t,x,y"),
-    ("t,v,omega\n0,0,0\n", "1 rows"),
+    ("t,v,omega\n0,0,0\n", "a single row"),
     ("t,v,omega\n0,0,0\n1,nan,0\n", "line 3.*not three finite numbers"),
     ("t,v,omega\n0,0,0\n1,0\n", "line 3"),
     ("t,v,omega\n0,0,0\n0,0,0\n", "line 3: t goes from 0 to 0"),

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from bridge.commands import CommandListener, Ear, Endpoint, choose_type, without
+from bridge.commands import NAMELESS, UNKNOWN, Commanders, CommandListener, Ear, Endpoint, choose_type, without
 
 pytestmark = pytest.mark.quick
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -89,3 +89,39 @@ def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base():
         get_subscriptions_info_by_topic=lambda topic: infos)
     listener = CommandListener(node, "cmd_vel", "auto", print)
     assert [end.node for end in listener.listeners()] == ["/left/bridge_guard", "/base"]
+
+
+UNNAMED = f"/{UNKNOWN}"
+
+
+def test_nobody_counts_as_absent_before_the_list_has_stayed_the_same():
+    others = Commanders(10.0)
+    others.look(10.2, [])
+    assert not others.settled(10.9)
+    others.look(10.9, ["/planner"])
+    assert not others.settled(11.8)
+    assert others.settled(11.95)
+
+
+def test_a_commander_with_a_name_counts_at_once():
+    others = Commanders(10.0)
+    others.look(10.2, ["/planner", UNNAMED])
+    assert others.names(10.2) == ["/planner"]
+
+
+def test_a_commander_without_a_name_counts_when_it_stays():
+    others = Commanders(10.0)
+    for step in range(20):
+        now = 10.25 + 0.125 * step
+        others.look(now, [UNNAMED])
+        assert others.names(now) == ([] if now < 11.0 else [NAMELESS])
+
+
+def test_a_guard_that_gets_its_name_late_never_counts_but_the_wait_begins_again():
+    others = Commanders(10.0)
+    others.look(12.0, [])
+    assert others.settled(12.0)
+    others.look(12.2, [UNNAMED])
+    others.look(12.8, [])
+    assert others.names(13.5) == []
+    assert not others.settled(13.5) and others.settled(13.8)

@@ -24,9 +24,9 @@ def commands_per_period(outcome, episode):
 def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph, policy, tmp_path):
     results = tmp_path / "results.json"
     graph.start("record", tmp_path / "logs", "straight_1")
-    graph.start("drive", policy, "--signal-age", 10)  # a machine that tests in parallel pauses for long
+    graph.start("drive", policy)
     graph.wait_for("drive", "standing")
-    graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 2, "--linger", 1.5,
+    graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 2, "--linger", 3,
                 "--results", results)
     assert graph.wait("simulate") == 0, graph.log("simulate")
     assert graph.end("drive") == 0, graph.log("drive")
@@ -35,7 +35,7 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
     outcome = json.loads(results.read_text())
     assert [(episode["reached_goal"], episode["collided"]) for episode in outcome["episodes"]] == [(True, False)] * 2
     for episode in outcome["episodes"]:
-        assert 0.6 <= commands_per_period(outcome, episode) <= 1.6
+        assert 0.3 <= commands_per_period(outcome, episode) <= 2.3  # about one a frame, however busy the machine
     assert outcome["stops_at_end"] >= 5  # the camera went silent: the bridge stopped by itself
 
     trial = tmp_path / "logs" / "trials" / "straight_1"
@@ -55,17 +55,15 @@ def test_policy_drives_the_simulator_to_the_goal_and_the_drive_is_recorded(graph
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
-def test_vehicle_is_stopped_however_the_policy_node_ends(graph, policy, tmp_path, number, code):
-    results = tmp_path / "results.json"
-    graph.start("simulate", "--simulator", "point_robot:EndlessRobot", "--results", results)
+def test_vehicle_is_stopped_however_the_policy_node_ends(graph, policy, number, code):
+    base = graph.peer("base")
+    base.base()
+    graph.start("simulate", "--simulator", "point_robot:EndlessRobot")
     graph.start("drive", policy)
-    graph.wait_for("drive", "driving")
-    time.sleep(0.5)
+    base.wait_until(lambda base: base.moving())
     assert graph.end("drive", number) == code, graph.log("drive")
-    time.sleep(1.0)
+    base.wait_until(lambda base: [one[1:] for one in base.commands[-5:]] == [(0.0, 0.0)] * 5)
     assert graph.end("simulate") == 0, graph.log("simulate")
-    outcome = json.loads(results.read_text())
-    assert len(outcome["commands"]) > outcome["stops_at_end"] >= 5
 
 
 def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):
@@ -77,7 +75,7 @@ def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):
             "publisher = node.create_publisher(Twist, '/whill/controller/cmd_vel', 1); time.sleep(60)")
     graph.processes["joystick"] = subprocess.Popen([sys.executable, "-c", code], env=graph.environment)
     graph.wait_for("drive", "another node publishes commands")
-    assert "joystick" in graph.log("drive")
+    graph.wait_for("drive", "has other publishers: /joystick")
 
 
 def test_missing_camera_is_named(graph, policy):
@@ -93,7 +91,7 @@ def test_large_best_effort_images_arrive_with_the_shipped_profile(graph, policy,
     assert graph.wait("simulate") == 0, graph.log("simulate")
     outcome = json.loads((tmp_path / "results.json").read_text())
     (episode,) = outcome["episodes"]
-    assert episode["reached_goal"] and commands_per_period(outcome, episode) >= 0.6
+    assert episode["reached_goal"] and commands_per_period(outcome, episode) >= 0.3
 
 
 @pytest.mark.parametrize("damage", ["missing", "hash"])

@@ -48,7 +48,7 @@ import json, sys, time, types
 import humble_stub
 humble_stub.install()
 import numpy as np
-from bridge import drive, guard, vehicle_node
+from bridge import commands, drive, guard, vehicle_node
 from bridge.controller import Controller
 from bridge.safety import SafetyConfig
 
@@ -57,7 +57,7 @@ class Policy:
     reset = lambda self: None
     step = lambda self, image: np.array([0.2, 0.1])
 
-vehicle_node.LOOK_PERIOD = 0.0
+vehicle_node.LOOK_PERIOD = commands.SETTLE = 0.0
 options = drive.parse_arguments(["policy", "--guard", "other", *sys.argv[1:]])
 node = humble_stub.Node("bridge_drive")
 kind = "TwistStamped" if "stamped" in options.image_topic else "Twist"

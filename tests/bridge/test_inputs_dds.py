@@ -51,8 +51,8 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
 def test_emergency_stop_that_falls_silent_while_driving_stops_and_needs_arming(graph, policy):
     robot = graph.peer("robot")
     beat = robot.whole()
-    graph.start("drive", policy)
-    robot.wait_for_status(driving=True)
+    graph.start("drive", policy, "--signal-age", 2)
+    robot.wait_until(lambda robot: robot.moving())
     beat.timer.cancel()
     robot.wait_for_status(state="disarmed", reason="emergency stop unknown")
     beat.timer.reset()
@@ -74,7 +74,7 @@ def test_vehicle_moves_only_while_the_dead_man_button_is_held(graph, policy):
     joy = robot.publisher("sensor_msgs/Joy", "joy")
     buttons = [0, 0, 0]
     timer = robot.repeat(joy, 0.05, lambda: message_type("sensor_msgs/Joy")(buttons=buttons))
-    graph.start("drive", policy, "--dead-man-button", 2)
+    graph.start("drive", policy, "--dead-man-button", 2, "--signal-age", 3)
     robot.wait_for_status(reason="dead-man button released", holds="['dead-man button released']")
     buttons[2] = 1
     robot.wait_for_status(driving=True)

@@ -6,6 +6,8 @@ import signal
 
 import pytest
 
+from benchmarks.bridge_robot import message_type
+
 
 def rows(path):
     with open(path, encoding="utf-8", newline="") as file:
@@ -28,18 +30,22 @@ def start(graph, commands, *options):
     return robot
 
 
-def test_replicates_are_driven_and_recorded_each_after_its_arming(graph, commands):
+def arm_again_and_again(robot):
+    """Arm each half second: a pause of a busy machine stops a replicate, which then begins again."""
+    arm = message_type("std_msgs/Empty")
+    return robot.repeat(robot.publisher("std_msgs/Empty", "bridge/rearm"), 0.5, arm)
+
+
+def test_replicates_are_driven_until_all_are_whole_and_recorded(graph, commands):
     robot = start(graph, commands, "--repeat", 2)
-    robot.arm()
-    robot.wait_for_status(reason="bring the vehicle back")
-    robot.arm()
+    arm_again_and_again(robot)
     assert graph.wait("manoeuvre") == 0, graph.log("manoeuvre")
     trials = commands.parent / "logs" / "trials"
     assert sorted(path.name for path in trials.iterdir()) == ["ahead_1", "ahead_2"]
     for trial in trials.iterdir():
         command, odometry = rows(trial / "command.csv"), rows(trial / "odometry.csv")
         assert max(row["v"] for row in command) == pytest.approx(0.4) and command[0]["v"] == command[-1]["v"] == 0
-        assert odometry[-1]["x"] == pytest.approx(0.4 * 1.5, abs=0.1)
+        assert odometry[-1]["x"] == pytest.approx(0.4 * 1.5, abs=0.25)
         first = next(row["t"] for row in command if row["v"])
         assert first > 0.5 and odometry[-1]["t"] - max(row["t"] for row in command if row["v"]) > 0.5
     sysid_log = pytest.importorskip("sysid.logs.log")
@@ -50,10 +56,8 @@ def test_a_drive_that_a_person_ends_is_put_aside_and_no_trial(graph, commands):
     commands.write_text("t,v,omega\n0,0.2,0\n8,0,0\n")
     robot = start(graph, commands)
     robot.arm()
-    robot.wait_until(lambda robot: robot.statuses[-1]["manoeuvre"]["elapsed"] is not None)
+    robot.wait_for_status(since=0, driving=True)
     collision = robot.publisher("std_msgs/Bool", "collision_sensor")
-    from benchmarks.bridge_robot import message_type
-
     robot.wait_until(lambda _: collision.get_subscription_count())
     graph.wait_for("manoeuvre", "driving")
     collision.publish(message_type("std_msgs/Bool")(data=True))

@@ -101,3 +101,32 @@ def test_a_person_who_takes_over_silences_the_manoeuvre():
     before = len(drive.sent)
     drive.run(0.3)
     assert len(drive.sent) == before and drive.player.aborted == 1
+
+
+def simulated(speed):
+    """A drive whose table counts in simulated time."""
+    drive = Drive()
+    drive.began = drive.now
+    drive.player.clock = lambda now: (now - drive.began) * speed
+    return drive
+
+
+def test_in_simulated_time_the_table_follows_the_clock():
+    drive = simulated(4.0)
+    drive.player.supervisor.arm()
+    drive.run(2, dt=0.0025)
+    times = [t for t, _, _ in drive.moving()]
+    assert drive.player.finished and times[-1] - times[0] == pytest.approx(0.5, abs=0.02)
+    assert np.all(np.diff(times) < 0.02)
+
+
+def test_simulated_time_that_stands_stops_the_vehicle_as_a_silent_camera_would():
+    drive = simulated(1.0)
+    drive.player.supervisor.arm()
+    drive.run(2)
+    stands = drive.player.clock(drive.now)
+    drive.player.clock = lambda _: stands
+    drive.run(0.2)
+    assert drive.player.aborted == 0
+    drive.run(0.2)
+    assert drive.player.aborted == 1 and drive.sent[-1][1:] == (0, 0)

@@ -12,7 +12,7 @@ from flax import struct
 
 from dreamer.config import DreamerConfig, preset
 from dreamer.spaces import Discrete
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from dreamer.types import FunctionalEnv, Transition
 
 SHAPE = (16, 16, 3)
@@ -30,7 +30,8 @@ def tiny_config(**overrides: Any) -> DreamerConfig:
 
 def train_without_end(config: DreamerConfig, out: Path) -> None:
     """Train in the corridor with a checkpoint after every iteration, until somebody ends it."""
-    train(corridor_env(4), config, out, 10**6, 0, progress=False, log_every_s=0.0, checkpoint_every_s=0.0)
+    options = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=0.0)
+    train(corridor_env(4), config, out, 10**6, 0, options)
 
 
 @struct.dataclass

@@ -4,6 +4,7 @@
     run_parallel.py process OUT PORT INDEX    one of two processes
 """
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -15,14 +16,14 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
 from dreamer_toys import corridor_env, tiny_config  # noqa: E402
 
 from dreamer import iteration, parallel, sensors  # noqa: E402
-from dreamer.train import _first_state, train  # noqa: E402
+from dreamer.train import TrainingOptions, _first_state, train  # noqa: E402
 
 # Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
 # two-hot critic are near 5e8, so that runs agree in what they learn but not in every digit.
 # Of 16 sequences each of the eight devices has two: what is merged with time lies in another order than on one device.
 CONFIG = tiny_config(batch_size=16, learning_starts=72, train_ratio=32.0, warmup=1)
 ENV = corridor_env(8)
-QUIET = dict(progress=False, log_every_s=1e9, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=1e9, checkpoint_every_s=1e9)
 
 
 def run(devices, iterations=9):
@@ -78,8 +79,8 @@ def one_of_two(out, port, index):
     jax.distributed.initialize(f"localhost:{port}", 2, index)
     assert jax.process_count() == 2 and len(jax.local_devices()) == 1
     folder, devices = out.parent / "run", jax.devices()
-    result = train(ENV, CONFIG, folder, 72, 0, devices=devices, eval_fn=lambda params, steps: {"x": float(index)},
-                   **QUIET)  # fmt: skip
+    run = dataclasses.replace(QUIET, devices=devices, eval_fn=lambda params, steps: {"x": float(index)})
+    result = train(ENV, CONFIG, folder, 72, 0, run)
     mesh = parallel.make_mesh(devices, ENV.num_envs, CONFIG.batch_size)
     again, _ = _first_state(ENV, CONFIG, folder, 0, True, mesh)  # what a second start would go on from
     assert len(again.replay.obs.sharding.device_set) == 2 and int(again.env_steps) == 72

@@ -14,11 +14,11 @@ from dreamer_toys import corridor_env, counting_env, tiny_config, train_without_
 from filelock import FileLock
 
 from dreamer import checkpoint, iteration
-from dreamer.train import evaluate, train
+from dreamer.train import TrainingOptions, evaluate, train
 
 ENV = corridor_env(4)
 CONFIG = tiny_config(lr=1e-3, train_ratio=64.0)
-QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
 
 
 def lines(out):
@@ -31,13 +31,13 @@ def assert_equal(a, b):
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    return train(ENV, CONFIG, tmp_path_factory.mktemp("learned"), 1200, 0, **{**QUIET, "log_every_s": 1.0})
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("learned"), 1200, 0, dataclasses.replace(QUIET, log_every_s=1.0))
 
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory):
     """An uninterrupted run of 400 steps."""
-    return train(ENV, CONFIG, tmp_path_factory.mktemp("straight"), 400, 0, **QUIET)
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("straight"), 400, 0, QUIET)
 
 
 def test_the_corridor_is_learned_to_its_best_return(learned):
@@ -98,8 +98,8 @@ def test_credit_buys_exactly_the_ratio(num_envs, ratio):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(straight, tmp_path):
-    train(ENV, CONFIG, tmp_path, 200, 0, **QUIET, tensorboard=True)
-    resumed = train(ENV, CONFIG, tmp_path, 400, 0, **QUIET, tensorboard=True)
+    train(ENV, CONFIG, tmp_path, 200, 0, dataclasses.replace(QUIET, tensorboard=True))
+    resumed = train(ENV, CONFIG, tmp_path, 400, 0, dataclasses.replace(QUIET, tensorboard=True))
     assert_equal(resumed.agent, straight.agent)
     drawn = curve(tmp_path / "tensorboard", "updates_per_env_step")
     logged = {line["env_steps"]: line["updates_per_env_step"] for line in lines(tmp_path)}
@@ -126,29 +126,27 @@ def curve(folder, name):
     return points
 
 
-KILLS = 10
-
-
-def test_a_run_killed_ten_times_gives_the_curve_and_the_state_of_an_uninterrupted_one(straight, tmp_path):
+@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.long)])
+def test_a_run_killed_again_and_again_gives_the_curve_and_the_state_of_an_uninterrupted_one(straight, tmp_path, kills):
     random, processes = Random(7), multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["dreamer.train"])  # each child starts with everything imported
 
     def newest():
         return max((int(path.name) for path in checkpoint.complete(tmp_path / "checkpoints")), default=0)
 
-    for kill in range(KILLS):
+    for kill in range(kills):
         wanted = newest() + ENV.num_envs * random.randint(1, 5)
         child = processes.Process(target=train_without_end, args=(CONFIG, tmp_path))
         child.start()
         deadline = time.monotonic() + 120
         while kill % 5 and child.is_alive() and newest() < wanted and time.monotonic() < deadline:
             time.sleep(0.01)
-        time.sleep(random.uniform(0.0, 0.03 if kill % 5 else 1.0))  # two of them fall wherever its start is by then
+        time.sleep(random.uniform(0.0, 0.03 if kill % 5 else 1.0))  # the first falls anywhere in its start
         child.kill()
         child.join()
         assert child.exitcode == -signal.SIGKILL, "it ended by itself"
     assert 0 < newest() < 400
-    train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+    train(ENV, CONFIG, tmp_path, 400, 0, QUIET)
     assert_equal(last_state(tmp_path), last_state(straight.out))
     assert [told(line) for line in lines(tmp_path)] == [told(line) for line in lines(straight.out)]
 
@@ -243,10 +241,10 @@ def test_another_seed_or_a_second_process_in_the_folder_of_a_run_is_refused(tmp_
     checkpoint.save(tmp_path / "checkpoints", {"a": np.zeros(3)}, CONFIG, 100)
     (tmp_path / "config.json").write_text(json.dumps({"seed": 0}))
     with pytest.raises(ValueError, match="begun with seed 0, not 1. Give that seed, or another folder"):
-        train(ENV, CONFIG, tmp_path, 400, 1, **QUIET)
+        train(ENV, CONFIG, tmp_path, 400, 1, QUIET)
     with FileLock(tmp_path / ".training.lock"):
         with pytest.raises(ValueError, match="another process trains there"):
-            train(ENV, CONFIG, tmp_path, 400, 0, **QUIET)
+            train(ENV, CONFIG, tmp_path, 400, 0, QUIET)
 
 
 @pytest.mark.quick

@@ -13,7 +13,7 @@ from dreamer.export import PolicyContract, export_policy
 from dreamer.gym import from_gym, read_actions, read_observations
 from dreamer.policy import Policy, of_agent, save
 from dreamer.spaces import Box, Discrete
-from dreamer.train import evaluate, train
+from dreamer.train import TrainingOptions, evaluate, train
 
 
 class Corridor(gymnasium.Env):
@@ -39,7 +39,7 @@ class Corridor(gymnasium.Env):
 
 
 CONFIG = tiny_config(lr=1e-3, train_ratio=64.0)
-QUIET = dict(progress=False, log_every_s=1.0, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=1.0, checkpoint_every_s=1e9)
 
 
 @pytest.mark.quick
@@ -99,8 +99,8 @@ def test_episodes_of_the_host_arrive_whole_and_begin_anew():
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gym")
-    train(from_gym(Corridor, 4), CONFIG, folder / "run", 400, 0, **QUIET)
-    return folder, train(from_gym(Corridor, 4), CONFIG, folder / "run", 1000, 0, **QUIET)  # resumed with new instances
+    train(from_gym(Corridor, 4), CONFIG, folder / "run", 400, 0, QUIET)
+    return folder, train(from_gym(Corridor, 4), CONFIG, folder / "run", 1000, 0, QUIET)  # resumed with new instances
 
 
 def test_an_environment_of_the_host_is_learned_also_across_a_resume(learned):

@@ -10,12 +10,12 @@ from dreamer_toys import corridor_env, tiny_config
 
 from dreamer import host_replay, replay
 from dreamer.rssm import Latent
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from dreamer.types import Transition
 
 ENV = corridor_env(4)
 CONFIG = tiny_config(replay_capacity=200)  # 50 rows: the ring turns over
-QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
 SHAPE = {"camera": (64, 64, 3), "speeds": (5,)}
 
 
@@ -64,11 +64,12 @@ def small_device(monkeypatch):
     monkeypatch.setattr(host_replay, "fits", lambda obs_bytes, device: obs_bytes < 50 * 4 * 16 * 16 * 3)
 
 
+@pytest.mark.long
 def test_a_run_on_too_small_a_device_goes_on_from_its_checkpoint_bit_for_bit(small_device, tmp_path, capsys):
-    straight = train(ENV, CONFIG, tmp_path / "straight", 300, 0, **QUIET)
+    straight = train(ENV, CONFIG, tmp_path / "straight", 300, 0, QUIET)
     assert "kept in the host's" in capsys.readouterr().err
-    train(ENV, CONFIG, tmp_path / "cut", 240, 0, **QUIET)
-    resumed = train(ENV, CONFIG, tmp_path / "cut", 300, 0, **QUIET)
+    train(ENV, CONFIG, tmp_path / "cut", 240, 0, QUIET)
+    resumed = train(ENV, CONFIG, tmp_path / "cut", 300, 0, QUIET)
     assert resumed.updates == straight.updates > 100
     assert_equal(resumed.agent, straight.agent)
 
@@ -83,4 +84,4 @@ def test_half_of_the_device_is_left_to_everything_else():
 
 def test_several_seeds_keep_their_memory_on_the_device(tmp_path):
     with pytest.raises(ValueError, match="belongs to one seed on one device"):
-        train(ENV, dataclasses.replace(CONFIG, replay_memory="host"), tmp_path, 8, (0, 1), **QUIET)
+        train(ENV, dataclasses.replace(CONFIG, replay_memory="host"), tmp_path, 8, (0, 1), QUIET)

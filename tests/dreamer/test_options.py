@@ -1,4 +1,4 @@
-"""Options that are off unless asked for: no decoder, and targets that only the decoder sees."""
+"""TrainingOptions that are off unless asked for: no decoder, and targets that only the decoder sees."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from dreamer.config import DreamerConfig
 from dreamer.iteration import init_state, train_iteration
 from dreamer.progress import Progress
 from dreamer.rssm import Latent
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 
 KEY = jax.random.PRNGKey(0)
 CONFIG = tiny_config()
@@ -108,14 +108,15 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due_and_leaves_the_run_
         traced.append(1)
         return sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(params))
 
-    quiet = dict(eval_every=32, progress=False, log_every_s=1e9)
-    plain = train(env, config, tmp_path / "plain", 64, 0, **quiet)
-    run = train(env, config, tmp_path / "ahead", 64, 0, **quiet,
-                eval_fn=lambda params, _: due.append(float(size(params))) or {},
-                eval_ahead=lambda params: ahead.append(float(size(params))))
+    quiet = TrainingOptions(eval_every=32, progress=False, log_every_s=1e9)
+    plain = train(env, config, tmp_path / "plain", 64, 0, quiet)
+    watched = dataclasses.replace(quiet, eval_fn=lambda params, _: due.append(float(size(params))) or {},
+                      eval_ahead=lambda params: ahead.append(float(size(params))))
+    run = train(env, config, tmp_path / "ahead", 64, 0, watched)
     assert len(traced) == len(ahead) == 1 and len(due) == 2
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(run.agent), jax.device_get(plain.agent))
-    train(env, config, tmp_path / "ahead", 64, 0, **quiet, eval_fn=lambda *_: {}, eval_ahead=ahead.append)
+    watched = dataclasses.replace(quiet, eval_fn=lambda *_: {}, eval_ahead=ahead.append)
+    train(env, config, tmp_path / "ahead", 64, 0, watched)
     assert len(ahead) == 1  # nothing is left to train
 
 
@@ -130,10 +131,13 @@ def test_training_goes_on_while_an_evaluation_waits_for_its_compilation(tmp_path
 
     def run(folder, **ahead):
         made = []
-        train(env, config, folder, 64, 0, eval_every=16, log_every_s=1e9, progress=False, **ahead,
-              eval_fn=lambda params, steps: made.append((steps, over.is_set())) or {
-                  "size": float(sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(params)))},
-              stop=lambda line: stopped_at.append(line["env_steps"]) or False)
+        options = TrainingOptions(
+            eval_every=16, log_every_s=1e9, progress=False, **ahead,
+            eval_fn=lambda params, steps: made.append((steps, over.is_set())) or {
+                "size": float(sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(params)))},
+            stop=lambda line: stopped_at.append(line["env_steps"]) or False,
+        )  # fmt: skip
+        train(env, config, folder, 64, 0, options)
         lines = [json.loads(text) for text in (folder / "metrics.jsonl").read_text().splitlines()]
         return made, [(line["env_steps"], line["eval/size"]) for line in lines]
 
@@ -151,7 +155,8 @@ def test_a_run_interrupted_again_while_it_evaluates_what_was_due_leaves_a_checkp
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(corridor_env(2), tiny_config(), tmp_path, 64, 0, eval_every=16, progress=False, eval_fn=interrupted)
+        options = TrainingOptions(eval_every=16, progress=False, eval_fn=interrupted)
+        train(corridor_env(2), tiny_config(), tmp_path, 64, 0, options)
     [kept] = checkpoint.complete(tmp_path / "checkpoints")
     assert kept.name == f"{16:012d}"
 
@@ -159,8 +164,8 @@ def test_a_run_interrupted_again_while_it_evaluates_what_was_due_leaves_a_checkp
 def test_evaluations_take_the_average(tmp_path):
     seen = []
     config = dataclasses.replace(CONFIG, average_rate=0.25)
-    run = train(corridor_env(2), config, tmp_path, 64, 0, eval_fn=lambda params, _: seen.append(params) or {},
-                progress=False)  # fmt: skip
+    options = TrainingOptions(eval_fn=lambda params, _: seen.append(params) or {}, progress=False)
+    run = train(corridor_env(2), config, tmp_path, 64, 0, options)
     jax.tree.map(np.testing.assert_array_equal, seen[-1], run.agent.average)
     changed = jax.tree.map(lambda a, b: bool((a != b).any()), run.agent.average, run.agent.params)
     assert any(jax.tree.leaves(changed))

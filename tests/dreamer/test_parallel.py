@@ -58,6 +58,7 @@ def test_what_the_whole_batch_tells_is_that_of_one_device(several):
     np.testing.assert_allclose(result["statistics_many"], result["statistics_alone"], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.long
 def test_two_processes_train_save_and_restore_like_one(several, tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -9,7 +9,7 @@ import pytest
 from dreamer_toys import choice_env, tiny_config
 
 from dreamer import checkpoint, iteration, pretrain, seeds
-from dreamer.train import train
+from dreamer.train import TrainingOptions, train
 from dreamer.types import Mirror
 
 
@@ -35,7 +35,7 @@ CONFIG = tiny_config(
     lr=2e-3, warmup=5, pretrain_steps=62, pretrain_updates=40, average_rate=0.1, learning_starts=64, train_ratio=16.0,
     vector_layers=1,
 )  # fmt: skip
-QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
 COUNTED = 24
 
 
@@ -54,14 +54,14 @@ def changed(a, b):
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory):
     """An uninterrupted run."""
-    return train(ENV, CONFIG, tmp_path_factory.mktemp("straight"), COUNTED, 0, **QUIET)
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("straight"), COUNTED, 0, QUIET)
 
 
 @pytest.fixture(scope="module")
 def pretrained(tmp_path_factory):
     """A run without a counted step: its first state, and what pretraining made of it."""
     first = jax.jit(lambda: iteration.init_state(ENV, CONFIG, 0))()
-    result = train(ENV, CONFIG, tmp_path_factory.mktemp("pretrained"), 0, 0, **QUIET)
+    result = train(ENV, CONFIG, tmp_path_factory.mktemp("pretrained"), 0, 0, QUIET)
     return first, checkpoint.restore(result.out / "checkpoints", first, CONFIG)[0], result
 
 
@@ -118,8 +118,8 @@ def halt(**at):
 def test_a_run_interrupted_in_each_phase_goes_on_bit_for_bit(straight, tmp_path):
     for at in (dict(pretrain_steps=20), dict(pretrain_updates=16), dict(pretrain_updates=40), dict(env_steps=8)):
         with pytest.raises(KeyboardInterrupt):
-            train(ENV, CONFIG, tmp_path, COUNTED, 0, on_metrics=halt(**at), **QUIET)
-    resumed = train(ENV, CONFIG, tmp_path, COUNTED, 0, **QUIET, tensorboard=True)
+            train(ENV, CONFIG, tmp_path, COUNTED, 0, dataclasses.replace(QUIET, on_metrics=halt(**at)))
+    resumed = train(ENV, CONFIG, tmp_path, COUNTED, 0, dataclasses.replace(QUIET, tensorboard=True))
     assert_equal(resumed.agent, straight.agent)
     whole, mine = lines(straight.out), lines(tmp_path)
     for name in ("env_steps", "pretrain_steps", "pretrain_updates", "pretrain/loss", "loss"):
@@ -132,10 +132,10 @@ def test_a_killed_pretraining_goes_on_from_its_last_checkpoint(straight, tmp_pat
             raise RuntimeError("killed")  # nothing is saved on the way out
 
     with pytest.raises(RuntimeError, match="killed"):
-        train(ENV, CONFIG, tmp_path, COUNTED, 0, **{**QUIET, "checkpoint_every_s": 0.0}, on_metrics=kill)
+        train(ENV, CONFIG, tmp_path, COUNTED, 0, dataclasses.replace(QUIET, checkpoint_every_s=0.0, on_metrics=kill))
     left = [path.name for path in checkpoint.complete(tmp_path / "checkpoints")]
     assert left == [f"{0:012d}.{64 + updates:012d}" for updates in (8, 16)]
-    resumed = train(ENV, CONFIG, tmp_path, COUNTED, 0, **{**QUIET, "checkpoint_every_s": 0.0})
+    resumed = train(ENV, CONFIG, tmp_path, COUNTED, 0, dataclasses.replace(QUIET, checkpoint_every_s=0.0))
     assert_equal(resumed.agent, straight.agent)
     assert [path.name for path in checkpoint.complete(tmp_path / "checkpoints")][-1] == f"{COUNTED:012d}"
 
@@ -149,8 +149,8 @@ def test_seeds_side_by_side_pretrain_as_each_alone_with_a_mirror_and_targets(tmp
         lr=2e-3, warmup=5, mirror=True, decode_only=("range",), pretrain_steps=20, pretrain_updates=3, steps_per_iter=4,
         vector_layers=1,
     )  # fmt: skip
-    both = train(env, config, tmp_path / "both", 0, (3, 5), **QUIET)
-    alone = train(env, config, tmp_path / "alone", 0, 5, **QUIET)
+    both = train(env, config, tmp_path / "both", 0, (3, 5), QUIET)
+    alone = train(env, config, tmp_path / "alone", 0, 5, QUIET)
     mine = seeds.pick(both.agent.params, 1)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), mine, alone.agent.params)
     first = jax.jit(lambda: iteration.init_state(env, config, 5))()

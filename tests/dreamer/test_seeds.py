@@ -1,5 +1,6 @@
 """Several seeds in one program are the runs of each seed alone."""
 
+import dataclasses
 import json
 
 import jax
@@ -9,12 +10,12 @@ from dreamer_toys import tiny_config
 
 from benchmarks import grid_env
 from dreamer import seeds
-from dreamer.train import evaluate, train
+from dreamer.train import TrainingOptions, evaluate, train
 
 ENV = grid_env.make(4)
 # Learning starts with the last of nine iterations: rounding, which grows with every update, has no time to.
 CONFIG = tiny_config(patch=4, train_ratio=16.0, learning_starts=36, warmup=1)
-QUIET = dict(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
+QUIET = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=1e9)
 SEEDS = (3, 5)
 
 
@@ -27,15 +28,15 @@ def runs(tmp_path_factory):
         result = evaluate(ENV, CONFIG, params, jax.random.PRNGKey(2), 6)
         return {f"return_{seed}": value for seed, value in zip(SEEDS, result["return"].mean(-1), strict=True)}
 
-    straight = train(ENV, CONFIG, folder / "a", 36, SEEDS, eval_fn=figures, **QUIET)
-    halted = train(ENV, CONFIG, folder / "b", 36, SEEDS, time_limit_s=0.0, **QUIET)
-    resumed = train(ENV, CONFIG, folder / "b", 36, SEEDS, **QUIET)
+    straight = train(ENV, CONFIG, folder / "a", 36, SEEDS, dataclasses.replace(QUIET, eval_fn=figures))
+    halted = train(ENV, CONFIG, folder / "b", 36, SEEDS, dataclasses.replace(QUIET, time_limit_s=0.0))
+    resumed = train(ENV, CONFIG, folder / "b", 36, SEEDS, QUIET)
     return straight, halted, resumed
 
 
 def test_two_seeds_side_by_side_are_the_two_runs_alone(runs, tmp_path):
     both = runs[0]
-    alone = train(ENV, CONFIG, tmp_path, 36, SEEDS[1], **QUIET)
+    alone = train(ENV, CONFIG, tmp_path, 36, SEEDS[1], QUIET)
     assert both.updates == alone.updates == 2
     mine = seeds.pick(both.agent.params, 1)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), mine, alone.agent.params)

@@ -13,7 +13,7 @@ from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
 from sysid.follow_up.tables import Table
-from sysid.follow_up.trust import beside_still_base, warnings
+from sysid.follow_up.trust import advice, as_good_as_repeats, beside_still_base, warnings
 from sysid.follow_up.unnamed import vehicle_of, with_start_angles
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
@@ -156,6 +156,7 @@ def test_an_effect_that_is_not_looked_for_is_not_named_but_missed(drives, slopin
         sloping.prepared.without(("slop",))
 
 
+@pytest.mark.long
 def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sloping):
     result = find_missing(drives["sloping"], (), replace(CONFIG, refit_nulls=4), reference=sloping.prepared)
     assert result.search.verdict == "named"
@@ -237,16 +238,38 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     if "slope.along_x" in values:
         low, high = values["slope.along_x"]["interval"]
         assert low - 0.01 < 0.03 < high + 0.01
-    before, alone, after = (read[key]["held_out"]["ground_truth"]["trajectory"] for key in ("before", "alone", "after"))
-    assert after < before and alone < before
-    page = (tmp_path / "report.html").read_text()
-    assert "named alone" in page and "refitted before" in page
+    before, refitted, alone, after = (read[key]["held_out"]["ground_truth"]["trajectory"]
+                                      for key in ("before", "refitted", "alone", "after"))
+    assert after < before and alone < refitted and after < refitted
+    shown = read["shown"]
+    assert shown["held_out"] and shown["errors"]["after"]["position"] < shown["errors"]["before"]["position"]
+    page, method = ((tmp_path / name).read_text() for name in ("report.html", "method.html"))
+    assert "<h1>Missing: " in page and "the vehicle as it was" in page and "refitted before" in method
+    assert "alpha" in method and "alpha" not in page  # thresholds have a page of their own
     assert all({"reference", "before", "after", "spread", "away", "unit"} <= set(row) for row in read["base"])
     assert read["manifest"]["sha256"]
     _, params, provenance = load_vehicle(tmp_path / "vehicle.toml")
     assert read["effects"][0]["name"] in [effect.name for effect in params.effects]
     assert provenance["verdict"] == "named"
     assert "<html" in (tmp_path / "report.html").read_text()
+
+
+def test_before_is_the_vehicle_as_it_was_and_no_parameter_of_it_moved(sloping):
+    trials = (*sloping.log.training, *sloping.log.held_out)
+    report = make_report(sloping)
+    as_it_was = replay(sloping, sloping.reference.params, trials)
+    errors = [score(trial, one)["ground_truth"].trajectory for trial, one in zip(trials, as_it_was, strict=True)
+              if trial.held_out]
+    assert report["before"]["held_out"]["ground_truth"]["trajectory"] == pytest.approx(np.mean(errors))
+
+
+def test_a_doubt_about_what_is_left_asks_for_nothing_where_drives_are_predicted_as_well_as_they_repeat(sloping):
+    limit = sloping.prepared.wander.excess_limit(CONFIG.thresholds.alpha)
+    search = replace(sloping.search, excess=(sloping.search.excess[0], 1.1 * limit))
+    doubtful = replace(sloping, search=search)
+    assert len(warnings(doubtful)) == 1 and advice(doubtful, True) == []
+    assert "Take the name as a hint" in advice(doubtful, False)[0]
+    assert as_good_as_repeats(np.array([0.01, 0.02]), 0.015) and not as_good_as_repeats(np.array([0.03, 0.04]), 0.015)
 
 
 def test_where_only_what_was_named_may_move_the_base_stays_as_it_was(sloping):

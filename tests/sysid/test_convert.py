@@ -550,3 +550,32 @@ def test_a_bag_with_the_states_of_a_chair_has_odometry(tmp_path, joystick):
     assert stream.x[-1] == pytest.approx(0.5 * (stream.t[-1] - 2.0), abs=0.01)
     assert stream.v[100] == pytest.approx(0.5, abs=1e-3) and abs(stream.omega).max() < 1e-3
     assert any("odometry from /whill/states/model_cr2" in note for note in notes)
+
+
+def with_imu(rate, end=21.0, topic="/imu/data"):
+    """Rows of a recording and those of a gyro at 100 Hz."""
+    def add(rows):
+        still = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        more = [(t + 0.03, topic, "sensor_msgs/msg/Imu", message(
+            "sensor_msgs/msg/Imu", header=header(T0 + t), orientation=still, orientation_covariance=np.zeros(9),
+            angular_velocity=vector(z=float(rate(t))), angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=vector(z=9.8), linear_acceleration_covariance=np.zeros(9)))
+            for t in np.arange(0.0, end, 0.01)]
+        return sorted([*rows, *more], key=lambda row: row[0])
+    return add
+
+
+def test_the_yaw_rate_of_an_imu_becomes_the_gyro_of_a_trial(tmp_path):
+    write_bag(tmp_path / "circle_1", edit=with_imu(lambda t: -motion(t)[1]))  # upside down
+    log, notes = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "out"))
+    (trial,) = log.trials
+    assert trial.gyro.turn[-1] == pytest.approx(6.0, abs=0.05)
+    assert any("imu from /imu/data" in note for note in notes)
+    assert any("its sign is changed" in note for note in log.notes)
+
+
+@pytest.mark.parametrize(("rate", "end"), [(lambda t: 200.0, 21.0), (lambda t: np.nan, 21.0), (lambda t: 0.0, 0.005)])
+def test_a_gyro_that_cannot_be_used_does_not_cost_the_drive(tmp_path, rate, end):
+    write_bag(tmp_path / "circle_1", edit=with_imu(rate, end))
+    log, notes = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "out"))
+    assert log.trials[0].gyro is None and any("left out" in note for note in notes)

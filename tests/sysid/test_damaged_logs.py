@@ -14,9 +14,14 @@ from test_convert import StoragePlugin, write_bag
 from test_models import ROBOT
 
 from sysid.design import load_subject
+from sysid.errors.features import CHANNELS
+from sysid.errors.noise import ROUGH, Whitener
+from sysid.logs import lerobot
+from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log, read_csv
 from sysid.logs.measured import load_drive, load_mrclam
 from sysid.logs.rosbag import read_bag
+from sysid.missing.fit_statistics import FitStatistics, Leftovers, load_fitted
 from sysid.pages.report import read_report, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, load, save
 from sysid.replay.mjcf_file import load_robot
@@ -178,3 +183,85 @@ def test_a_damaged_recording(tmp_path, suffix):
 def test_a_damaged_model_of_a_robot(tmp_path):
     path = tmp_path / "cart.xml"
     check(path, ROBOT.encode(), lambda: load_robot(path), 25)
+
+
+DRIVE = [(1.7e9 + 0.1 * k, 0.5 * (5 <= k < 25), 0.1 * (5 <= k < 25), 0.05 * min(max(k - 5, 0), 20)) for k in range(30)]
+TABLES = {
+    "cmd_vel.csv": "time,cmd_v,cmd_w\n" + "".join(f"{t:.1f},{v},{w}\n" for t, v, w, _ in DRIVE),
+    "odom.csv": "time,odom_x,odom_y,odom_yaw,odom_v,odom_w\n"
+                + "".join(f"{t:.1f},{x:.3f},0,0,{v},{w}\n" for t, v, w, x in DRIVE),
+    "mocap.tum": "".join(f"{t:.1f} {x:.3f} 0 0 0 0 0 1\n" for t, _, _, x in DRIVE),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_damaged_table_of_a_stranger(tmp_path, name):
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for one, text in TABLES.items():
+        (folder / one).write_text(text)
+
+    def read():
+        shutil.rmtree(tmp_path / "log", ignore_errors=True)
+        log, _ = convert(ConvertConfig(folder, tmp_path / "log"))
+        for trial in log.trials:
+            assert np.isfinite(trial.command.v).all() and (np.diff(trial.command.t) > 0).all()
+
+    path = folder / name
+    check(path, path.read_bytes(), read, 15)
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", "meta/tasks.parquet", "data/chunk-000/file-000.parquet"])
+def test_a_damaged_dataset_of_lerobot(dataset, tmp_path, name):
+    pytest.importorskip("pyarrow")
+    lerobot.write(tmp_path, load_log(dataset))
+
+    def read():
+        for _, table in lerobot.read(tmp_path).drives:
+            assert len({len(values) for values in table.columns.values()}) == 1
+
+    path = tmp_path / name
+    check(path, path.read_bytes(), read)
+
+
+def test_a_damaged_gyro_of_a_driving_log(dataset, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(dataset, folder)
+    path = folder / "trials" / "ahead_1" / "imu.csv"
+    check(path, b"t,gyro\n" + b"".join(b"%.2f,0.1\n" % (0.05 * k) for k in range(30)), lambda: load_log(folder), 30)
+
+
+@pytest.mark.parametrize("name", ["cart.urdf", "cart.xacro"])
+def test_a_damaged_description_of_a_robot(tmp_path, name):
+    path = tmp_path / name
+    inertial = '<inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    wheels = "".join(
+        f'<link name="{side}">{inertial}<collision><origin rpy="1.5708 0 0"/><geometry><cylinder radius="0.1" '
+        f'length="0.05"/></geometry></collision></link><joint name="{side}_wheel_joint" type="continuous"><parent '
+        f'link="base"/><child link="{side}"/><origin xyz="0 {y} 0"/><axis xyz="0 1 0"/></joint>'
+        for side, y in (("left", 0.25), ("right", -0.25)))
+    base = (f'<link name="base">{inertial}<collision><geometry><box size="0.6 0.3 0.1"/></geometry></collision>'
+            '<collision><origin xyz="0.3 0 -0.05"/><geometry><sphere radius="0.05"/></geometry></collision></link>')
+    macro = '<xacro:property name="r" value="${0.05 * 2}"/>' if name.endswith("xacro") else ""
+    top = ' xmlns:xacro="http://www.ros.org/wiki/xacro"' if macro else ""
+    check(path, f'<robot name="cart"{top}>{macro}{base}{wheels}</robot>'.encode(), lambda: load_robot(path), 6)
+
+
+def test_damaged_statistics_of_a_vehicle_file(tmp_path):
+    names, channels = ("body.mass", "body.iz"), len(CHANNELS)
+    whitener = Whitener(np.full(channels, 0.1), np.zeros((2, channels, channels)), np.eye(channels))
+    left = Leftovers(3, 0.5, CHANNELS, whitener, np.ones((len(ROUGH) + 1, channels)), 0.2)
+    table = FitStatistics(names, np.array([1.0, 2.0]), np.eye(2), left).as_table()
+    path = save_vehicle(tmp_path / "vehicle.toml", *preset("whill_cr_physical"), statistics=table)
+    text = path.read_text()
+    start = text.index("[statistics]")
+
+    def read():
+        path.write_bytes(text[:start].encode() + source.read_bytes())
+        vehicle = load_fitted(path)[1]
+        if vehicle.statistics is not None:
+            found = vehicle.statistics.covariance(names, np.ones(2))
+            assert np.isfinite(found).all()
+
+    source = tmp_path / "statistics"
+    check(source, text[start:].encode(), read)

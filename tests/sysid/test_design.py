@@ -219,6 +219,7 @@ def test_the_command_file_is_a_log_and_stays_in_the_room(whill):
         assert np.allclose(np.diff(columns["t"]), 0.1) and np.abs(columns["v"]).max() <= 0.6
         assert np.abs(columns["omega"]).max() <= 0.8 and columns["v"][:10].max() == 0.0
     page = (folder / "next.html").read_text()
+    assert "next: the uncertainty of" in page.partition("</header>")[0]
     assert "forward_slip.eta" in page and "path in the room" in page and 'href="http' not in page
 
 

@@ -14,6 +14,7 @@ from conftest import shared_folder
 
 import sysid
 import sysid.inspect as inspect_module
+from bridge.command_table import check_space, make_table, reach_of, read_commands
 from sysid.errors.space import make_space
 from sysid.inspect import InspectConfig, main
 from sysid.logs import replicates
@@ -24,6 +25,7 @@ from sysid.logs.metrics import ideal_replay
 from sysid.logs.next_drives import next_drives
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from sysid.search import thin
+from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR
 
@@ -271,8 +273,11 @@ def test_replicate_spread_is_the_deviation_between_drives():
     assert group.spread["ground_truth.x"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_command_writes_text_json_and_picture(tmp_path, capsys):
+def test_the_command_writes_page_text_json_and_picture(tmp_path, capsys):
     main(InspectConfig(CHAIR, out=tmp_path / "seen"))
+    page = (tmp_path / "seen" / "inspect.html").read_text()
+    assert "9 trials of differential-drive powered chair, 214 s: nothing looks wrong" in page.partition("</header>")[0]
+    assert "data:image/png" in page and "next_1.csv" in page
     printed = capsys.readouterr().out
     assert "What this log cannot determine" in printed and "figure_eight_1*" in printed
     found = json.loads((tmp_path / "seen" / "inspect.json").read_text())
@@ -358,15 +363,29 @@ def test_a_first_glance_passes_all_drives_with_the_same_commands():
     assert replicates.may_be_alike(first, second) and not replicates.may_be_alike(first, third)
 
 
-def test_the_next_drives_show_what_a_log_lacks_with_ramps_within_the_space():
+def lacking_turns():
     straight = log_of(trial_of(Command(np.arange(0.0, 9.0, 0.1), np.full(90, 0.3), np.zeros(90))))
-    blind = blind_spots(straight, {one.name: excitation(one) for one in straight.trials})
-    drives = next_drives(straight, blind, (3.0, 3.0), 0.4)
+    return straight, blind_spots(straight, {one.name: excitation(one) for one in straight.trials})
+
+
+def test_the_next_drives_show_what_a_log_lacks_with_ramps_within_the_space():
+    drives = next_drives(*lacking_turns(), (4.0, 4.0), 0.4)
     assert len(drives) == 3 and drives[0].why == "no turn" and np.ptp(drives[0].command.omega) > 0.2
     for drive in drives:
         command, dt = drive.command, np.diff(drive.command.t)
         assert max(abs(command.v).max(), abs(command.omega).max()) <= 0.8 and abs(command.v).max() <= 0.4
         assert (abs(np.diff(command.v)) <= 0.5 * dt + 1e-9).all() and (abs(np.diff(command.omega)) <= dt + 1e-9).all()
-        assert command.v[-1] == command.omega[-1] == command.v[0] == 0.0 and max(drive.size) < 3.0 * np.sqrt(2)
-    assert next_drives(straight, blind, (0.5, 0.5), 0.4) == [] or all(
-        max(one.size) < 0.5 for one in next_drives(straight, blind, (0.5, 0.5), 0.4))
+        assert command.v[-1] == command.omega[-1] == command.v[0] == 0.0 and max(drive.floor) <= 4.0
+    assert next_drives(*lacking_turns(), (1.0, 1.0), 0.4) == []
+
+
+@pytest.mark.parametrize("space", [(2.5, 2.5), (4.0, 4.0), (2.5, 7.0)])
+def test_the_bridge_takes_the_next_drives(tmp_path, space):
+    drives = next_drives(*lacking_turns(), space)
+    assert drives
+    for drive in drives:
+        write_csv(tmp_path / "next.csv", COMMAND_HEADER, drive.command.table)
+        table = make_table(read_commands(tmp_path / "next.csv"), (-0.6, -1.0), (0.6, 1.0), (1.0, 2.0))
+        reach = reach_of(table, drive.radius, 0.15)
+        check_space(reach, space)  # raises where it does not fit
+        assert (reach.length, reach.width) == pytest.approx(drive.floor, abs=0.05)

@@ -18,9 +18,9 @@ from sysid.pages import series as series_module
 from sysid.pages.fit_page import autocorrelation, choose, worse
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
-from sysid.pages.svg import Line, bar_chart, interval_bar, line_chart
 from sysid.replay.rollout import make_batch, predictions, simulate
 from whill_mjx.io.html import Cell, Section, html_page, number, png, table
+from whill_mjx.io.svg import Line, bar_chart, interval_bar, line_chart
 
 pytestmark = pytest.mark.quick
 
@@ -87,11 +87,13 @@ def run(tmp_path_factory, unicycle_log):
 
 
 def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run):
-    text = check(write_html(run).read_text())
+    page = write_html(run).read_text()
+    text, header = check(page), page.partition("</header>")[0]
     for word in ("Held-out trials: predicted, never fitted", "tau_v", "not told", "weigh it", "a note", "+1.00 turn",
                  "Fisher information", "0.02000", "2 of 3", "figure_eight_1 (held out)",
                  "sysid sources SHA-256", "toy & <co>"):
         assert word in text, word
+    assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and '<p class="lead">' in header
     report = read_report(run)
     assert report["dataset"]["sha256"] in text and report["code"]["sysid sources SHA-256"] in text
     assert not list(run.glob("*.tmp"))
@@ -171,8 +173,9 @@ def test_held_out_trials_and_other_manoeuvres_are_drawn_first():
 
 def test_text_is_escaped_and_titles_that_repeat_get_their_own_anchor():
     page = html_page("a < b", [Section("Same", table(["x"], [["<i>"], [Cell(0.5, "bad")], [None]])),
-                               Section("Same", "")])
+                               Section("Same", "")], kind="<b>", lead="x & <script>")
     check(page)
+    assert "<script>" not in page and "x &amp; &lt;script&gt;" in page and "&lt;b&gt;" in page
     assert "&lt;i&gt;" in page and 'class="n bad"' in page and page.count('id="same"') == 1
 
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 from random import Random
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from cart import cart
 from conftest import SHORT, TRUTH, unicycle_plant
+from warm_starter import Warm
 
 from sysid.fit import Arguments, main
 from sysid.logs.synthetic import write_dataset
@@ -81,23 +83,7 @@ def test_a_fit_stopped_at_random_steps_ends_in_the_same_bits(more, folder, tmp_p
         main(arguments(folder, broken, **more, iterations=5))
 
 
-def test_a_full_disk_at_the_end_keeps_what_was_computed(folder, tmp_path, monkeypatch):
-    quick = {"method": "lm", "iterations": 3, "elsewhere": False}
-
-    def full(*words):
-        raise OSError(28, "No space left on device", "report.json")
-
-    monkeypatch.setattr("sysid.pages.fit_report.write_report", full)
-    with pytest.raises(OSError) as failed:
-        main(arguments(folder, tmp_path / "run", **quick))
-    assert f"is in {tmp_path / 'run' / 'steps'}; the same command goes on there." in failed.value.__notes__[0]
-    monkeypatch.undo()
-    monkeypatch.setattr("sysid.search.least_squares._Descent.advanced", lambda *words: pytest.fail("computed again"))
-    main(arguments(folder, tmp_path / "run", **quick))
-    assert (tmp_path / "run" / "report.json").exists()
-
-
-LONG = {
+COMMANDS = {
     "fit": ["sysid.fit", "{log}", "--model", "{cart}", "--quick"],
     "vehicle": ["sysid.fit", "{chair}", "--quick"],
     "close_loop": ["sysid.close_loop", "{chair}", "--quick", "--refit-nulls", "20"],
@@ -105,58 +91,118 @@ LONG = {
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
-def command(which, folder, out):
+def words_of(which, folder, out):
     names = {"log": folder / "log", "cart": folder / "cart.py", "chair": ROOT / "sysid" / "data" / "chair"}
-    words = [word.format(**names) for word in LONG[which]]
-    return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, stdout=subprocess.DEVNULL,
-                            stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    return [*(word.format(**names) for word in COMMANDS[which]), "--out", str(out)]
+
+
+class Process(subprocess.Popen):
+    """`python -m MODULE WORDS` as users start it."""
+
+    def __init__(self, module, words, said, **options):
+        self.said = said
+        with said.open("w") as file:
+            super().__init__([sys.executable, "-m", module, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file,
+                             env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
 
 
 def kept_steps(out):
-    return len(list((out / "steps").glob("*.npz")))
+    return len(list((out / "steps").glob("[0-9]*.npz")))
 
 
-def report_of(out):
-    """The report without times."""
-    report = json.loads((out / "report.json").read_text())
-    report.pop("seconds", None)
-    report.get("search", {}).pop("seconds", None)
-    return report
+def check_whole(out):
+    """Every file with a final name can be read."""
+    for path in (one for one in out.rglob("[!.]*") if one.is_file()):
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".toml":
+            tomllib.loads(path.read_text())
+        elif path.suffix == ".npz":
+            with np.load(path) as archive:
+                assert [archive[name] for name in archive.files]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("which", LONG)
-def test_a_command_killed_ten_times_by_each_signal_ends_in_the_same_bits(which, folder, tmp_path):
-    straight, broken, random = tmp_path / "straight", tmp_path / "broken", Random(4)
-    child = command(which, folder, straight)
-    most = 0
-    while child.poll() is None:
-        most = max(most, kept_steps(straight))
-        time.sleep(0.1)
-    assert child.returncode == 0, child.stderr.read()
-    kills = [number for number in SIGNALS for _ in range(10)]
-    random.shuffle(kills)
-    for index, number in enumerate(kills):
-        child, wanted = command(which, folder, broken), (index + 1) * most // (len(kills) + 1)
+def files_of(out):
+    """Everything that a run wrote but pictures and locks, without the times that it took."""
+    found = {}
+    for path in sorted(one for one in out.rglob("[!.]*") if one.is_file() and one.suffix not in (".png", ".html")):
+        found[str(path.relative_to(out))] = path.read_bytes()
+        if path.name == "report.json":
+            report = json.loads(path.read_text())
+            report.pop("seconds", None)
+            report.get("search", {}).pop("seconds", None)
+            found[str(path.relative_to(out))] = report
+        elif path.suffix == ".npz":
+            with np.load(path) as archive:
+                found[str(path.relative_to(out))] = {name: archive[name].tobytes() for name in archive.files}
+    return found
+
+
+def killed_again_and_again(start, module, words, out, kills, most, seconds, said):
+    """Start a command and end it at a random moment, `kills` times with each signal; `most` and `seconds` are its steps
+    and its time when it is left alone."""
+    random = Random(4)
+    signals = [number for number in SIGNALS for _ in range(kills)]
+    random.shuffle(signals)
+    for index, number in enumerate(signals):
+        child, wanted = start(module, words, said), (index + 1) * most // (len(signals) + 1)
         if index % 3 == 0:
-            time.sleep(random.uniform(0.5, 8.0))  # some fall into its start
-        while index % 3 and child.poll() is None and kept_steps(broken) < wanted:
-            time.sleep(0.01)
-        before = kept_steps(broken)
-        child.send_signal(number)
-        told = child.communicate()[1]
-        assert child.returncode in ((-number, 0) if number == signal.SIGKILL else (130, 0)), told
-        assert "Traceback" not in told and kept_steps(broken) >= before
-    child = command(which, folder, broken)
-    assert child.communicate() and child.returncode == 0
-    assert report_of(broken) == report_of(straight)
-    name = "model.toml" if which == "fit" else "vehicle.toml"
-    assert (broken / name).read_bytes() == (straight / name).read_bytes()
+            time.sleep(random.uniform(0.0, seconds / 3))  # some fall into its start
+        while index % 3 and child.poll() is None and kept_steps(out) < wanted:
+            time.sleep(0.005)
+        before = kept_steps(out)
+        if (code := child.poll()) is None:
+            child.send_signal(number)
+            code = child.wait()
+        told = said.read_text()
+        assert code in ((-number, 0) if number == signal.SIGKILL else (130, 0)), told
+        assert "Traceback" not in told and (code == 0 or kept_steps(out) >= before)
+        assert code <= 0 or told.rstrip().endswith(f"({signal.Signals(number).name})"), told
+        check_whole(out)
+
+
+def left_alone(start, module, words, out, said):
+    """Steps and seconds of a command that nobody ends."""
+    began, child, most = time.monotonic(), start(module, words, said), 0
+    while (code := child.poll()) is None:
+        most = max(most, kept_steps(out))
+        time.sleep(0.02)
+    assert code == 0, said.read_text()
+    return most, time.monotonic() - began
+
+
+def test_a_fit_killed_three_times_by_each_signal_and_then_short_of_disk_ends_in_the_same_bits(folder, tmp_path):
+    said, other, outs = tmp_path / "said", tmp_path / "other", [tmp_path / name for name in ("straight", "broken")]
+    (module, *straight), (_, *words) = (words_of("fit", folder, out) for out in outs)
+    with Warm("sysid.fit", "sysid.pages.fit_report") as warm:
+        most, seconds = left_alone(warm.start, module, straight, outs[0], said)
+        killed_again_and_again(warm.start, module, words, outs[1], 3, most, seconds, said)
+        assert warm.start(module, words, said, largest=20_000).wait() == 1
+        told = said.read_text()
+        assert f"is in {outs[1] / 'steps'}; the same command goes on there." in told.splitlines()[-1], told
+        check_whole(outs[1])
+        child = warm.start(module, words, said)
+        while f'"pid": {child.pid},' not in (outs[1] / ".lock").read_text():
+            time.sleep(0.005)
+        if warm.start(module, words, other).wait() != 0:
+            assert f"process {child.pid} on " in other.read_text() and "writes there" in other.read_text()
+        assert child.wait() == 0 and files_of(outs[1]) == files_of(outs[0])
 
 
 @pytest.mark.long
-def test_two_fits_at_once_in_one_folder_give_one_fit_and_one_refusal(folder, tmp_path):
-    children = [command("fit", folder, tmp_path / "run") for _ in range(2)]
-    told = [child.communicate()[1] for child in children]
-    assert sorted(child.returncode for child in children) == [0, 2]
-    assert sum("writes there" in text for text in told) == 1
+@pytest.mark.parametrize("which", COMMANDS)
+def test_a_command_killed_ten_times_by_each_signal_ends_in_the_same_bits(which, folder, tmp_path):
+    said, outs = tmp_path / "said", [tmp_path / name for name in ("straight", "broken")]
+    (module, *straight), (_, *broken) = (words_of(which, folder, out) for out in outs)
+    most, seconds = left_alone(Process, module, straight, outs[0], said)
+    killed_again_and_again(Process, module, broken, outs[1], 10, most, seconds, said)
+    assert Process(module, broken, said).wait() == 0 and files_of(outs[1]) == files_of(outs[0])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("which", ["fit", "close_loop"])
+def test_two_commands_at_once_in_one_folder_give_one_result_and_one_refusal(which, folder, tmp_path):
+    module, *words = words_of(which, folder, tmp_path / "run")
+    children = [Process(module, words, tmp_path / f"said{k}") for k in range(2)]
+    assert sorted(child.wait() for child in children) == [0, 2]
+    assert sum("writes there" in child.said.read_text() for child in children) == 1

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from sysid import inspect as inspect_module
+from sysid.replay import xacro_text
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.mjcf_file import default_paths, load_robot
 from sysid.replay.robot_check import check_robot, describe_robot
+from sysid.replay.robot_files import expand_xacro
 
 pytestmark = pytest.mark.quick
 CYLINDER = '<cylinder radius="0.1" length="0.05"/>'
@@ -209,3 +211,14 @@ def test_motors_of_a_file_are_driven_by_the_host_with_their_own_limits(tmp_path)
     path.write_text(ROBOT.replace("<velocity", '<motor ctrlrange="-0.01 0.01"').replace(' kv="1"', ""))
     assert not drives(load_robot(path))[0]
     assert np.isfinite(check.rate)
+
+
+def test_a_xacro_file_whose_sums_never_end_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("xacro")
+    monkeypatch.setattr(xacro_text, "SECONDS", 1)
+    path = tmp_path / "robot.xacro"
+    for text, said in (("${10**10**10}", "it takes more than 1 s of processor time"), ("$(find nowhere)", "'nowhere'"),
+                       ("${().__class__}", "invalid name"), ("${[0] * 10**10}", "when evaluating")):
+        path.write_text(f'<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r"><link name="{text}"/></robot>')
+        with pytest.raises(ValueError, match=f"robot.xacro: xacro cannot expand it: .*{said}"):
+            expand_xacro(path)

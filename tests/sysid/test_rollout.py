@@ -88,6 +88,7 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
     np.testing.assert_allclose(found[1:], jax.jit(driven)(command), atol=1e-5)
 
 
+@pytest.mark.long
 def test_many_drives_side_by_side_are_those_of_a_few_and_so_are_their_derivatives():
     """Few are computed by one function, which XLA cannot compile for many."""
     from sysid.replay.rollout import IN_ONE, vehicle_plant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -119,6 +120,51 @@ def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):
     path.write_text("\n".join(lines))
     log, notes = convert(ConvertConfig(path, tmp_path / "log"))
     assert len(log.trials[0].odometry.t) == len(c["t"]) - 1 and any("dead reckoned" in note for note in notes)
+
+
+def clocked(c, t):
+    return {"time": t, "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]}
+
+
+@pytest.mark.parametrize("back", [0.5, 2.0])
+def test_a_clock_that_was_set_back_is_refused_and_rows_out_of_order_are_not(tmp_path, back):
+    c = columns()
+    t = c["t"].copy()
+    t[200:] -= back
+    with pytest.raises(ValueError, match=f"goes back by {back - 0.05:.2f} s after row 200 .9.9 s into it.*Cut"):
+        convert(ConvertConfig(write(tmp_path / "back.csv", clocked(c, t)), tmp_path / "log"))
+    rows = np.arange(len(t))
+    rows[[100, 101]] = rows[[101, 100]]
+    swapped = clocked({name: values[rows] for name, values in c.items()}, c["t"][rows])
+    log, _ = convert(ConvertConfig(write(tmp_path / "swapped.csv", swapped), tmp_path / "log"))
+    check(log.trials[0], pose=False)
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f"])
+def test_dates_and_times_of_day_are_times_also_past_midnight(tmp_path, form):
+    c = columns()
+    path = write(tmp_path / "drive.csv", clocked(c, c["t"]))
+    head, *rows = path.read_text().splitlines()
+    begin = datetime(2026, 1, 2, 23, 59, 55)
+    stamps = [(begin + timedelta(seconds=float(row.split(",")[0]))).strftime(form) for row in rows]
+    path.write_text("\n".join(["Recorded by a logger", "Robot: 7", head, *(
+        f"{stamp},{row.partition(',')[2]}" for stamp, row in zip(stamps, rows, strict=True))]))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log"))
+    check(log.trials[0], pose=False)
+    assert log.trials[0].duration == pytest.approx(c["t"][-1] - c["t"][0], abs=0.01)
+
+
+def test_one_bad_file_of_a_folder_does_not_keep_out_the_others(tmp_path):
+    for name in ("circle_1", "circle_2"):
+        c = columns(CHAIR[name])
+        write(tmp_path / "logs" / f"{name}.csv", clocked(c, c["t"]))
+    (tmp_path / "logs" / "notes.csv").write_text("who,what\nme,nothing\n")
+    c = columns(CHAIR["turn_1"])
+    write(tmp_path / "logs" / "turn_1.csv", clocked(c, np.where(c["t"] > 5, c["t"] - 3, c["t"])))
+    log, notes = convert(ConvertConfig(tmp_path / "logs", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1", "circle_2"]
+    left = [note for note in notes if note.startswith("left out")]
+    assert len(left) == 2 and "notes.csv" in left[0] and "turn_1: its time goes back" in left[1]
 
 
 def unnamed(c):

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer.export import flatten_weights, save_arrays
+from dreamer.train import TrainingOptions
 from whill_mjx.io.folders import claim_folder, whole_file
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.ppo_training import train_ppo
@@ -84,8 +85,8 @@ def main(options):
             time.sleep(0.02)  # so that a kill finds it at work
             return {"norm": float(jnp.linalg.norm(jax.tree.leaves(params)[-1]))}
 
-        params, *_ = train_ppo(half_lit_env(COUNT), TINY, options.out, ITERATIONS * each, options.seed, evaluate, each,
-                               checkpoint_every_s=0.0)  # fmt: skip
+        how = TrainingOptions(eval_fn=evaluate, eval_every=each, checkpoint_every_s=0.0, progress=False)
+        params, *_ = train_ppo(half_lit_env(COUNT), TINY, options.out, ITERATIONS * each, options.seed, how)
         with whole_file(options.out / "result.npz") as path:
             save_arrays(path, flatten_weights(params))
 

@@ -23,7 +23,7 @@ from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
-from whill_mjx.evaluation.rollouts import CHANNELS, rollout
+from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
 from whill_mjx.io.video import write_h264
@@ -216,7 +216,9 @@ def test_sweeps_are_read_and_bad_ones_refused():
     for text, message in (
         ("wind=1", "unknown axis"), ("wing.span=1", "no effect"), ("body.colour=1", "no parameter"),
         ("light=", "no axis"),
-        ("light=-1", "not negative"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"), ("light=a", "could not"),
+        ("light=-1", "light is -1.0; it must lie within 0 to 100"), ("light=0:1:1001", "more than 1000"),
+        ("latency_s=99", "within 0 to 10"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
+        ("light=a", "could not"),
         ("light=1 light=2", "twice"), ("light=1 start_y=1 start_x=1", "one or two"), ("", "0 axes"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
@@ -280,7 +282,8 @@ def swerving():
 
     driver = Driver("swerving", begin, lambda turn, state, image, key: (turn, jnp.stack([1.0, turn])))
     keys = jax.random.split(jax.random.key(5), 8)
-    recorded = jax.jit(lambda params: rollout(course.env, params, keys, driver, frames=True))(course.vehicles(keys))
+    view = View(frames=True)
+    recorded = jax.jit(lambda params: rollout(course.env, params, keys, driver, view=view))(course.vehicles(keys))
     whole = jax.device_get(recorded)
     episodes = Episodes(whole.trace, whole.ends, whole.scene, keys, course.env.model.config.control_dt)
     return course, episodes, whole.frames

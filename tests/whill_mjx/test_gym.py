@@ -187,6 +187,16 @@ def test_options_that_are_no_dict_are_refused():
         condition_of([1])
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize(("name", "value"), [
+    ("light", -1), ("light", 1e9), ("start_x", float("nan")), ("start_y", "0.2"), ("start_yaw_deg", 1e6),
+    ("obstacle_x", True), ("start_x", 10**400),
+])  # fmt: skip
+def test_an_option_out_of_its_range_is_refused_by_name_and_value(name, value):
+    with pytest.raises(ValueError, match=f"reset: option {name} is .* it must"):
+        kinds.condition_of({name: value})
+
+
 
 def test_options_are_those_that_an_episode_can_begin_with():
     assert "start_yaw_deg" in kinds.OPTIONS and "latency" not in kinds.OPTIONS

@@ -239,7 +239,7 @@ def test_a_vehicle_in_a_map_sees_it_and_stops_at_its_walls(tmp_path):
 
 def test_the_command_writes_a_picture_and_the_walls(tmp_path):
     (tmp_path / "town.osm").write_text(OSM.format(NODES))
-    command = [sys.executable, "-m", "whill_mjx.maps", "import"]
+    command = [sys.executable, "-m", "whill_mjx.maps"]
     done = subprocess.run([*command, "town.osm", "--out", "scene"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and "walls: 8 straight ones" in done.stdout, done.stderr
     assert (tmp_path / "scene.png").stat().st_size > 1000

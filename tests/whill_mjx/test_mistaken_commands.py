@@ -7,7 +7,7 @@ import shlex
 import marker_seeker
 import pytest
 
-from whill_mjx import drive, evaluate, export_mjcf, look
+from whill_mjx import drive, evaluate, export_mjcf, export_python, look, view
 from whill_mjx.io import command_line
 
 pytestmark = pytest.mark.quick
@@ -15,6 +15,8 @@ COMMANDS = {
     "look": (look.Look, look.main, True),
     "drive": (drive.DriveOptions, drive.drive_and_say, False),
     "export_mjcf": (export_mjcf.Options, export_mjcf.main, True),
+    "export_python": (export_python.Options, export_python.main, True),
+    "view": (view.ViewOptions, view.main, False),
     "evaluate": (evaluate.EvaluateOptions, evaluate.main, False),
 }
 
@@ -31,6 +33,7 @@ def mistaken(command, words, capsys):
 
 @pytest.mark.parametrize("command, words, told", [
     ("look", "--scene nope", "unknown scene 'nope' (known: corridor, "),
+    ("look", "--scene task.py", "--scene task.py: a task in a file is named too. Give task.py:CLASS."),
     ("look", "--layout nope", "--layout nope: unknown (known: randomised, fixed)"),
     ("look", "--worlds 0", "--worlds 0: must be at least 1"),
     ("look", "--steps 0", "--steps 0: must be at least 1"),
@@ -61,6 +64,19 @@ def mistaken(command, words, capsys):
     ("export_mjcf", "nope.toml", "nope.toml: no such vehicle file"),
     ("export_mjcf", "whill_cr --out file", "--out file: exists already"),
     ("export_mjcf", "whill_cr --out file/new", "file is a file, not a folder"),
+    ("export_python", "whill_cr --physics-dt nan", "--physics-dt nan: must be at least 0.0001"),
+    ("export_python", "nope", "unknown vehicle 'nope'"),
+    ("export_python", "whill_cr --out vehicle.txt", "--out vehicle.txt: must be a file that ends in .py"),
+    ("export_python", "whill_cr --out folder.py", "--out folder.py: must be a file that ends in .py"),
+    ("export_python", "whill_cr --out file/new.py", "file is a file, not a folder"),
+    ("view", "", "RUN: none is given"),
+    ("view", "nowhere", "RUN nowhere: no such folder"),
+    ("view", "file", "RUN file: no such folder"),
+    ("view", "empty", "RUN empty: holds no run"),
+    ("view", "training --out file", "--out file: must be a file that ends in .html"),
+    ("view", "training --out file/new.html", "file is a file, not a folder"),
+    ("view", "training --embed-mb -1", "--embed-mb -1.0: must be at least 0"),
+    ("view", "training --serve --port 70000", "--port 70000: must be at least 0 and at most 65535"),
     ("evaluate", "nowhere", "nowhere"),
     ("evaluate", "planner --task nope", "--task nope: unknown (known: corridor, "),
     ("evaluate", "planner --episodes 0", "--episodes 0: must be at least 1"),
@@ -81,6 +97,9 @@ def mistaken(command, words, capsys):
     ("evaluate", "planner --sweep light=0:1:0", "light=0:1:0"),
     ("evaluate", "planner --sweep light=0:1:-4", "light=0:1:-4"),
     ("evaluate", "planner --sweep light=nan", "light=nan"),
+    ("evaluate", "planner --sweep light=0:1:1000000000", "1000000000 values are more than 1000"),
+    ("evaluate", "planner --sweep start_x=1e300", "start_x is 1e+300"),
+    ("evaluate", "planner --task task.py", "--task task.py: a task in a file is named too. Give task.py:CLASS."),
     ("evaluate", "planner --sweep yaw_scrub.nope=1", "no parameter 'nope'"),
     ("evaluate", "planner --sweep vehicle=whill_cr,nope", "unknown vehicle 'nope'"),
     ("evaluate", "planner --baselines nope", "'nope' is not NAME=VALUE"),
@@ -94,6 +113,8 @@ def test_a_mistake_ends_with_one_line_and_code_2(command, words, told, tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.png").mkdir()
+    (tmp_path / "folder.py").mkdir()
+    (tmp_path / "empty").mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "report.html").write_text("mine")
     (tmp_path / "training").mkdir()

@@ -115,9 +115,12 @@ def test_a_fault_of_the_program_keeps_its_traceback():
         run(Options, fail, None, args=[])
 
 
-def started(body, **options):
-    """A process that runs this as its command's `main`, when it has said that it has begun."""
-    text = textwrap.dedent("""
+def started(body, first="", before=(), **options):
+    """A process that runs this as its command's `main`, when it has said that it has begun.
+
+    `first` comes before its imports; `before` are the words of a program that starts it.
+    """
+    text = textwrap.dedent(first) + textwrap.dedent("""
         import sys, time
         from dataclasses import dataclass
         from whill_mjx.io.command_line import run
@@ -129,7 +132,8 @@ def started(body, **options):
         if __name__ == "__main__":
             run(Options, main, None, stopped="stopped; go on so.", args=[])
         """).format(body=textwrap.indent(textwrap.dedent(body), "    "))  # fmt: skip
-    child = subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    words = [*before, "-c", text] if before else [sys.executable, "-c", text]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                              cwd=Path(__file__).parents[2], **options)  # fmt: skip
     assert child.stdout.readline() == "begun\n", child.stderr.read()
     return child
@@ -181,6 +185,36 @@ def test_a_signal_ends_the_process_where_no_handler_can(body, tmp_path):
     after = tmp_path / "after"
     assert ended(started(body.format(after=after)), signal.SIGINT) == (130, "stopped; go on so. (SIGINT)")
     assert not after.exists()
+
+
+def test_a_signal_that_is_ignored_stays_so(tmp_path):
+    """As of nohup, and of a job in the background of a script, which Ctrl-C is not meant for."""
+    after = tmp_path / "after"
+    body = f"""
+        print("begun", flush=True); sys.stdin.readline()
+        open({str(after)!r}, "w").close()
+        """
+    ignoring = [sys.executable, "-c", "import os, signal, sys\n"
+                "for number in (signal.SIGINT, signal.SIGHUP):\n    signal.signal(number, signal.SIG_IGN)\n"
+                "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"]  # fmt: skip
+    child = started(body, before=ignoring, stdin=subprocess.PIPE)
+    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.SIGHUP)
+    assert child.communicate("\n", timeout=60)[1] == "" and child.returncode == 0 and after.exists()
+
+
+def test_a_signal_to_a_forked_child_ends_the_child_alone():
+    child = started("""
+        import os, signal
+        pid = os.fork()
+        if pid == 0:
+            time.sleep(60)
+        print("begun", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM, sep="\\n", flush=True)
+        """, first="""
+        import os, signal
+        os.register_at_fork(after_in_child=lambda: os.kill(os.getpid(), signal.SIGTERM))  # it comes before all else
+        """)  # fmt: skip
+    assert child.stdout.read() == "True\n" and child.wait() == 0 and not child.stderr.read()
 
 
 def test_output_that_nobody_reads_ends_the_command_quietly():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from half_lit import TINY, half_lit_env
 
+from dreamer.train import TrainingOptions
 from whill_mjx.learning.ppo import (
     Network,
     PpoConfig,
@@ -25,6 +26,8 @@ from whill_mjx.learning.ppo import (
     track,
 )
 from whill_mjx.learning.ppo_training import train_ppo
+
+QUIET = TrainingOptions(progress=False)
 
 
 def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
@@ -134,7 +137,8 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
         return {"spread": float(spread(params))}
 
     each = 4 * TINY.rollout
-    train_ppo(env, TINY, tmp_path, 2 * each, 0, evaluate, each, eval_ahead=True)
+    ahead = lambda params: evaluate(params, 0)  # noqa: E731
+    train_ppo(env, TINY, tmp_path, 2 * each, 0, TrainingOptions(evaluate, ahead, each, progress=False))
     assert len(traced) == 1 and asked == [0, each, 2 * each]
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)
@@ -147,7 +151,8 @@ def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp
         def figures(params, env_steps):
             return {"norm": float(jnp.linalg.norm(jax.tree.leaves(params)[-1]))}
 
-        return train_ppo(env, TINY, tmp_path / out, 6 * each, 0, figures, each, stop)
+        return train_ppo(env, TINY, tmp_path / out, 6 * each, 0,
+                         TrainingOptions(figures, eval_every=each, stop=stop, checkpoint_every_s=60.0, progress=False))
 
     def lines(out):
         text = (tmp_path / out / "metrics.jsonl").read_text()
@@ -174,9 +179,9 @@ def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
     from dreamer.checkpoint import CheckpointError
 
     env, each = half_lit_env(4), 4 * TINY.rollout
-    train_ppo(env, TINY, tmp_path, each, 0)
+    train_ppo(env, TINY, tmp_path, each, 0, QUIET)
     with pytest.raises(CheckpointError, match="lr: saved 0.003, now 0.1"):
-        train_ppo(env, dataclasses.replace(TINY, lr=0.1), tmp_path, 2 * each, 0)
+        train_ppo(env, dataclasses.replace(TINY, lr=0.1), tmp_path, 2 * each, 0, QUIET)
 
 
 @pytest.mark.quick

@@ -15,7 +15,7 @@ from whill_mjx.env import Env, reset_state
 from whill_mjx.evaluation.conditions import Condition
 from whill_mjx.evaluation.drivers import Driver, replay_driver
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
-from whill_mjx.evaluation.rollouts import CHANNELS, Rollout, rollout
+from whill_mjx.evaluation.rollouts import CHANNELS, Rollout, View, rollout
 from whill_mjx.look import top_view
 from whill_mjx.vehicle.dynamics import place
 from whill_mjx.vehicle.types import VehicleParams
@@ -108,7 +108,7 @@ class Course:
         """One episode per key; see `rollout` for the arguments."""
         params = self.vehicles(keys) if params is None else params
         late = 0 if condition is None else int(np.round(np.max(np.asarray(condition.latency))))
-        run = self._rollout(driver, sight, late, frames=False)
+        run = self._rollout(driver, View(sight, late))
         size = -(-len(keys) // -(-len(keys) // self.batch))  # parts of one size, so that one program serves all
         parts = []
         for begin in range(0, len(keys), size):
@@ -126,7 +126,7 @@ class Course:
         """
         keys, actions = episodes.keys, _actions(episodes)
         params, memory = self.vehicles(keys), (jnp.asarray(actions), jnp.zeros(len(keys), jnp.int32))
-        run = self._rollout(_REPLAY, "open", 0, frames=True)
+        run = self._rollout(_REPLAY, View(frames=True))
         frames = jax.device_get(run(params, keys, None, memory).frames)
 
         def view(params: VehicleParams, key: jax.Array, scene: Any, row: jax.Array) -> jax.Array:
@@ -156,13 +156,12 @@ class Course:
         memory = (jnp.asarray(np.roll(_actions(sighted), 1, axis=0)), jnp.zeros(len(keys), jnp.int32))
         return self.drive(_REPLAY, keys, memory=memory)
 
-    def _rollout(self, driver: Driver, sight: str, late: int, frames: bool) -> Callable[..., Rollout]:
-        name = (driver, sight, late, frames)
+    def _rollout(self, driver: Driver, view: View) -> Callable[..., Rollout]:
+        name = (driver, view)
         if name not in self._compiled:
 
             def run(params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
-                return rollout(self.env, params, keys, driver, condition, sight=sight, max_latency=late, memory=memory,
-                               frames=frames)
+                return rollout(self.env, params, keys, driver, condition, view=view, memory=memory)
 
             self._compiled[name] = jax.jit(run)
         return self._compiled[name]

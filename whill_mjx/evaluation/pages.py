@@ -216,7 +216,10 @@ def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], o
     sections += [html.Section("Videos", moving)] if videos else []
     device = " ".join(dict.fromkeys(evaluation["device"].split(": ")))
     subtitle = f"{first['episodes']} episodes with each driver; computed on {device}"
-    write_whole(out, html.html_page(f"Evaluation of {evaluation['policy']} in the task {task}", sections, subtitle))
+    main_name = next(iter(drivers))
+    lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
+    title = f"Evaluation of {evaluation['policy']} in the task {task}"
+    write_whole(out, html.html_page(title, sections, subtitle, kind="Evaluation", lead=lead))
     return out
 
 
@@ -229,9 +232,7 @@ def _figures(drivers: dict[str, Any]) -> str:
             row += [_shown(name, figures[name]), html.Cell(_interval(name, figures[f"{name}_interval_95"]), "i")]
         rows.append(row)
     header = ["figure", *(text for name in drivers for text in (_driver(name), "95 % interval"))]
-    main_name = next(iter(drivers))
-    lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
-    return html.paragraph(lead, "lead") + html.table(header, rows)
+    return html.table(header, rows)
 
 
 def _meanings(first: dict[str, Any]) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from whill_mjx.io.folders import whole_file
+from whill_mjx.io.reading import read_lines
 
 
 def reward_curve(
@@ -22,7 +22,7 @@ def reward_curve(
         action_repeat: control periods of a step; the axis says so.
     """
     plt = _pyplot()
-    lines = [json.loads(line) for line in metrics.read_text().splitlines()]
+    lines = [line for _, line in read_lines(metrics)]
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
     for name, label, style in (("episode/return", "training episodes", "-"), ("eval/return", "evaluation", "o-")):
         points = [(line["env_steps"], line[name]) for line in lines if name in line]

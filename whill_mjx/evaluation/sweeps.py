@@ -21,10 +21,13 @@ from whill_mjx.evaluation.conditions import NAMES, Condition, nominal
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures
 from whill_mjx.evaluation.intervals import wilson_interval
+from whill_mjx.io.fields import CONDITION, check
 from whill_mjx.world.randomize import check_parameter, with_parameter
 
 CONDITIONS = tuple(name for name in NAMES if name != "latency") + ("latency_s",)
 PATHS_KEPT = 40
+MOST = 1000
+"""Values of an axis."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,8 @@ def _parse_axis(text: str) -> Axis:
     try:
         if ":" in values:
             low, high, count = values.split(":")
+            if int(count) > MOST:
+                raise ValueError(f"{count} values are more than {MOST}")
             numbers = np.linspace(float(low.removesuffix("x")), float(high.removesuffix("x")), int(count))
         else:
             if any(part.endswith("x") != relative for part in parts):
@@ -104,8 +109,10 @@ def _parse_axis(text: str) -> Axis:
         raise ValueError(f"{text!r}: {error}; write NAME=a,b,c or NAME=low:high:count.") from error
     if not numbers.size:
         raise ValueError(f"{text!r}: has no value; write NAME=a,b,c or NAME=low:high:count.")
-    if not np.isfinite(numbers).all() or (name in ("light", "latency_s") and numbers.min() < 0):
-        raise ValueError(f"{text!r}: values must be finite, and light and latency_s not negative.")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{text!r}: values must be finite.")
+    for value in (numbers.min(), numbers.max()) if name in CONDITION else ():
+        check(f"{text!r}", CONDITION[name], value)
     return Axis(name, tuple(float(np.round(number, 9)) for number in numbers), relative)
 
 

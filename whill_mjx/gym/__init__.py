@@ -96,7 +96,15 @@ class WhillEnv(gymnasium.Env):
         return self._shown(time_step), _info(time_step.metrics)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One environment step; RuntimeError before the first `reset`."""
+        """One environment step.
+
+        Args:
+            action: (2,) normalised speed and yaw rate, each in [-1, 1].
+
+        Raises:
+            RuntimeError: before the first `reset`.
+            ValueError: an action of another shape.
+        """
         if self._state is None:
             raise RuntimeError("step was called before reset; call reset() first.")
         action = np.asarray(action, np.float32)

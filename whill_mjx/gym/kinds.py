@@ -7,8 +7,6 @@ first environment of a kind compiles, every other one is ready at once.
 from __future__ import annotations
 
 import dataclasses
-import math
-import numbers
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ import numpy as np
 from whill_mjx.batch import BatchEnv, BatchState, make_batch
 from whill_mjx.env import POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, begin_under, nominal
+from whill_mjx.io.fields import CONDITION, check
 from whill_mjx.vehicle.types import TimeStep
 
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
@@ -184,7 +183,7 @@ def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
     """The condition that `reset(options=...)` asks for; None where it asks for nothing.
 
     Raises:
-        ValueError: an unknown option, or a value that is no finite number.
+        ValueError: an unknown option, or a value that is no number or out of its range.
     """
     if not options:
         return None
@@ -194,8 +193,7 @@ def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
         if name not in OPTIONS:
             raise ValueError(f"reset has no option {name!r} (known: {', '.join(OPTIONS)}). Correct the name, or leave "
                              "it out.")
-        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
-            raise ValueError(f"option {name} is {value!r}; it must be a finite number. Correct it.")
+        check("reset", CONDITION[name], value, f"option {name}")
     return dataclasses.replace(nominal(), **{name: jnp.asarray(value, float) for name, value in options.items()})
 
 

@@ -182,6 +182,14 @@ def guarded(stopped: str = STOPPED) -> Iterator[None]:
         _stop_listening()
 
 
+def starts(module: str) -> bool:
+    """Whether this process was started for a module, given as its `__name__`: by `python -m`, or as its console script,
+    whose name is that of the module, such as sysid-close-loop. A command asks before its slow imports."""
+    package, _, name = module.partition(".")
+    script = f"{package.removesuffix('_mjx')}-{name}".replace("_", "-")
+    return module == "__main__" or os.path.basename(sys.argv[0] if sys.argv else "") == script
+
+
 def program() -> str:
     """This command as it is typed: `python -m MODULE`, or the name of the console script."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
@@ -234,6 +242,8 @@ class _State:
     before: dict[int, Any] = {}
     """Handlers that were there before."""
     wakeup: tuple[int, int] | None = None
+    held: Any = None
+    """Mask of signals before a fork that is under way."""
     leaving = threading.Lock()
 
 
@@ -249,8 +259,8 @@ def listen() -> None:
     os.set_blocking(writer, False)
     for number in SIGNALS:
         before = signal.getsignal(number)
-        if number == getattr(signal, "SIGHUP", None) and before == signal.SIG_IGN:
-            continue  # nohup
+        if before == signal.SIG_IGN:
+            continue  # of nohup, or of a job that a script put into the background: Ctrl-C is not meant for it
         _State.before[number] = before
         signal.signal(number, _interrupt)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -310,13 +320,26 @@ def _stop_listening() -> None:
     _State.before, _State.wakeup = {}, None
 
 
+def _hold_signals() -> None:
+    """Before a fork: a signal to the child must not come through the pipe that it shares with this process."""
+    if _State.wakeup is not None:
+        _State.held = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+
+
+def _let_signals_come() -> None:
+    if _State.held is not None:
+        held, _State.held = _State.held, None
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
+
+
 def _forget() -> None:
     """A forked child has handlers of its own."""
     if _State.wakeup is not None:
         signal.set_wakeup_fd(-1)
         for number in _State.before:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-        _State.wakeup = None
+        _State.before, _State.wakeup = {}, None
+    _let_signals_come()
 
 
-os.register_at_fork(after_in_child=_forget)
+os.register_at_fork(before=_hold_signals, after_in_parent=_let_signals_come, after_in_child=_forget)

@@ -18,6 +18,7 @@ import numpy as np
 LONGEST_TEXT = 400  # characters of a name or a description
 SHOWN = 60  # characters of a value in an error
 SPEED = 20.0  # m/s and rad/s; more is km/h, mm/s or deg/s
+DAY = 86_400.0  # s that a trial may last: replays and grids take memory by the second
 REMEDY = "Correct it, in SI units."
 
 
@@ -112,6 +113,11 @@ def check_fields(where: str, fields: Iterable[Field], holder: Any) -> None:
         value = getattr(holder, field.name, None)
         if value is not None or (field.needed and hasattr(holder, field.name)):
             check(where, field, value)
+
+
+def counted(count: int, what: str) -> str:
+    """A number of things in words: "1 row", "3 rows"."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def shown(value: Any) -> str:
@@ -293,13 +299,14 @@ DATASET = (
 """dataset.toml of a driving log."""
 
 COLUMNS = {field.name: field for field in (
-    Field("t", "s", -1e7, 1e7, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
+    Field("t", "s", -DAY, DAY, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
                                       "divide milli- or nanoseconds."),
     Field("x", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("y", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),
     Field("v", "m/s", -SPEED, SPEED, remedy="Convert it to m/s: is it in km/h or mm/s?"),
     Field("omega", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
+    Field("gyro", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),
 )}  # fmt: skip
 """Columns of the CSV files of a driving log."""
 
@@ -327,6 +334,9 @@ TASK = (
     Field("step_reward", "-", -1e9, 1e9),
     Field("smoothness_gain", "s/rad", -1e9, 1e9),
     Field("layout", kind="text"),
+    Field("people", kind="whole", low=0, high=200, needed=False),
+    Field("people_within", "m", 0.5, 1e3, needed=False),
+    Field("yielding", "-", 0.0, 1.0, needed=False),
     Field("gates", kind="whole", low=0, high=2),
     Field("goal_x", "m", -1e3, 1e3),
     Field("gate_x", "m", -1e3, 1e3, kind="numbers", count=2),
@@ -348,5 +358,14 @@ BATCH = (
     Field("count", kind="whole", low=1, high=10**7),
     Field("spread", "-", 0.0, 2.0, remedy="It is a relative standard deviation; use for example 0.1."),
 )
+CONDITION = {field.name: field for field in (
+    *(Field(name, "m", -1e4, 1e4) for name in ("obstacle_x", "obstacle_y", "obstacle_shift_y", "start_x", "start_y")),
+    Field("start_yaw_deg", "deg", -360.0, 360.0),
+    Field("light", "-", 0.0, 100.0, remedy="It is a factor; 1 changes nothing."),
+    *(Field(f"camera_{axis}", "m", -10.0, 10.0) for axis in "xyz"),
+    *(Field(f"camera_{angle}_deg", "deg", -180.0, 180.0) for angle in ("pitch", "yaw")),
+    Field("latency_s", "s", 0.0, 10.0),
+)}  # fmt: skip
+"""What a sweep and `reset(options=...)` change of an episode."""
 TIMES = (Field("control_dt", "s", 1e-6, 10.0), Field("physics_dt", "s", 1e-6, 10.0))
 """Arguments of `make_env`, of `make_batch`, and the time steps of `VehicleConfig`."""

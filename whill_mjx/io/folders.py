@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from whill_mjx.io.command_line import WRITING, OptionError
+from whill_mjx.io.reading import read_json
 
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
@@ -179,13 +180,13 @@ def read_identity(out: Path, kind: str) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path, "missing.", "")
         there, identity = found["kind"], dict(found["identity"])
     except (ValueError, KeyError, TypeError):
         raise FolderRefused(f"--out {out}: {path} does not say which run this is: it is damaged, or of an earlier "
                             "version. Choose another --out.") from None
     if there != kind:
-        raise FolderRefused(f"--out {out}: holds results of {there}, not of {kind}. Choose another --out.")
+        raise FolderRefused(f"--out {out}: holds results of {_short(there)}, not of {kind}. Choose another --out.")
     return {"kind": there, "identity": identity}
 
 
@@ -228,7 +229,7 @@ def _owner(out: Path) -> str:
     try:
         owner = json.loads((out / LOCK_FILE).read_text())
         return f"process {owner['pid']} on {owner['host']}, since {owner['since']},"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "another process"
 
 

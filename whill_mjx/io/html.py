@@ -1,6 +1,7 @@
-"""Self-contained HTML pages: no external style, script, font or picture.
+"""Self-contained HTML pages of one look: no external style, script, font or picture.
 
-A report is a list of sections; any module can make its own and hand them to `html_page`.
+A report is a list of sections; any module can make its own and hand them to `html_page`, which puts the header that all
+reports share above them. Pages can be printed, and read on a telephone.
 """
 
 from __future__ import annotations
@@ -13,20 +14,30 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
+from whill_mjx import __version__
+
 STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.5 system-ui, sans-serif; color: #1b1b1b; background: #fff; margin: 0 auto; max-width: 1160px;
-       padding: 1.2rem 1.4rem 4rem; }
-h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem;
+       padding: 0 1.4rem 2rem; overflow-wrap: anywhere; }
+header { border-top: .3rem solid #1f6fb4; padding: .7rem 0 .6rem; border-bottom: 1px solid #d5d5d5; }
+header .kind { font-size: .8rem; letter-spacing: .04em; text-transform: uppercase; color: #1f5f9f; font-weight: 600;
+               margin: 0 0 .3rem; max-width: none; }
+header .kind span { float: right; color: #6a6a6a; font-weight: 400; }
+footer { border-top: 1px solid #d5d5d5; margin-top: 3rem; padding-top: .5rem; font-size: .84rem; color: #6a6a6a; }
+h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 .2rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem;
      border-bottom: 1px solid #d5d5d5; padding-bottom: .2rem; } h3 { font-size: 1rem; margin: 1.2rem 0 .4rem; }
-nav { font-size: .88rem; margin: .6rem 0 0; } nav a { margin-right: 1rem; color: #1f5f9f; }
-p { max-width: 62rem; margin: .5rem 0; } .lead { font-size: 1.05rem; } .dim { color: #6a6a6a; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: .86rem; margin: .5rem 0; }
+nav { font-size: .88rem; margin: .6rem 0 0; } nav a { margin-right: 1rem; color: #1f5f9f; display: inline-block; }
+p { max-width: 62rem; margin: .5rem 0; } .lead { font-size: 1.1rem; margin: .4rem 0; } .dim { color: #6a6a6a; }
+.scroll { overflow-x: auto; overflow-wrap: normal; }
+table { border-collapse: collapse; font-size: .86rem; margin: .5rem 0; }
 th, td { padding: .18rem .6rem; border-bottom: 1px solid #e6e6e6; text-align: left; vertical-align: middle; }
 th { font-weight: 600; border-bottom: 1px solid #9a9a9a; white-space: nowrap; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; } th.n { text-align: right; }
-caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; }
+caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; max-width: min(62rem, calc(100vw - 1.7rem)); }
 td.i { white-space: nowrap; }
+td.differs { background: #fff3d1; } td.differs:first-child { border-left: .25rem solid #e0a014; }
+details { margin: .6rem 0; } summary { cursor: pointer; color: #1f5f9f; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
 figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img, video { max-width: 100%; }
@@ -34,9 +45,17 @@ code { font-size: .84rem; overflow-wrap: anywhere; }
 svg.chart { max-width: 100%; height: auto; background: #fff; } svg text { fill: #333; font-family: inherit; }
 svg .title { font-size: 11.5px; font-weight: 600; } svg .label { font-size: 11px; } svg .tick { font-size: 10px; }
 svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opacity: .13; }
-.legend span { margin-right: 1.1rem; font-size: .84rem; white-space: nowrap; }
+.legend span { margin-right: 1.1rem; font-size: .84rem; display: inline-block; }
 .legend i { display: inline-block; width: 1.1rem; height: .2rem; margin-right: .35rem; vertical-align: middle; }
-@media print { nav { display: none; } h2 { break-after: avoid; } }
+@media (max-width: 640px) { body { font-size: 14px; padding: 0 .8rem 1.5rem; } h1 { font-size: 1.25rem; }
+  h2 { font-size: 1.1rem; margin-top: 1.6rem; } .charts { display: block; } .charts svg { width: 100%; }
+  nav a { padding: .25rem 0; } th, td { padding: .25rem .4rem; } figure { margin: .4rem 0; }
+  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } }
+@media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
+  nav, video { display: none; }
+  h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }
+  table { font-size: 8pt; } a { color: inherit; text-decoration: none; } th { white-space: normal; }
+  .legend { break-after: avoid; } }
 """
 
 
@@ -58,17 +77,32 @@ class Cell:
     html: bool = False
 
 
-def html_page(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
-    """A whole page: heading, links to the sections, sections."""
+def html_page(
+    title: str, sections: Sequence[Section], subtitle: str = "", *, kind: str = "Report", lead: str = "",
+    head: str = "",
+) -> str:
+    """A whole page: the header of all reports, links to the sections, sections.
+
+    Args:
+        title: what this page is about.
+        sections: its parts.
+        subtitle: where the content comes from.
+        kind: of the report, such as "Fit"; stands above the title.
+        lead: what the page means, in one sentence; empty where the first section begins with it.
+        head: more for the head of the page; HTML.
+    """
     anchors = _anchors([section.title for section in sections])
     links = "".join(f'<a href="#{anchor}">{escape(section.title)}</a>'
                     for anchor, section in zip(anchors, sections, strict=True))
     parts = "".join(f'<section id="{anchor}"><h2>{escape(section.title)}</h2>{section.body}</section>\n'
                     for anchor, section in zip(anchors, sections, strict=True))
+    means = f'<p class="lead">{escape(lead)}</p>' if lead else ""
+    below = f'<p class="dim">{escape(subtitle)}</p>' if subtitle else ""
     return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f'<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>'
-            f'<p class="dim">{escape(subtitle)}</p><nav>{links}</nav>\n{parts}</body></html>\n')
+            f'{head}<style>{STYLE}</style></head><body><header><p class="kind"><span>whill-mjx</span>'
+            f'{escape(kind)}</p><h1>{escape(title)}</h1>{means}{below}'
+            f"<nav>{links}</nav></header>\n{parts}<footer>Made by whill-mjx {__version__}.</footer></body></html>\n")
 
 
 def paragraph(text: str, style: str = "") -> str:

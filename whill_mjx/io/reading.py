@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from whill_mjx.io.fields import Field, check, shown
+from whill_mjx.io.fields import Field, check, counted, shown
 
 MB = 1_000_000
 TOML_BYTES = MB // 2  # a vehicle file has 5 kB
 JSON_BYTES = 20 * MB  # a report of a long log has 1 MB
+LOG_BYTES = 60 * MB  # metrics of a long training have 1 MB
 CSV_BYTES = 60 * MB  # a day at 10 Hz, three hours at 100 Hz
 ARRAY_BYTES = 100 * MB  # of a .npz or .gz when unpacked
 MEMBERS = 20_000  # arrays of a .npz
@@ -115,6 +116,32 @@ def read_json(path: str | Path, missing: str, hint: str) -> dict[str, Any]:
     return content
 
 
+def read_lines(path: str | Path) -> list[tuple[str, dict[str, float]]]:
+    """Text and content of each line of a training's metrics.jsonl; empty where there is no such file.
+
+    A line that a kill has cut off, or that is no object of numbers with `env_steps`, is left out.
+    """
+    found = []
+    data = read_bytes(path, LOG_BYTES, "missing") if Path(path).is_file() else b""
+    for text in data.decode("utf-8", errors="replace").splitlines():
+        try:
+            line = json.loads(text)
+        except (ValueError, RecursionError):
+            continue
+        whole = isinstance(line, dict) and math.isfinite(_plain_number(line.get("env_steps")))
+        if whole and all(isinstance(value, int | float) for value in line.values()):
+            found.append((text, line))
+    return found
+
+
+def _plain_number(value: Any) -> float:
+    """A number as a float; nan for what is none, or too large to be one."""
+    try:
+        return float(value) if isinstance(value, int | float) else math.nan
+    except OverflowError:
+        return math.nan
+
+
 def read_csv(path: str | Path, fields: Sequence[Field], missing: str, see: str = "") -> dict[str, np.ndarray]:
     """Columns (T,) of a CSV file by name, and "line" (T,), the line of each row in the file; blank lines do not count.
 
@@ -144,8 +171,9 @@ def read_csv(path: str | Path, fields: Sequence[Field], missing: str, see: str =
             raise
         lines.append(line)
     if len(lines) < 2:
-        raise ValueError(f"{path}: {len(lines)} rows of data; at least 2 are needed. Delete the empty file or record "
-                         "it again.")
+        rows_there = counted(len(lines), "row")
+        raise ValueError(f"{path}: {rows_there} of data; at least 2 are needed. Delete the empty file or record it "
+                         "again.")
     table = np.frombuffer(values).reshape(len(lines), len(fields))
     found = {field.name: table[:, column].copy() for column, field in enumerate(fields)}
     for field in fields:

@@ -11,6 +11,7 @@ import numpy as np
 
 from dreamer import checkpoint, parallel
 from whill_mjx.io.heartbeat import say
+from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.setup import Preset
 from whill_mjx.logs.dataset import write_json
 
@@ -60,7 +61,7 @@ def read_best(out: Path) -> dict[str, float] | None:
         saved = json.loads(path.read_text(encoding="utf-8"))
         return {**saved, **{name: float(saved[name]) for name in ("success", "return")},
                 "env_steps": int(saved["env_steps"])}  # fmt: skip
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         say(f"{path}: is damaged and left aside; the best evaluation before it is not known.")
         return None
 
@@ -77,8 +78,12 @@ class Stopper:
         path = self._out / "stopped.json"
         if self._success is None or not path.is_file():
             return planned
-        saved = json.loads(path.read_text())
-        return min(planned, int(saved["env_steps"])) if saved["success"] == self._success else planned
+        try:
+            saved = json.loads(path.read_text(encoding="utf-8"))
+            return min(planned, int(saved["env_steps"])) if saved["success"] == self._success else planned
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            say(f"{path}: is damaged and left aside; the training goes on to its last step.")
+            return planned
 
     def __call__(self, line: dict[str, float]) -> bool:
         """Whether the run ends after this line."""
@@ -99,8 +104,9 @@ class Stopper:
     def _good_before(self, env_steps: float) -> int:
         """Good evaluations in a row at the end of what an earlier start has logged: a resumed run ends alike."""
         path, good = self._out / "metrics.jsonl", 0
-        for text in path.read_text().splitlines() if path.is_file() and self._success is not None else []:
-            line = json.loads(text)
+        if self._success is None:
+            return 0
+        for _, line in read_lines(path):
             if "eval/success" in line and line["env_steps"] < env_steps:
                 good = good + 1 if line["eval/success"] >= self._success else 0
         return good

@@ -46,7 +46,9 @@ def write_index(out: Path, evaluation: dict[str, Any], task: str) -> Path:
     sections.append(html.Section("Files", html.links(files)))
     title = f"Training in the task {task.replace('_', ' ')}"
     subtitle = f"the policy of environment step {evaluation['env_steps']}"
-    write_whole(out / INDEX, html.html_page(title, sections, subtitle))
+    policy = evaluation["policy"]
+    lead = f"The policy succeeds in {policy['success']:.0%} of {policy['episodes']} unseen episodes."
+    write_whole(out / INDEX, html.html_page(title, sections, subtitle, kind="Training", lead=lead))
     return out / INDEX
 
 
@@ -74,11 +76,8 @@ def _result(out: Path, evaluation: dict[str, Any]) -> str:
         rows.append([DRIVERS[name], f"{one['success']:.0%}", f"{low:.0%} to {high:.0%}", f"{one['collision']:.0%}",
                      f"{one['timeout']:.0%}", "–" if seconds is None else f"{seconds:.1f} s", one["return"]])
     header = ["driver", "success", "95 % interval", "collision", "time-out", "time to the goal", "return"]
-    policy = evaluation["policy"]
-    lead = f"The policy succeeds in {policy['success']:.0%} of {policy['episodes']} unseen episodes."
     command = f"python -m whill_mjx.evaluate {out / 'policy'} --html"
-    return (html.paragraph(lead, "lead") + html.table(header, rows)
-            + html.paragraph(f"More episodes, proofs of sight and sweeps: {command}", "dim"))
+    return html.table(header, rows) + html.paragraph(f"More episodes, proofs of sight and sweeps: {command}", "dim")
 
 
 def _shown(names: list[str]) -> str:

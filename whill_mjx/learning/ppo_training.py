@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from dreamer import checkpoint
 from dreamer.progress import Progress
+from dreamer.train import TrainingOptions, in_thread
 from whill_mjx.io.folders import write_whole
+from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
 
 SHOWN = ("success", "return")
@@ -27,17 +27,10 @@ def train_ppo(
     out: Path,
     total_steps: int,
     seed: int,
-    eval_fn: Callable[[Any, int], dict[str, float]] | None = None,
-    eval_every: int = 10_000,
-    stop: Callable[[dict[str, float]], bool] | None = None,
-    say: Callable[[str], None] = lambda text: None,
-    eval_ahead: bool = False,
-    checkpoint_every_s: float = 60.0,
+    options: TrainingOptions = TrainingOptions(),  # noqa: B008
     last_step: int | None = None,
-    announce: Callable[[str], None] = lambda text: None,
-    progress: bool = False,
 ) -> tuple[Any, int, int, float]:
-    """Train until `total_steps` environment steps, summed over instances, are done, or until `stop` says so.
+    """Train until `total_steps` environment steps, summed over instances, are done, or until `options.stop` says so.
 
     A run that was interrupted goes on from its last checkpoint in `out`, as if nothing had happened.
 
@@ -47,77 +40,106 @@ def train_ppo(
         out: folder that gets metrics.jsonl and checkpoints/.
         total_steps: rounded up to whole rollouts; a resumed run must get the same, since its learning rate spans them.
         seed: of everything random.
-        eval_fn: (params, env_steps) -> figures, logged as eval/...
-        eval_every: environment steps between evaluations; one more happens at the end.
-        stop: called with every line that holds an evaluation; True ends the run.
-        say: gets a line for each evaluation.
-        eval_ahead: call `eval_fn` once in a thread at the start, so that it is compiled beside the run's own program.
-            Not with several devices.
-        checkpoint_every_s: time between checkpoints [s]; one more is written at the end.
+        options: intervals, evaluation and callbacks, as for the other learner. A line is logged at each evaluation.
         last_step: environment step at which an earlier start of this run was stopped; none trains them all.
-        announce: gets a line when something begins that takes long.
-        progress: show a bar on stderr.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
     """
     out.mkdir(parents=True, exist_ok=True)
-    each, updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
-    iterations = -(-total_steps // each)
-    last = iterations if last_step is None else min(iterations, -(-last_step // each))
-    announce("compiling the training program, usually 1 to 2 minutes")
-    state, wall_before = _first_state(env, config, out, iterations, seed)
-    done, began = int(state.updates), time.monotonic()
-    logged = done * each // eval_every
-    _keep_lines(out / "metrics.jsonl", done * each)
-    ready = _ahead(eval_fn, state.params) if eval_ahead and eval_fn is not None and done < last else []
-    run = jax.jit(lambda state: iterate(env, config, iterations, state), donate_argnums=0)
-    saved_at = time.monotonic()
-
-    def wall_s() -> float:
-        return wall_before + time.monotonic() - began
-
-    def save() -> None:
-        checkpoint.save(out / "checkpoints", state, config, int(state.updates) * each, wall_s())
-
-    def due(done: int) -> bool:
-        return done == last or done * each // eval_every > logged
-
-    def evaluated(metrics: dict[str, Any]) -> dict[str, float]:
-        line = _line(jax.device_get(metrics), done * each, done * updates_each)
-        line["wall_s"] = wall_s()
-        if eval_fn is not None:
-            wait(ready)
-            line |= {f"eval/{name}": value for name, value in eval_fn(state.params, done * each).items()}
-        with (out / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        say(f"{done * each} steps: " + ", ".join(f"{name} {line[name]:.3g}" for name in line if "eval/" in name))
-        return line
-
-    stopped, running, bar = False, None, Progress(iterations * each, done * each, progress)
+    run = _Run(env, config, out, total_steps, options)
+    run.begin(seed, last_step)
     try:
-        while done < last and not stopped:
-            state, metrics = run(state)
-            done += 1
-            if progress:
-                jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
-                bar.show(done * each, {})
-            running = metrics
-            if due(done):
-                line = evaluated(metrics)
-                bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
-                logged = done * each // eval_every
-                stopped = stop is not None and stop(line)
-            if done == last or stopped or time.monotonic() - saved_at >= checkpoint_every_s:
-                save()
-                saved_at = time.monotonic()
+        run.go_on()
     except KeyboardInterrupt:
-        if checkpoint.is_whole(state) and not due(int(state.updates)):
-            save()  # an evaluation that is due would be missing from the run that goes on from here
+        run.interrupted()
         raise
     finally:
-        bar.close()
-    return state.params, done * each, done * updates_each, wall_s()
+        run.bar.close()
+    return run.state.params, run.env_steps, run.updates, run.wall_s()
+
+
+class _Run:
+    """One call of `train_ppo`: the state, what is counted, and when the next evaluation is due."""
+
+    def __init__(self, env: Any, config: PpoConfig, out: Path, total_steps: int, options: TrainingOptions) -> None:
+        self.env, self.config, self.out, self.options = env, config, out, options
+        self.each, self.updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
+        self.iterations = -(-total_steps // self.each)
+
+    def begin(self, seed: int, last_step: int | None) -> None:
+        """Restore or make the state, and prepare the program of an iteration."""
+        options = self.options
+        self.last = self.iterations if last_step is None else min(self.iterations, -(-last_step // self.each))
+        options.announce("compiling the training program, usually 1 to 2 minutes")
+        self.state, self.wall_before = _first_state(self.env, self.config, self.out, self.iterations, seed)
+        self.done, self.began = int(self.state.updates), time.monotonic()
+        self.logged = self.env_steps // options.eval_every
+        _keep_lines(self.out / "metrics.jsonl", self.env_steps)
+        early = options.eval_ahead if self.done < self.last else None
+        self.ready = [] if early is None else [in_thread(early, self.state.params)]
+        self.run = jax.jit(lambda state: iterate(self.env, self.config, self.iterations, state), donate_argnums=0)
+        self.saved_at = time.monotonic()
+        self.bar = Progress(self.iterations * self.each, self.env_steps, options.progress)
+
+    @property
+    def env_steps(self) -> int:
+        """Control steps so far, summed over instances."""
+        return self.done * self.each
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps so far."""
+        return self.done * self.updates_each
+
+    def wall_s(self) -> float:
+        """Time of the run [s], all its parts together."""
+        return self.wall_before + time.monotonic() - self.began
+
+    def go_on(self) -> None:
+        """Iterate to the end."""
+        stopped, running = False, None
+        while self.done < self.last and not stopped:
+            self.state, metrics = self.run(self.state)
+            self.done += 1
+            if self.options.progress:
+                jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
+                self.bar.show(self.env_steps, {})
+            running = metrics
+            if self._due(self.done):
+                line = self._evaluated(metrics)
+                self.bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
+                self.logged = self.env_steps // self.options.eval_every
+                stopped = self.options.stop is not None and self.options.stop(line)
+            if self.done == self.last or stopped or time.monotonic() - self.saved_at >= self.options.checkpoint_every_s:
+                self._save()
+                self.saved_at = time.monotonic()
+
+    def interrupted(self) -> None:
+        """Keep what is done; an evaluation that is due would be missing from the run that goes on from here."""
+        if checkpoint.is_whole(self.state) and not self._due(int(self.state.updates)):
+            self._save()
+
+    def _due(self, done: int) -> bool:
+        return done == self.last or done * self.each // self.options.eval_every > self.logged
+
+    def _save(self) -> None:
+        steps = int(self.state.updates) * self.each
+        checkpoint.save(self.out / "checkpoints", self.state, self.config, steps, self.wall_s())
+
+    def _evaluated(self, metrics: dict[str, Any]) -> dict[str, float]:
+        """The line of an evaluation, written to the log."""
+        line = _line(jax.device_get(metrics), self.env_steps, self.updates)
+        line["wall_s"] = self.wall_s()
+        if self.options.eval_fn is not None:
+            wait(self.ready)
+            figures = self.options.eval_fn(self.state.params, self.env_steps)
+            line |= {f"eval/{name}": value for name, value in figures.items()}
+        with (self.out / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        if self.options.on_metrics is not None:
+            self.options.on_metrics(line)
+        return line
 
 
 def _first_state(env: Any, config: PpoConfig, out: Path, iterations: int, seed: int) -> tuple[PpoState, float]:
@@ -129,22 +151,8 @@ def _first_state(env: Any, config: PpoConfig, out: Path, iterations: int, seed: 
 
 def _keep_lines(path: Path, env_steps: int) -> None:
     """Drop the lines of a log that a resumed run is about to write again, and one that a kill has cut off."""
-    kept = []
-    for text in path.read_text().splitlines() if path.exists() else []:
-        try:
-            if json.loads(text)["env_steps"] <= env_steps:
-                kept.append(text)
-        except (ValueError, KeyError, TypeError):
-            continue
+    kept = [text for text, line in read_lines(path) if line["env_steps"] <= env_steps]
     write_whole(path, "".join(text + "\n" for text in kept))
-
-
-def _ahead(eval_fn: Callable[[Any, int], Any], params: Any) -> list[Future]:
-    """An evaluation in a thread, with a copy of the parameters: the run's own are donated."""
-    threads = ThreadPoolExecutor(1)
-    ready = [threads.submit(eval_fn, jax.tree.map(jnp.copy, params), 0)]
-    threads.shutdown(wait=False)
-    return ready
 
 
 def _line(metrics: dict[str, Any], env_steps: int, updates: int) -> dict[str, float]:

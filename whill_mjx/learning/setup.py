@@ -104,42 +104,9 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
         if key not in PRESETS or not isinstance(one, Budget):
             raise ValueError(f"task {chosen.name!r}: budgets has {key!r}: {one!r}; it needs a Budget by the name of a "
                              f"preset ({', '.join(PRESETS)}). Correct it.")
-    budget = chosen.budgets.get(name, chosen.budgets.get("paper") if name == "transfer" else None)
-    if budget is None and name == "smoke":
-        budget = Budget(400, eval_every=200)
-    if budget is None and steps is None:
-        has = f"it has some for {', '.join(chosen.budgets)}" if chosen.budgets else "it has none at all"
-        raise ValueError(f"task {chosen.name!r} has no budget for the preset {name!r} ({has}). Give --steps, or add "
-                         f"{name!r} to its budgets.")
-    budget = budget or Budget(steps or 0)
+    budget = _budget(chosen, name, steps)
     chosen = _changed(chosen, budget.fields, f"task {chosen.name!r}: budget {name!r}")
-    match name:
-        case "paper" | "transfer":
-            learner = learner_preset(
-                "size12m", lr=1.5e-4, entropy_scale=1e-3, replay_capacity=250_000, average_rate=0.002,
-                greedy_share=0.25, decode_only=(TRUTH,),
-            )  # fmt: skip
-            preset = Preset(chosen, learner, budget.steps, eval_episodes=200)
-            if name == "transfer":
-                preset = dataclasses.replace(preset, looks="rich", spread=0.1)
-        case "wallclock":
-            learner = learner_preset(
-                "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
-                horizon=100.0, return_lambda=0.98, decode_only=(TRUTH,),
-            )  # fmt: skip
-            wide = PpoConfig(rollout=32, minibatches=16)
-            preset = Preset(chosen, learner, budget.steps, instances=2048, eval_episodes=1000, ppo=wide)
-        case "cpu":
-            small = PpoConfig(rollout=32, minibatches=4, width=128, channels=(16, 32, 32))
-            learner = learner_preset("cpu", lr=6e-4, mean_pull=0.01)
-            slow = dataclasses.replace(chosen, **{"action_repeat": 5, **budget.fields})
-            preset = Preset(slow, learner, budget.steps, instances=8, ppo=small)
-        case "smoke":
-            tiny = learner_preset("cpu", deter=64, hidden=32, units=32, stoch=8, patch_units=16, batch_size=4)
-            tiny = dataclasses.replace(tiny, batch_length=8, learning_starts=64, train_ratio=4.0, imag_horizon=4)
-            small = PpoConfig(rollout=16, minibatches=2, epochs=1, width=32, channels=(8, 8, 8))
-            slow = dataclasses.replace(chosen, **{"action_repeat": 5, **budget.fields})
-            preset = Preset(slow, tiny, budget.steps, instances=4, eval_episodes=8, ppo=small)
+    preset = _preset(name, chosen, budget)
     learner = _changed(preset.learner, budget.learner, f"task {chosen.name!r}: budget {name!r}")
     if name in ("paper", "transfer"):  # the falling rate spans the run
         updates = int(budget.steps * learner.train_ratio) // learner.replayed_per_update
@@ -155,6 +122,48 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
         second_tries=budget.second_tries,
         stop_success=budget.stop_success,
     )
+
+
+def _budget(task: Task, name: str, steps: int | None) -> Budget:
+    """The task's budget for a preset; raises ValueError where it has none and no steps are given."""
+    budget = task.budgets.get(name, task.budgets.get("paper") if name == "transfer" else None)
+    if budget is None and name == "smoke":
+        budget = Budget(400, eval_every=200)
+    if budget is None and steps is None:
+        has = f"it has some for {', '.join(task.budgets)}" if task.budgets else "it has none at all"
+        raise ValueError(f"task {task.name!r} has no budget for the preset {name!r} ({has}). Give --steps, or add "
+                         f"{name!r} to its budgets.")
+    return budget or Budget(steps or 0)
+
+
+def _preset(name: str, task: Task, budget: Budget) -> Preset:
+    """What a preset says of learners and instances, before the task's budget changes it."""
+    match name:
+        case "paper" | "transfer":
+            learner = learner_preset(
+                "size12m", lr=1.5e-4, entropy_scale=1e-3, replay_capacity=250_000, average_rate=0.002,
+                greedy_share=0.25, decode_only=(TRUTH,),
+            )  # fmt: skip
+            preset = Preset(task, learner, budget.steps, eval_episodes=200)
+            return dataclasses.replace(preset, looks="rich", spread=0.1) if name == "transfer" else preset
+        case "wallclock":
+            learner = learner_preset(
+                "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
+                horizon=100.0, return_lambda=0.98, decode_only=(TRUTH,),
+            )  # fmt: skip
+            wide = PpoConfig(rollout=32, minibatches=16)
+            return Preset(task, learner, budget.steps, instances=2048, eval_episodes=1000, ppo=wide)
+        case "cpu":
+            small = PpoConfig(rollout=32, minibatches=4, width=128, channels=(16, 32, 32))
+            learner = learner_preset("cpu", lr=6e-4, mean_pull=0.01)
+            slow = dataclasses.replace(task, **{"action_repeat": 5, **budget.fields})
+            return Preset(slow, learner, budget.steps, instances=8, ppo=small)
+        case _:
+            tiny = learner_preset("cpu", deter=64, hidden=32, units=32, stoch=8, patch_units=16, batch_size=4)
+            tiny = dataclasses.replace(tiny, batch_length=8, learning_starts=64, train_ratio=4.0, imag_horizon=4)
+            small = PpoConfig(rollout=16, minibatches=2, epochs=1, width=32, channels=(8, 8, 8))
+            slow = dataclasses.replace(task, **{"action_repeat": 5, **budget.fields})
+            return Preset(slow, tiny, budget.steps, instances=4, eval_episodes=8, ppo=small)
 
 
 def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
@@ -213,7 +222,7 @@ def with_settings(learner: Any, settings: Sequence[str]) -> Any:
             raise ValueError(f"{text!r} changes no setting of the learner; these are: {', '.join(sorted(known))}.")
         try:
             found = json.loads(value)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{text!r}: give NAME=VALUE, the value as in JSON: 0.1, true or [1, 2].") from error
         changes[name] = tuple(found) if isinstance(found, list) else found
         if not _alike(changes[name], getattr(learner, name)):

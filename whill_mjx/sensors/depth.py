@@ -11,6 +11,7 @@ import numpy as np
 
 from whill_mjx.sensors.base import Reading, Sensor, View
 from whill_mjx.vehicle.kinematics import camera_pose
+from whill_mjx.world.maps.walls import shown
 from whill_mjx.world.render import pinhole, render_frame
 
 
@@ -44,7 +45,8 @@ class Depth(Sensor):
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
         height, width = self.size(env)
         intrinsics = pinhole(env.model.spec.camera.fov_y, height, width)
-        depth = render_frame(position, rotation, intrinsics, state.scene, height, width).depth
+        scene = shown(state.scene, position, rotation, intrinsics, width)
+        depth = render_frame(position, rotation, intrinsics, scene, height, width).depth
         depth = jnp.clip(depth, 0.0, self.reach)
         if not self.as_bytes:
             return memory, depth

@@ -16,9 +16,11 @@ import numpy as np
 from whill_mjx.sensors.base import Reading, Sensor, View
 from whill_mjx.sensors.lidar import distances
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
+from whill_mjx.world.lidar import first_hits
 from whill_mjx.world.scene import Boxes, Footprint, footprint
 
 UNIT = 0.1  # m
+HEIGHT = 0.3  # m, at which walls of a map and people are met
 RANGE = 5.0  # m, largest free distance
 RAYS = 48  # 3 m away they lie 0.39 m apart: at least one meets a box as wide as the corridor's
 SIZE = 4 + RAYS
@@ -49,7 +51,11 @@ def truth(env: Any, state: Any) -> jax.Array:
     dx, dy = env.task.goal(state.scene) - jnp.stack([body.x, body.y])
     ahead, aside = dx * jnp.cos(yaw) + dy * jnp.sin(yaw), dy * jnp.cos(yaw) - dx * jnp.sin(yaw)
     near = jnp.stack([ahead, aside, v, omega]) / UNIT
-    return jnp.concatenate([near, free_distances(body, state.scene.boxes) / UNIT]).astype(jnp.float32)
+    free = free_distances(body, state.scene.boxes)
+    if state.scene.walls is not None or state.scene.people is not None:  # neither is a box
+        there = first_hits(state.scene, body.x, body.y, body.yaw + ANGLES, HEIGHT)
+        free = jnp.minimum(free, there)
+    return jnp.concatenate([near, free / UNIT]).astype(jnp.float32)
 
 
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:

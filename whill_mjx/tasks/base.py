@@ -19,6 +19,8 @@ from whill_mjx.io.fields import TASK, check_fields
 from whill_mjx.tasks import terms
 from whill_mjx.tasks.parts import Draws, make_marker, room
 from whill_mjx.tasks.terms import Moment
+from whill_mjx.world.people.crowd import Crowd, People
+from whill_mjx.world.people.places import in_sight
 from whill_mjx.world.scene import Scene, default_looks
 
 LAYOUTS = ("randomised", "fixed")
@@ -36,6 +38,7 @@ class World:
     """Scene and start of one episode."""
 
     scene: Scene
+    """Boxes, goal marker and looks."""
     start: jax.Array  # (3,) x [m], y [m], yaw [rad] of the driven-axle centre
 
 
@@ -99,14 +102,23 @@ class Task:
     goal_radius: float = 1.0
     """Distance of the driven-axle centre from the goal centre that counts as arrival [m]."""
     goal_reward: float = 100.0
+    """Reward of an arrival."""
     collision_reward: float = -50.0
+    """Reward of a collision."""
     progress_gain: float = 30.0
     """Reward per metre that the distance to the goal has shrunk."""
     step_reward: float = -0.05
+    """Reward of every control period."""
     smoothness_gain: float = 1.0
     """Reward lost per rad/s that the commanded yaw rate has changed."""
     layout: str = "randomised"
     """"randomised" draws a new world for each episode, "fixed" is always the same one."""
+    people: int = 0
+    """People who walk around."""
+    people_within: float = 10.0
+    """Greatest distance at which they begin, from the vehicle's start [m]."""
+    yielding: float = 0.5
+    """Share of them who make way for the vehicle."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -139,6 +151,15 @@ class Task:
         distance, angle = draw(2.0, 4.0, fixed=3.0), draw(-0.8, 0.8, fixed=0.4)
         marker = make_marker(distance * jnp.cos(angle), distance * jnp.sin(angle), size=0.5, height=0.55)
         return World(Scene(room(5.0), marker, default_looks()), jnp.zeros(3))
+
+    @property
+    def crowd(self) -> Crowd:
+        """What the people of an episode are like."""
+        return Crowd(count=self.people, within=self.people_within, yielding=self.yielding)
+
+    def populate(self, key: jax.Array, world: World) -> People:
+        """The `people` of an episode: they walk to and fro between points in sight of each other."""
+        return in_sight(key, world.scene, world.start, self.crowd)
 
     def goal(self, scene: Scene) -> jax.Array:
         """(2,) m: where to go; `Moment.goal_distance` is measured to it."""

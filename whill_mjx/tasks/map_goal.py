@@ -14,7 +14,9 @@ from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import Task, World
-from whill_mjx.world.maps import Reach, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.world.maps import MapScene, Reach, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.world.maps.ways import Ways, draw_ways, people_near
+from whill_mjx.world.people.crowd import Crowd, People
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,26 @@ class MapGoal(Task):
         scene, start = sample(key if self.randomised else jax.random.key(0))
         return World(scene, start)
 
+    def populate(self, key: jax.Array, world: World) -> People:
+        """People on ways of the map that lead past the start."""
+        ways = _ways(self.map, self.nearest, self.farthest, self.people_within)
+        return people_near(key, ways, world.start, self.crowd)
+
     def observations(self) -> Mapping[str, Any]:
         return {"goal": Goal(), "lidar": Lidar(rays=90, reach=8.0, z=0.3), "commands": Commands(1)}
 
 
 @lru_cache(maxsize=8)
+def _made(path: str, nearest: float, farthest: float) -> MapScene:
+    return make_map_scene(read_map(Path(path)), Reach(nearest=nearest, farthest=farthest))
+
+
+@lru_cache(maxsize=8)
 def _sampler(path: str, nearest: float, farthest: float) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
-    made = make_map_scene(read_map(Path(path)), Reach(nearest=nearest, farthest=farthest))
-    return map_scene_sampler(made)
+    return map_scene_sampler(_made(path, nearest, farthest))
+
+
+@lru_cache(maxsize=8)
+def _ways(path: str, nearest: float, farthest: float, within: float) -> Ways:
+    made = _made(path, nearest, farthest)
+    return draw_ways(made.grid, made.space, made.places.start, Crowd().clear, within)

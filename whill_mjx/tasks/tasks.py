@@ -130,6 +130,8 @@ def find_task(name: str) -> Task:
     place, colon, attribute = name.rpartition(":")
     if not colon:
         if name not in TASKS:
+            if name.endswith(".py"):
+                raise ValueError(f"task {name!r}: a task in a file is named too. Give {name}:CLASS.")
             raise ValueError(f"unknown task {name!r} (known: {', '.join(TASKS)}). Correct the name, or give "
                              "package.module:TASK or path/to/file.py:TASK.")
         return TASKS[name]

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.world.scene import Footprint, Scene, clearance
+from whill_mjx.world.collision import free_distance
+from whill_mjx.world.scene import Footprint, Scene
 
 
 @struct.dataclass
@@ -46,8 +47,8 @@ def speed_change(moment: Moment) -> jax.Array:
 
 
 def shortfall(moment: Moment, margin: float) -> jax.Array:
-    """() m by which the distance to the nearest box falls short of a margin."""
-    return jnp.maximum(margin - clearance(moment.body, moment.scene.boxes), 0.0)
+    """() m by which the distance to the nearest thing falls short of a margin."""
+    return jnp.maximum(margin - free_distance(moment.body, moment.scene), 0.0)
 
 
 def goal_vector(moment: Moment, goal: jax.Array) -> jax.Array:

@@ -32,13 +32,13 @@ def describe(params: VehicleParams) -> dict[str, Parameter]:
 
 
 def get_values(params: VehicleParams, names: Sequence[str]) -> jax.Array:
-    """Values (P,) of the named parameters of one instance; KeyError names the known ones."""
+    """Values (P,) of the named parameters of one instance, in their SI units; KeyError names the known ones."""
     found = holders(params)
     return jnp.stack([jnp.asarray(getattr(found[holder], field)) for holder, field in _split(found, names)])
 
 
 def set_values(params: VehicleParams, names: Sequence[str], values: jax.Array) -> VehicleParams:
-    """The same vehicle with the named parameters at `values` (P,)."""
+    """The same vehicle with the named parameters at `values` (P,), in their SI units."""
     found = holders(params)
     for index, (holder, field) in enumerate(_split(found, names)):
         found[holder] = dataclasses.replace(found[holder], **{field: values[index]})

@@ -40,6 +40,7 @@ class VehicleSpec:
     """Nominal geometry, mass and limits of one vehicle. Hashable: a static argument of compiled functions."""
 
     name: str
+    """How vehicle files, reports and runs call it."""
     wheel_radius: float
     """Radius of the driven wheels [m]."""
     track: float
@@ -57,13 +58,19 @@ class VehicleSpec:
     wheel_inertia: float = 0.02
     """Spin inertia of the driven wheels of one side, motor included [kg m^2]."""
     body_length: float = 0.985
+    """Overall length [m]."""
     body_width: float = 0.554
+    """Overall width [m]."""
     body_height: float = 0.9
+    """Overall height [m]."""
     v_min: float = -1.0
+    """Lowest forward speed [m/s]; the vehicle cuts every command to its limits."""
     v_max: float = 1.0
+    """Highest forward speed [m/s]."""
     omega_max: float = 1.0
-    """Limits [m/s, rad/s] to which the vehicle cuts every command."""
+    """Highest yaw rate in both directions [rad/s]."""
     camera: CameraMount = CameraMount()
+    """Where its camera sits."""
 
     def __post_init__(self) -> None:
         fields.check_fields(f"vehicle {fields.shown(self.name)}", fields.SPEC, self)

@@ -205,7 +205,9 @@ class VehicleParams:
     """The whole physical parameter tree of one instance: what is randomised, fitted and saved."""
 
     body: Body
+    """Mass distribution."""
     effects: tuple
+    """Physical effects, each with its own parameters, in the order in which they act."""
 
 
 @struct.dataclass

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 
 from whill_mjx.effects import EFFECTS
 from whill_mjx.io import fields
+from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.presets import preset, preset_params
 from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
@@ -168,6 +169,7 @@ def _read(path: Path) -> dict[str, Any]:
     """Content of a vehicle file, of the right kind and schema."""
     content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
                         "Vehicle files are written by sysid.fit.")
+    content = upgraded(KIND, content)
     if content.get("kind") == KIND and content.get("schema") != SCHEMA:
         raise ValueError(f"{path}: schema is {fields.shown(content.get('schema'))}; this version reads schema {SCHEMA}."
                          " Fit the vehicle again.")

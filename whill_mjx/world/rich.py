@@ -27,6 +27,7 @@ PASSAGE = 0.95
 DEEP = (0.08, 0.38)
 """How far things reach from the wall into the room [m]."""
 FLOOR, MARKER, WALL, OBSTACLE, THING, PANEL, CEILING, LAMP, FRAME, DOOR, POSTER, WINDOW, POLE, TOP = range(14)
+PERSON = 14
 """Roles: what a label is to the room."""
 
 
@@ -93,8 +94,13 @@ def room_of(scene: Scene) -> Room:
         left[0] - boxes.half[0, 0],
         far[0] - boxes.half[2, 0],
         left[1] - boxes.half[0, 1],
-        jax.tree.map(lambda leaf: leaf[3:], boxes),
+        jax.tree.map(lambda leaf: leaf[3 : leaf.shape[0] - pictures_of(scene)], boxes),
     )
+
+
+def pictures_of(scene: Scene) -> int:
+    """How many of the last boxes are pictures of a map's walls."""
+    return 0 if scene.walls is None else scene.walls.keep
 
 
 class _Draws:
@@ -140,6 +146,9 @@ def furnish(key: jax.Array, scene: Scene, lone: bool) -> Scene:
     count = solid.yaw.shape[0]
     hidden = jnp.zeros(count, bool).at[count - THINGS - 1 : count - THINGS - 1 + ROUNDS].set(rounds.mask)
     ghosts = stack_boxes([*_ceiling(draw, room, ceiling, covered), *_on_walls(draw, room, height), *stand, tops])
+    if pictures := pictures_of(scene):
+        solid = stack_boxes([solid, jax.tree.map(lambda leaf: leaf[-pictures:], scene.boxes)])
+        hidden = jnp.concatenate([hidden, jnp.zeros(pictures, bool)])
     return dataclasses.replace(
         scene, boxes=solid, marker=marker, ghosts=ghosts, hidden=hidden, solids=Solids(rounds=rounds)
     )
@@ -147,11 +156,13 @@ def furnish(key: jax.Array, scene: Scene, lone: bool) -> Scene:
 
 def roles_of(scene: Scene) -> np.ndarray:
     """(L,) role of each label of a furnished scene."""
-    obstacles = scene.boxes.yaw.shape[0] - 3 - 1 - THINGS - 1
-    boxes = [WALL] * 3 + [OBSTACLE] * obstacles + [WALL] + [THING] * THINGS + [PANEL]
+    pictures = pictures_of(scene)
+    obstacles = scene.boxes.yaw.shape[0] - 3 - 1 - THINGS - 1 - pictures
+    boxes = [WALL] * 3 + [OBSTACLE] * obstacles + [WALL] + [THING] * THINGS + [PANEL] + [WALL] * pictures
     ghosts = [CEILING] + [LAMP] * LAMPS + [FRAME, DOOR] * DOORS + [POSTER] * POSTERS + [WINDOW] * WINDOWS
     ghosts += [POLE] * 2 + [PANEL] + [TOP] * THINGS
-    return np.array([FLOOR, FLOOR, MARKER, *boxes, *ghosts, *[THING] * ROUNDS])
+    people = scene.solids.rounds.mask.shape[0] - ROUNDS  # type: ignore[union-attr]
+    return np.array([FLOOR, FLOOR, MARKER, *boxes, *ghosts, *[THING] * ROUNDS, *[PERSON] * people])
 
 
 def _other_carton(draw: _Draws, carton: Boxes) -> Boxes:
@@ -348,6 +359,7 @@ CHOICE: dict[int, tuple[str, ...]] = {
     WINDOW: ("plaster",),
     POLE: ("black", "metal", "plaster"),
     TOP: ("paint", "black", "planks", "metal", "print"),
+    PERSON: ("paint", "paint", "black", "stripes", "print", "carpet"),
 }
 _NAMES = tuple(FAMILIES)
 _RANGES = np.array(
@@ -356,7 +368,7 @@ _RANGES = np.array(
 _IS_LOG = np.array([p in _LOG for p in PROPERTIES])
 _CHOICES = 24
 _CHOICE = np.array(
-    [[_NAMES.index(CHOICE[role][i * len(CHOICE[role]) // _CHOICES]) for i in range(_CHOICES)] for role in range(14)]
+    [[_NAMES.index(CHOICE[role][i * len(CHOICE[role]) // _CHOICES]) for i in range(_CHOICES)] for role in range(15)]
 )
 
 
@@ -378,7 +390,7 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     labels, width = roles.shape[0], len(PROPERTIES) + 16
     own_key, shared_key, alike_key = jax.random.split(key, 3)
     own = jax.random.uniform(own_key, (labels, width))
-    shared = jax.random.uniform(shared_key, (14, width))[roles]
+    shared = jax.random.uniform(shared_key, (14, width))[np.minimum(roles, 13)]
     alike = np.isin(roles, (FLOOR, WALL, FRAME, DOOR, LAMP, CEILING))
     alike = alike & (jax.random.uniform(alike_key, (labels,)) < 0.8)
     u = jnp.where(alike[:, None], shared, own)
@@ -477,7 +489,9 @@ def _lights(key: jax.Array, scene: Scene) -> Lights:
 def _casters(draw: _Draws, scene: Scene, position, power) -> jax.Array:
     """(C, 10) numbers of what throws soft shadows on the floor: obstacles, things and the board."""
     # Not the walls: the first three, and the back one before the things.
-    solid = jax.tree.map(lambda leaf: jnp.concatenate([leaf[3 : -THINGS - 2], leaf[-THINGS - 1 :]]), scene.boxes)
+    own = scene.boxes.yaw.shape[0] - pictures_of(scene)
+    back = own - THINGS - 2
+    solid = jax.tree.map(lambda leaf: jnp.concatenate([leaf[3:back], leaf[back + 1 : own]]), scene.boxes)
     offset = solid.centre[:, None, :2] - position[:, :2]  # (C, LIGHTS, 2)
     high = position[:, 2] - solid.centre[:, None, 2]
     weight = power / (jnp.sum(offset**2, -1) + high**2)

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from whill_mjx.world.materials import Finish
+from whill_mjx.world.people.crowd import People
 from whill_mjx.world.solids import Solids
 
 
@@ -93,6 +94,7 @@ class Scene:
     walls: MapWalls | None = struct.field(pytree_node=False, default=None)  # of a map: seen and hit
     ghosts: Boxes | None = None  # upright boxes that are seen, but nothing collides with them
     hidden: jax.Array | None = None  # (P,) bool: boxes that are hit but not seen, for something else shows them
+    people: People | None = None  # who walk; `solids` has their shapes, behind all other rounds
     rich: Any = None  # materials, lights and film of `whill_mjx.world.rich`; they replace colours, looks and finish
 
 

@@ -8,6 +8,7 @@ straight    long straight walls from the borders of cells
 field       distance to the nearest thing
 walls       which walls rays meet and a camera sees
 places      starts and goals with a way between them
+ways        where people walk
 playable    all that as the world of an episode
 """
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from whill_mjx.io.reading import MB, read_bytes
+from whill_mjx.io.reading import LONGEST_REASON, MB, read_bytes
 from whill_mjx.world.maps.grid import FREE, OCCUPIED, GridMap
 
 XML_BYTES = 60 * MB
@@ -58,26 +58,32 @@ def load_footprints(path: str | Path, resolution: float = 0.1) -> GridMap:
     try:
         buildings = _osm(root) if kind == "osm" else _city(root)
     except (TypeError, ValueError, KeyError) as error:
-        raise ValueError(f"{path}: has a coordinate that cannot be read ({error}). Export it again.") from None
+        reason = str(error)[:LONGEST_REASON]
+        raise ValueError(f"{path}: has a coordinate that cannot be read ({reason}). Export it again.") from None
     if not buildings:
         what = sorted({_name(one[0]) for one in root if _name(one) == "cityObjectMember" and len(one)})
         found = f" (found {', '.join(what)})" if what else ""
         raise ValueError(f"{path}: has no building with a footprint{found}. Choose another part of the map.")
     corners = np.concatenate([ring for rings in buildings for ring in rings])
+    if not np.isfinite(corners).all():
+        raise ValueError(f"{path}: has a coordinate that is no finite number. Export it again.")
     low, high = corners.min(0) - MARGIN, corners.max(0) + MARGIN
-    columns, rows = np.ceil((high - low) / resolution).astype(int)
-    if not np.isfinite(corners).all() or rows * columns > MAX_CELLS:
+    width, height = np.ceil((high - low) / resolution)
+    if not width * height <= MAX_CELLS:
         raise ValueError(
-            f"{path}: spans {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, over {MAX_CELLS} cells of "
+            f"{path}: spans {high[0] - low[0]:.4g} x {high[1] - low[1]:.4g} m, over {MAX_CELLS} cells of "
             f"{resolution:g} m. Cut the file or take larger cells."
         )
-    cells = np.zeros((rows, columns), np.uint8)
+    cells = np.zeros((int(height), int(width)), np.uint8)
     for rings in buildings:
         # Corners of cells lie at whole numbers; fillPoly counts from the centres of pixels, in 1/256 of them.
-        places = [np.rint(((ring - low) / resolution - 0.5) * 256).astype(np.int32) for ring in rings]
-        layer = cells.copy()
-        cv2.fillPoly(layer, places, 1, shift=8)  # a ring inside another is a courtyard
-        cells |= layer
+        places = [(ring - low) / resolution - 0.5 for ring in rings]
+        first = np.floor(np.min([place.min(0) for place in places], axis=0)).astype(int) - 1
+        last = np.ceil(np.max([place.max(0) for place in places], axis=0)).astype(int) + 2
+        part = cells[first[1] : last[1], first[0] : last[0]]
+        layer = np.zeros_like(part)
+        cv2.fillPoly(layer, [np.rint((place - first) * 256).astype(np.int32) for place in places], 1, shift=8)
+        part |= layer  # of this building alone: a ring inside another is a courtyard
     return GridMap(np.where(cells > 0, OCCUPIED, FREE).astype(np.uint8), resolution, (low[0], low[1], 0.0))
 
 
@@ -151,9 +157,10 @@ def _city(root: ET.Element) -> list[list[Ring]]:
     geographic = any(system.rstrip("/").endswith(code) for code in GEOGRAPHIC)
     chosen = []
     for thing in root.iter():
-        in_parts = any(_name(one) == "BuildingPart" for one in thing.iter() if one is not thing)
-        if _name(thing) not in STANDING or in_parts:
+        if _name(thing) not in STANDING:
             continue
+        if any(_name(one) == "BuildingPart" for one in thing.iter() if one is not thing):
+            continue  # its parts stand for it
         for wanted in (*GROUND, None):
             surfaces = [thing] if wanted is None else [one for one in thing.iter() if _name(one) == wanted]
             polygons = [one for surface in surfaces for one in surface.iter() if _name(one) == "Polygon"]
@@ -170,6 +177,8 @@ def _rings(polygon: ET.Element) -> list[Ring]:
             continue
         lists = [one for one in ring if _name(one) == "posList"]
         size = int((lists[0].get("srsDimension") if lists else None) or 3)
+        if size not in (2, 3):
+            raise ValueError(f"points of {size} numbers")
         numbers = [
             float(word)
             for one in (lists or [one for one in ring if _name(one) == "pos"])

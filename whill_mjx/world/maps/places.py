@@ -48,21 +48,19 @@ def clearances(space: np.ndarray, resolution: float) -> np.ndarray:
     return np.where(space, distance_transform_edt(padded)[1:-1, 1:-1] - 0.5, 0.0) * resolution
 
 
-def draw_places(
-    grid: GridMap, space: np.ndarray, reach: Reach, goals: int = 64, each: int = 32, seed: int = 0
-) -> Places:
-    """Pairs with a way of the asked length between them: `each` starts for each of `goals` goals.
+def way_graph(grid: GridMap, space: np.ndarray, passing: float) -> tuple[np.ndarray, ...]:
+    """Ways in a map as a graph of points about `STEP` apart with enough clearance to pass.
 
-    Raises:
-        ValueError: the map has no such pair; names the largest clearance and the length of the longest way.
+    Returns:
+        Clearance of all cells, of the coarse cells, the rows and columns (P,) of those that are points, the points
+        (P, 2) in the world [m], and the graph (P, P) of distances between neighbours (scipy, sparse).
     """
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import dijkstra
 
     clear = clearances(space, grid.resolution)
     stride = max(1, round(STEP / grid.resolution))
     coarse = clear[stride // 2 :: stride, stride // 2 :: stride]
-    rows, columns = np.nonzero(coarse >= reach.passing)
+    rows, columns = np.nonzero(coarse >= passing)
     number = np.full(np.add(coarse.shape, 1), -1)
     number[rows, columns] = np.arange(len(rows))
     tails, heads, lengths = [], [], []
@@ -76,6 +74,20 @@ def draw_places(
     tail, head, length = (np.concatenate(parts) for parts in (tails, heads, lengths))
     graph = coo_array((length, (tail, head)), (count, count)).tocsr()
     points = grid.to_world((np.stack([columns, rows], -1) * stride + stride // 2 + 0.5) * grid.resolution)
+    return clear, coarse, rows, columns, points, graph
+
+
+def draw_places(
+    grid: GridMap, space: np.ndarray, reach: Reach, goals: int = 64, each: int = 32, seed: int = 0
+) -> Places:
+    """Pairs with a way of the asked length between them: `each` starts for each of `goals` goals.
+
+    Raises:
+        ValueError: the map has no such pair; names the largest clearance and the length of the longest way.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    clear, coarse, rows, columns, points, graph = way_graph(grid, space, reach.passing)
     standing = np.flatnonzero(coarse[rows, columns] >= reach.standing)
     rng = np.random.default_rng(seed)
     starts, ends, ways = [], [], []

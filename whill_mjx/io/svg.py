@@ -234,4 +234,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def _number(value: float) -> str:
+    if 1e4 <= abs(value) < 1e7:
+        return f"{value:,.0f}"
     return "0" if abs(value) < 1e-12 else f"{value:.4g}"

@@ -1,0 +1,248 @@
+"""Pedestrians beside recorded ones: speeds, flow, headways; and the cost of a map with people: `python -m benchmarks.people`.
+
+The recordings are those of ../shared/data/pedestrians: a corridor with one direction and one with two. Simulated people
+enter at the recorded times and places, and walk to where the recorded ones left. Speed and time gap are fitted to the
+first half of each recording; every figure is of the second half.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.harness import figure, record
+from whill_mjx.io import command_line
+from whill_mjx.world.people import law
+from whill_mjx.world.people.crowd import GAP, Crowd, people_on
+
+CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
+DT = 0.1
+WINDOW = 0.5
+"""Time over which a speed is taken [s]."""
+RATE = 25
+"""Frames per second of the recordings."""
+INSIDE = (-4.5, 3.5)
+"""Part of the corridor in which speeds are taken, along it [m]."""
+GATE, HALF = -0.5, 2.0
+"""Middle and half length of the stretch in which density and flow are taken [m]."""
+LANE = 0.8
+"""How far apart sideways two people are who follow one another [m]."""
+DENSITIES = np.arange(0.5, 2.01, 0.25)
+"""Borders of the bins of density [1/m2]."""
+LEAST = 50
+"""Moments that a bin must have in both."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the benchmark."""
+
+    recordings: Path = Path("../shared/data/pedestrians/juelich_pedpy")
+    """Folder of the recordings."""
+    fit: bool = False
+    """Search speed, its spread and the time gap on the first halves, and print them."""
+
+
+class Recording(NamedTuple):
+    """A corridor along x whose walls are at two y, and what its people were fitted to."""
+
+    file: str
+    scale: float
+    walls: tuple[float, float]
+    speed: float
+    spread: float
+
+
+RECORDINGS = {
+    "one_way": Recording("traj_UNI_CORR_500_01.txt.gz", 1.0, (0.0, 5.0), 1.52, 0.25),
+    "two_ways": Recording("bi_corr_400_b_03.txt.gz", 0.01, (0.0, 4.0), 1.20, 0.20),
+}
+
+
+class Track(NamedTuple):
+    """One person."""
+
+    time: np.ndarray  # (T,) s
+    place: np.ndarray  # (T, 2) m
+
+
+def read(folder: Path, recording: Recording) -> list[Track]:
+    """Everybody of a recording who was seen for longer than the window."""
+    with gzip.open(folder / recording.file) as file:
+        rows = np.loadtxt(file, comments="#")
+    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    people = np.split(rows, np.flatnonzero(np.diff(rows[:, 0])) + 1)
+    tracks = [Track(one[:, 1] / RATE, one[:, 2:4] * recording.scale) for one in people]
+    return [track for track in tracks if track.time[-1] - track.time[0] > 2 * WINDOW]
+
+
+def simulator(tracks: list[Track], walls: tuple[float, float]) -> Callable[[float, float, float], list[Track]]:
+    """Function of mean speed, its spread and the time gap that gives the tracks of simulated people."""
+    begin = min(track.time[0] for track in tracks)
+    duration = max(track.time[-1] for track in tracks) - begin + 15.0
+    first = np.array([track.place[0] for track in tracks])
+    last = np.array([track.place[-1] for track in tracks])
+    way = np.sign(last[:, 0] - first[:, 0])
+    route = jnp.asarray(np.stack([first, last + np.stack([3.0 * way, 0.0 * way], 1)], 1), jnp.float32)
+    enter, first, out = jnp.asarray([track.time[0] - begin for track in tracks]), jnp.asarray(first), jnp.asarray(last)
+    side, count = jnp.asarray(way), len(tracks)
+    nobody = jnp.zeros(count, bool)
+    people = people_on(jax.random.key(0), Crowd(count=count), route, jnp.zeros(count, jnp.int32), nobody)
+    quantile = jnp.clip(jax.random.normal(jax.random.key(1), (count,)), -2.5, 2.5)
+
+    def near(place: jax.Array) -> law.Near:
+        x = place[:, 0]
+        points = jnp.stack([jnp.stack([x, jnp.full(count, wall)], -1) for wall in walls], 1)
+        return law.Near(points, jnp.ones((count, 2), bool))
+
+    @jax.jit
+    def run(speed, spread, gap):
+        crowd = dataclasses.replace(people, speed=jnp.maximum(speed + spread * quantile, 0.4), gap=jnp.full(count, gap))
+
+        def one_step(carry, number):
+            crowd, entered = carry
+            apart = jnp.linalg.norm(crowd.position[None] - first[:, None], axis=-1)
+            blocked = jnp.any(crowd.there & (apart < 2 * law.RADIUS + law.ASIDE), -1)
+            enters = (number * DT >= enter) & ~entered & ~blocked
+            crowd = law.walk(dataclasses.replace(crowd, there=crowd.there | enters), near, None, DT)
+            seen = (crowd.position, crowd.there)
+            gone = (crowd.position[:, 0] - out[:, 0]) * side >= 0.0
+            return (dataclasses.replace(crowd, there=crowd.there & ~gone), entered | enters), seen
+
+        return jax.lax.scan(one_step, (crowd, nobody), jnp.arange(int(duration / DT)))[1]
+
+    def tracks_of(speed: float, spread: float, gap: float) -> list[Track]:
+        place, there = (np.asarray(leaf) for leaf in run(speed, spread, gap))
+        found = []
+        for index in range(count):
+            row = np.flatnonzero(there[:, index])
+            if len(row) * DT > 2 * WINDOW:
+                found.append(Track(begin + row * DT, place[row, index]))
+        return found
+
+    return tracks_of
+
+
+def moving(tracks: list[Track]) -> np.ndarray:
+    """(M, 5) time, x, y, speed along the corridor and speed, taken over the window, of everybody inside."""
+    rows = []
+    for track in tracks:
+        step = round(WINDOW / (track.time[1] - track.time[0]))
+        span = track.time[step:] - track.time[:-step]
+        velocity = (track.place[step:] - track.place[:-step]) / span[:, None]
+        middle = slice(step // 2, step // 2 + len(velocity))
+        speed = np.hypot(*velocity.T)
+        rows.append(np.column_stack([track.time[middle], track.place[middle], velocity[:, 0], speed]))
+    found = np.concatenate(rows)
+    return found[(found[:, 1] > INSIDE[0]) & (found[:, 1] < INSIDE[1])]
+
+
+def flows(tracks: list[Track], walls: tuple[float, float]) -> np.ndarray:
+    """(F, 2) density [1/m2] and flow [1/(m s)], both ways added up, in the stretch at each moment."""
+    rows = moving(tracks)
+    rows = rows[np.abs(rows[:, 1] - GATE) < HALF]
+    moment = np.round(rows[:, 0] / DT).astype(int)
+    # A recording has several frames in a moment: everybody counts once.
+    own = round(DT / np.min([track.time[1] - track.time[0] for track in tracks]))
+    area = 2 * HALF * (walls[1] - walls[0])
+    count = np.bincount(moment) / own
+    return np.column_stack([count, np.bincount(moment, np.abs(rows[:, 3])) / own])[count > 0] / area
+
+
+def headways(tracks: list[Track]) -> np.ndarray:
+    """Times [s] between two people who pass the gate one behind the other in the same direction."""
+    passes = []
+    for track in tracks:
+        x = track.place[:, 0] - GATE
+        over = np.flatnonzero(x[1:] * x[:-1] < 0)
+        if len(over):
+            passes.append((track.time[over[0]], track.place[over[0], 1], np.sign(x[-1] - x[0])))
+    time, aside, way = np.array(sorted(passes)).T
+    found = []
+    for index in range(len(time)):
+        behind = np.flatnonzero((way == way[index]) & (np.abs(aside - aside[index]) < LANE) & (time > time[index]))
+        if len(behind):
+            found.append(time[behind[0]] - time[index])
+    return np.array(found)
+
+
+def largest_gap(one: np.ndarray, other: np.ndarray) -> float:
+    """Kolmogorov-Smirnov distance of two samples."""
+    both = np.concatenate([one, other])
+    shares = [np.searchsorted(np.sort(sample), both, "right") / len(sample) for sample in (one, other)]
+    return float(np.abs(shares[0] - shares[1]).max())
+
+
+def flow_errors(recorded: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
+    """Relative error of the mean flow in each bin of density that both have."""
+    errors = {}
+    for low, high in zip(DENSITIES[:-1], DENSITIES[1:], strict=True):
+        means = []
+        for rows in (recorded, simulated):
+            chosen = (rows[:, 0] >= low) & (rows[:, 0] < high)
+            # Flow over density is speed: bins are wide, and the densities in them differ.
+            means.append(rows[chosen, 1].sum() / rows[chosen, 0].sum() if chosen.sum() >= LEAST else np.nan)
+        if np.isfinite(means).all():
+            errors[f"{low:g} to {high:g}"] = means[1] / means[0] - 1.0
+    return errors
+
+
+def halves(tracks: list[Track]) -> tuple[list[Track], list[Track]]:
+    """Those who enter in the first and in the second half of a recording."""
+    times = [track.time[0] for track in tracks]
+    middle = (min(times) + max(times)) / 2
+    return [t for t in tracks if t.time[0] < middle], [t for t in tracks if t.time[0] >= middle]
+
+
+def search(folder: Path) -> None:
+    """Print what fits the first halves best."""
+    for name, recording in RECORDINGS.items():
+        tracks = halves(read(folder, recording))[0]
+        run, recorded = simulator(tracks, recording.walls), moving(tracks)[:, 4]
+        best: tuple[float, ...] = (np.inf,)
+        for gap in (0.3, 0.5, 0.7, 0.9):
+            for speed in recording.speed + np.arange(-0.08, 0.09, 0.04):
+                for spread in (recording.spread - 0.05, recording.spread, recording.spread + 0.05):
+                    off = largest_gap(recorded, moving(run(speed, spread, gap))[:, 4])
+                    best = min(best, (off, speed, spread, gap))
+            print(f"{name}, gap up to {gap}: distance {best[0]:.3f} at speed {best[1]:.2f}, spread {best[2]:.2f}, "
+                  f"gap {best[3]:.1f}", flush=True)  # fmt: skip
+
+
+def main(options: Options) -> None:
+    """Compare and record."""
+    if options.fit:
+        search(options.recordings)
+        return
+    distance, flow, headway, figures = {}, {}, {}, {}
+    for name, recording in RECORDINGS.items():
+        recorded = halves(read(options.recordings, recording))[1]
+        simulated = simulator(recorded, recording.walls)(recording.speed, recording.spread, GAP)
+        distance[name] = largest_gap(moving(recorded)[:, 4], moving(simulated)[:, 4])
+        errors = flow_errors(flows(recorded, recording.walls), flows(simulated, recording.walls))
+        flow |= {f"{name}, {bin} per m2": error for bin, error in errors.items()}
+        times = headways(recorded), headways(simulated)
+        headway[name] = largest_gap(*times)
+        print(f"{name}: {len(recorded)} people; speeds {distance[name]:.3f} apart; headway median "
+              f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, {headway[name]:.3f} apart; "
+              f"flow " + ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items()), flush=True)  # fmt: skip
+        figures[f"people_headway_ratio_{name}"] = figure([float(np.median(times[1]) / np.median(times[0]))], "ratio")
+    path = record("environment", CLAIM, {
+        "people_speed_distance": figure([max(distance.values())], "-"),
+        "people_flow_error": figure([max(map(abs, flow.values()))], "share"),
+        "people_headway_distance": figure([max(headway.values())], "-"),
+        **figures,
+    })  # fmt: skip
+    print(f"-> {path}")
+
+
+if __name__ == "__main__":
+    command_line.run(Options, main, __doc__, positional=False)

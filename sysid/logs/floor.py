@@ -1,0 +1,142 @@
+"""What a floor changes of a vehicle, measured on it without a model of it.
+
+A gyro beside the wheels' speeds shows what share of their difference turns the body, to 1 %. The command beside them
+shows how late they turn and drive, and how far they fall short of it. None of these needs an outside pose. Parameters
+of a physical model that say the same are many, and a log determines their sum only: a turn that falls short is scrub,
+slip or a wider track. Errors are those of blocks of drives that are left out in turn (block jackknife: Kuensch 1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.logs.log import Command, Trial, command_in_force
+
+DT = 0.05  # s, grid of the sums
+SETTLED = 2.0  # s of constant commands after which speeds count as reached
+LAGS = np.geomspace(0.05, 5.0, 40)  # s that are tried
+BLOCKS = 8
+LEAST_TURNED = 0.5  # rad/s, root of the summed squares of a quantity's signal below which a block says nothing
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One thing that a floor changes."""
+
+    name: str
+    unit: str
+    parameter: str
+    """Of the vehicle's model that says most nearly the same."""
+    effects: tuple[str, ...]
+    """Effects that these drives cannot separate in it."""
+    lag: bool = False
+    """Whether it is a time, whose logarithm is estimated."""
+
+
+QUANTITIES = (
+    Quantity("turn efficiency", "-", "turn_efficiency.efficiency", ("turn_efficiency", "track_width", "yaw_scrub")),
+    Quantity("lag of turning", "s", "turn_lag.time_constant", ("turn_lag", "yaw_scrub"), True),
+    Quantity("lag ahead", "s", "torque_drive.kp", ("actuator_lag", "acceleration_limit"), True),
+    Quantity("wheels' turning over the command's", "-", "yaw_scrub.torque", ("yaw_scrub", "motor_line",
+                                                                           "torque_saturation")),
+    Quantity("wheels' speed over the command's", "-", "rolling_resistance.mu_r", ("rolling_resistance", "motor_line",
+                                                                                "torque_saturation")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Of one trial: products that add up over trials."""
+
+    ratios: np.ndarray  # (3, 2) signal times reference, reference squared
+    lags: np.ndarray  # (2, K, 3) filtered command squared, it times what follows, what follows squared
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Quantities of some drives, lags as logarithms; nan where the drives do not show one."""
+
+    value: np.ndarray  # (Q,)
+    error: np.ndarray  # (Q,)
+
+
+def sums_of(trial: Trial) -> Sums | None:
+    """The sums of a trial; None without a gyro or an odometry."""
+    if trial.gyro is None or trial.odometry is None or len(trial.gyro.t) < 2:
+        return None
+    edge = np.arange(0.0, min(trial.odometry.t[-1], trial.gyro.t[-1]) + 1e-9, DT)
+    if len(edge) < 3:
+        return None
+    t = (edge[1:] + edge[:-1]) / 2
+    turning = np.diff(np.interp(edge, trial.gyro.t, trial.gyro.turn)) / DT
+    v, omega = (np.interp(t, trial.odometry.t, one) for one in (trial.odometry.v, trial.odometry.omega))
+    held = command_in_force(trial.command, t)
+    wanted = [np.where(held >= 0, one[np.maximum(held, 0)], start) for one, start in (
+        (trial.command.v, trial.start.v), (trial.command.omega, trial.start.omega))]
+    reached = t - last_change(trial.command, t) >= SETTLED
+    pairs = ((turning, omega), (omega, wanted[1]), (v, wanted[0]))
+    ratios = np.array([[np.sum(one[reached] * other[reached]), np.sum(other[reached] ** 2)] for one, other in pairs])
+    return Sums(ratios, np.stack([_lagging(omega, wanted[1], t), _lagging(v, wanted[0], t)]))
+
+
+def last_change(command: Command, t: np.ndarray) -> np.ndarray:
+    """(T,) time of the last command that was another one, at times t (T,); at first that of the trial's start."""
+    moved = np.append(True, np.abs(np.diff(command.table[:, 1:], axis=0)).max(1, initial=0.0) > 0)
+    changes = np.append(0.0, command.t[moved][1:])
+    return np.asarray(changes[np.maximum(np.searchsorted(changes, t + 1e-9, side="right") - 1, 0)])
+
+
+def _lagging(signal: np.ndarray, wanted: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(K, 3) sums by which any lag explains a signal (T,) as what is wanted (T,) filtered, from where it began."""
+    keep = np.exp(-DT / LAGS)
+    followed, state = np.empty((len(LAGS), len(t))), np.zeros(len(LAGS))
+    for i, target in enumerate(wanted):
+        followed[:, i] = state
+        state = keep * state + (1 - keep) * target
+    rest = signal - signal[0] * np.exp(-(t - t[0]) / LAGS[:, None])
+    return np.stack([np.sum(followed**2, 1), np.sum(followed * rest, 1), np.sum(rest**2, 1)], axis=-1)
+
+
+def measure(sums: Sequence[Sums]) -> np.ndarray:
+    """(Q,) quantities of drives together."""
+    ratios = np.sum([one.ratios for one in sums], axis=0)
+    lags = np.sum([one.lags for one in sums], axis=0)
+    known = ratios[:, 1] > LEAST_TURNED**2
+    first, *others = np.where(known, ratios[:, 0] / np.where(known, ratios[:, 1], 1.0), np.nan).tolist()
+    return np.array([first, _best_lag(lags[0]), _best_lag(lags[1]), *others])
+
+
+def _best_lag(sums: np.ndarray) -> float:
+    """Logarithm of the lag that leaves least, between those tried; nan where it is none of them."""
+    squares, product, whole = sums.T
+    if squares.max() <= LEAST_TURNED**2:
+        return float("nan")
+    left = whole - product**2 / np.maximum(squares, 1e-12)
+    k = int(np.argmin(left))
+    if not 0 < k < len(LAGS) - 1:
+        return float("nan")
+    x = np.log(LAGS[k - 1 : k + 2])
+    bend, slope, _ = np.polyfit(x - x[1], left[k - 1 : k + 2], 2)
+    return float(x[1] - slope / (2 * bend)) if bend > 0 else float(x[1])
+
+
+def in_blocks(sums: Sequence[Sums], blocks: int = BLOCKS) -> Measured | None:
+    """Quantities with their errors by leaving out blocks of consecutive drives in turn; None with too few drives."""
+    if len(sums) < 2 * blocks:
+        return None
+    parts = np.array_split(np.arange(len(sums)), blocks)
+    without = np.array([measure([sums[i] for j, other in enumerate(parts) if j != k for i in other])
+                        for k in range(blocks)])
+    error = np.sqrt((blocks - 1) / blocks * np.square(without - without.mean(0)).sum(0))
+    return Measured(measure(sums), error)
+
+
+def over_days(days: Sequence[Sequence[Sums]]) -> Measured | None:
+    """Mean of the quantities over days, and how far a new day is from it; None with too few days."""
+    if len(days) < 3 or not all(days):
+        return None
+    each = np.array([measure(day) for day in days])
+    return Measured(each.mean(0), each.std(0, ddof=1) * np.sqrt(1 + 1 / len(each)))

@@ -1,0 +1,92 @@
+"""What the loop's report says: title, sentences, and one drive before and after."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
+from sysid.pages.loop_report import wrapped
+from sysid.pages.loop_words import lead, size, title
+
+pytestmark = pytest.mark.quick
+
+
+def parameter(value, low, high, unit="s", **more):
+    return {"value": value, "interval": [low, high], "unit": unit, "open": [False, False], "was": None, "neutral": 0.0,
+            **more}
+
+
+def effect(name, parameters, alike=()):
+    return {"name": name, "parameters": parameters, "class": [name, *alike],
+            "equation": "A command acts `delay` after it is sent: u(t) = u_sent(t - delay)."}
+
+
+DELAY = effect("command_delay", {"command_delay.delay": parameter(
+    0.1523, 0.1131, 0.1902, description="time from sending a command to its effect")})
+
+
+def report(*effects, verdict="named", **more):
+    def part(trajectory, floor=0.014):
+        return {"held_out": {"ground_truth": {"trajectory": trajectory, "noise_floor": {"trajectory": floor}}},
+                "training": {}}
+    return {"verdict": verdict, "effects": list(effects), "before": part(0.27), "refitted": part(0.15),
+            "after": part(0.02), "known": True, "next_manoeuvre": None, "unnamed": None, "lives_in": [], **more}
+
+
+def test_the_title_says_what_was_found_with_its_size_and_interval():
+    assert title(report(DELAY)) == "Missing: command delay 0.152 s (0.113 to 0.190)"
+    assert title(report(verdict="none")).startswith("Nothing is missing")
+    assert title(report(verdict="unexplained")).startswith("Something is missing")
+
+
+def test_an_effect_that_was_there_before_has_changed():
+    had = effect("command_delay", {"command_delay.delay": parameter(0.152, 0.113, 0.190, was=0.02)})
+    assert title(report(had)) == "Missing: command delay 0.152 s (0.113 to 0.190)"  # no more than it is unsure by
+    had = effect("command_delay", {"command_delay.delay": parameter(0.152, 0.113, 0.190, was=0.06)})
+    assert title(report(had)) == "Changed: command delay 0.152 s (0.113 to 0.190), before 0.060"
+
+
+def test_parts_of_an_effect_that_may_be_none_are_left_to_the_table():
+    slope = effect("slope", {"slope.along_x": parameter(0.001, -0.002, 0.004, "rad"),
+                             "slope.along_y": parameter(0.0356, 0.0317, 0.039, "rad")})
+    assert title(report(slope)) == "Missing: slope, along y 2.04 degrees (1.82 to 2.23)"
+
+
+def test_an_open_end_is_said():
+    assert size(parameter(0.3, 0.22, 0.5, "m/s^2", open=[False, True])) == "above 0.22 m/s^2"
+    assert size(parameter(0.3, 0.22, 0.5, "m/s^2", open=[True, False])) == "below 0.50 m/s^2"
+    assert "do not show" in size(parameter(0.3, 0.22, 0.5, "m/s^2", open=[True, True]))
+
+
+def test_three_sentences_say_what_it_is_what_it_changes_and_what_is_open():
+    what, change, rest = lead(report(DELAY))
+    assert what == "What explains these drives is command delay (time from sending a command to its effect)."
+    assert "27.0 cm for the vehicle as it was, 15.0 cm refitted within its day-to-day spread, 2.0 cm with" in change
+    assert "two repeats of one drive differ by 1.4 cm" in change and "No other effect" in rest
+    alike = effect("command_delay", DELAY["parameters"], ("sensor_delay", "clock_offset"))
+    assert "could as well be sensor delay, clock offset" in lead(report(alike))[2]
+
+
+def circle(error, name, held_out):
+    t = np.linspace(0, 10, 500)
+    path = np.column_stack([np.sin(t), 1 - np.cos(t), t])
+    replays = {"before": path + [error, 0, 0.1], "after": path + [error / 10, 0, 0.0]}
+    return Paths(name, held_out, "ground_truth", t, path, replays)
+
+
+def test_the_drive_that_is_shown_is_held_out_and_the_one_of_median_error():
+    drives = [circle(9.0, "training", False), *(circle(e, f"held_{e}", True) for e in (0.3, 0.1, 0.2))]
+    shown = shown_drive(drives)
+    assert shown["trial"] == "held_0.2" and len(shown["t"]) <= 240
+    assert shown["errors"]["before"]["position"] == pytest.approx(0.2)
+    assert shown["errors"]["after"]["yaw"] == pytest.approx(0.0)
+    names = {"before": "the vehicle as it was", "after": "with the effect"}
+    page = drive_pictures(shown, names) + drive_table(shown, names)
+    assert page.count("<svg") == 3 and "20.00" in page and "held out" in page
+    assert shown_drive([]) is None
+
+
+def test_long_lines_are_folded_and_words_stay_whole():
+    folded = wrapped("  lives in " + "somewhere " * 30, 60)
+    assert max(map(len, folded.splitlines())) <= 60 and folded.splitlines()[1].startswith("    somewhere")

@@ -1,0 +1,83 @@
+"""The tutorials run as they are written: two in `make test`, all six in a row in `make test-long`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+
+import pytest
+
+from benchmarks import tutorials
+from benchmarks.tutorials import blocks, notebook_text, pages, run_page, workplace
+
+QUICK = ("1_look_and_drive.md", "5_my_map_my_task.md")
+"""Those that take the fewest seconds."""
+
+
+def page_of(tmp_path, text):
+    page = tmp_path / "page.md"
+    page.write_text(text)
+    return page
+
+
+@pytest.mark.quick
+def test_there_are_six_tutorials_and_each_has_code_and_a_picture():
+    assert [page.name[0] for page in pages()] == list("123456")
+    for page in pages():
+        assert blocks(page) and "![" in page.read_text(), page.name
+
+
+@pytest.mark.quick
+def test_a_block_is_changed_in_tests_alone_and_only_by_a_text_that_it_has(tmp_path):
+    text = "<!-- in tests: a 100 => a 4 -->\n<!-- in make test: left out -->\n```sh\nx --a 100\n```\n```text\nno\n```\n"
+    [block] = blocks(page_of(tmp_path, text))
+    assert (block.code, block.in_tests, block.quick, block.line) == ("x --a 100\n", "x --a 4\n", False, 4)
+    with pytest.raises(ValueError, match="page.md, line 4: the block has no 'b'"):
+        blocks(page_of(tmp_path, text.replace("tests: a", "tests: b").replace("b 100", "b")))
+
+
+@pytest.mark.quick
+def test_python_blocks_share_names_and_a_failing_one_is_named_by_page_and_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_page(page_of(tmp_path, "```python\na = 1\n```\n\n```python\nassert a == 1\n```\n"))
+    with pytest.raises(RuntimeError, match="page.md, line 6: NameError"):
+        run_page(page_of(tmp_path, "```python\na = 1\n```\n\n```python\nb\n```\n"))
+    with pytest.raises(RuntimeError, match="page.md, line 2"):
+        run_page(page_of(tmp_path, "```sh\nfalse\ntrue\n```\n"))
+
+
+@pytest.mark.quick
+def test_a_notebooks_links_lead_from_its_place_to_the_files_of_the_repository():
+    for page in pages():
+        text = notebook_text(page)
+        assert "<!--" not in text and "%cd ../.." in text
+        for target in tutorials.re.findall(r"\]\((\.\./[^)#\s]+)", text):
+            assert (tutorials.ROOT / "build" / "notebooks" / target).resolve().exists(), (page.name, target)
+
+
+@pytest.mark.quick
+@pytest.mark.skipif(not importlib.util.find_spec("jupytext"), reason="needs jupytext: pip install -e '.[docs]'")
+def test_notebooks_have_the_code_of_the_pages(tmp_path):
+    for page, path in zip(pages(), tutorials.write_notebooks(tmp_path), strict=True):
+        cells = [cell["source"] for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+        texts = ["".join(cell) for cell in cells]
+        for block in blocks(page):
+            [text] = [text for text in texts if block.code.strip() in text]
+            assert text.startswith("%%") == (block.language == "sh")
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_quick_tutorials_run(name, tmp_path):
+    with workplace(tmp_path):
+        run_page(tutorials.TUTORIALS / name, tests=True, quick=True)
+
+
+@pytest.mark.long
+def test_all_tutorials_run_in_a_row(tmp_path):
+    with workplace(tmp_path):
+        for page in pages():
+            if page.name.startswith("6") and not (importlib.util.find_spec("rclpy") or os.environ.get("ROS_DISTRO")):
+                pytest.skip("the sixth needs rclpy: pip install -e '.[ros]'")
+            run_page(page, tests=True)
+    assert list((tmp_path / "runs").glob("first/index.html"))

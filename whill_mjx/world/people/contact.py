@@ -1,0 +1,133 @@
+"""Contact of the vehicle with people while both move, and whose it is.
+
+A person who walks into a vehicle that stands is stopped by it and counted (`People.bumped`); the episode goes on. A
+contact is a collision of the vehicle where its own border moves towards the person.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from whill_mjx.world.collision import HALVINGS, Stadiums, distances
+from whill_mjx.world.people import body
+from whill_mjx.world.people.around import mover_of, near_in
+from whill_mjx.world.people.crowd import People
+from whill_mjx.world.people.law import walk
+from whill_mjx.world.scene import Footprint, Scene
+
+STANDING = 0.05
+"""Speed towards a person below which the vehicle stands, as far as contact is concerned [m/s]."""
+FASTEST_FOOT = 4.8
+"""Speed of a swinging foot at 1.9 m/s, the fastest walk of people by default [m/s]."""
+DEPTH = 0.025
+"""Way of any two points relative to each other between two tested poses [m].
+
+A corner that grazes a leg of 7.6 cm radius between two of them gets DEPTH^2 / (8 r) = 1 mm deep unseen.
+"""
+
+
+def scene_without_people(scene: Scene) -> Scene:
+    """What stands: the scene without its people."""
+    if scene.people is None:
+        return scene
+    return dataclasses.replace(scene, solids=body.removed(scene.solids, scene.people), people=None)  # type: ignore[arg-type]
+
+
+def scene_with_people(scene: Scene, people: People, key: jax.Array) -> Scene:
+    """A scene with people in it, seen, scanned and hit; those that it has already stay."""
+    if scene.people is not None:
+        from whill_mjx.world.people.crowd import join
+
+        scene, people = scene_without_people(scene), join(scene.people, people)
+    return dataclasses.replace(scene, solids=body.added(scene.solids, people, key), people=people)
+
+
+def poses_among_people(speed: float, yaw_rate: float, duration: float, half_length: float, half_width: float) -> int:
+    """Poses to test in one step, so that vehicle and people move at most `DEPTH` towards each other between two."""
+    fastest = abs(speed) + abs(yaw_rate) * math.hypot(half_length, half_width) + FASTEST_FOOT
+    return max(1, math.ceil(duration * fastest / DEPTH))
+
+
+def walk_around(
+    scene: Scene, before: Footprint, after: Footprint, duration: float, poses: int
+) -> tuple[Scene, jax.Array, jax.Array]:
+    """People of a scene after a period, and what the vehicle met on its way from `before` to `after`.
+
+    Args:
+        scene: at the beginning.
+        before, after: the vehicle at both ends; between them place and heading change evenly.
+        duration: static [s].
+        poses: static, from `poses_among_people`.
+
+    Returns:
+        The scene at the end; whether the vehicle ran into somebody (); the share () of its way until then, else 1.
+    """
+    people, solids = scene.people, scene.solids
+    assert people is not None and solids is not None
+    mover = mover_of(before, after, duration)
+    walked = walk(people, near_in(scene_without_people(scene)), mover, duration)
+    first = body.ends_of(body.own_rounds(solids, people))
+    last = body.skeleton(walked)
+    radius = people.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
+    turn = duration * mover.yaw_rate
+
+    def vehicle(share):
+        return dataclasses.replace(
+            after,
+            x=before.x + share * (after.x - before.x),
+            y=before.y + share * (after.y - before.y),
+            yaw=before.yaw + share * turn,
+        )
+
+    def apart(footprint: Footprint, share: jax.Array) -> jax.Array:
+        """(N,) m from a vehicle to each person at a share () of the period."""
+        start, end = (a[:, : body.TOUCHING] + share * (b - a)[:, : body.TOUCHING]
+                      for a, b in zip(first, last, strict=True))  # fmt: skip
+        low = jnp.minimum(start[..., 2], end[..., 2]) - radius
+        there = jnp.broadcast_to(people.there[:, None], low.shape)
+        parts = (start[..., :2], end[..., :2], radius, low, there)
+        stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
+        far = distances(footprint, stadiums)
+        met = stadiums.mask & (stadiums.low < footprint.height)
+        return jnp.where(met, far, jnp.inf).reshape(-1, body.TOUCHING).min(-1)
+
+    shares = jnp.arange(1, poses + 1) / poses
+    hits = jax.vmap(lambda share: apart(vehicle(share), share) <= 0.0)(shares)  # (poses, N)
+    touched = hits.any(0)
+    index = jnp.argmax(hits, 0)
+    low, high = index / poses, (index + 1) / poses
+    row = jnp.arange(people.speed.shape[0])
+    own = jax.vmap(lambda share, one, back: apart(vehicle(share - back), share)[one])
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        there = own(middle, row, jnp.zeros(row.shape)) <= 0.0
+        low, high = jnp.where(there, low, middle), jnp.where(there, middle, high)
+    # By how much a vehicle that goes a whole period back is farther from where the person is at the contact.
+    approach = own(high, row, jnp.ones(row.shape)) / duration
+    ran_into = touched & (approach > STANDING)
+    collided = ran_into.any()
+    share = jnp.min(jnp.where(ran_into, high, 1.0), initial=1.0)
+    kept = jnp.where(touched, jnp.minimum(low, share), share)  # (N,) how far each person gets
+    people_after = _between(people, walked, kept, touched & ~ran_into)
+    start, end = (a + kept[:, None, None] * (b - a) for a, b in zip(first, last, strict=True))
+    solids_after = body.moved(solids, people_after, start, end)
+    return dataclasses.replace(scene, solids=solids_after, people=people_after), collided, share
+
+
+def _between(before: People, after: People, share: jax.Array, stopped: jax.Array) -> People:
+    """People at a share (N,) of their way; who was stopped stands, and knows of the vehicle from then on."""
+    part = share[:, None]
+    turn = jnp.mod(after.phase - before.phase, 2 * jnp.pi)
+    return dataclasses.replace(
+        after,
+        position=before.position + part * (after.position - before.position),
+        velocity=jnp.where(stopped[:, None], 0.0, after.velocity),
+        phase=jnp.mod(before.phase + share * turn, 2 * jnp.pi),
+        yields=after.yields | stopped,
+        held=before.held | stopped,
+        bumped=stopped & ~before.held,
+    )
