@@ -24,19 +24,21 @@ from sysid.replay.mjcf_file import drive_entries, load_robot
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
-from sysid.replay.robot_check import rolling_ratio
-from sysid.replay.robot_drive import RobotDrive
+from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.config import VehicleConfig
-from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import find_spec
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 WRONG = Wrong(radius=0.03, track=-0.05, odometry=-0.02, x=0.12, y=-0.05, yaw=0.14)
+NAMES = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "slip_traction.mu", "body.com_x", "pose_mount.x",
+         "wheel_radius_difference.common", "track_width.error", "command_delay.delay")
 SIZES = {"wheel_radius_difference.common", "track_width.error", "odometry_scale.linear", "pose_mount.x",
          "pose_mount.yaw"}
 
@@ -270,6 +272,38 @@ def test_the_controller_that_a_fit_adds_is_written_and_read_again(small_robot, t
     np.testing.assert_allclose(host.jnt_actfrcrange[list(robot.joints)], [[-0.06, 0.06]] * 2, rtol=1e-6)
     nominal = load_robot(file).host.body("base_link").inertia
     np.testing.assert_allclose(np.sort(host.body("base_link").inertia / nominal), 0.004 / nominal.max(), rtol=1e-4)
+
+
+@pytest.mark.quick
+def test_a_fitted_robot_becomes_a_vehicle_where_it_slides_on_a_ball(small_robot, tmp_path):
+    log, file = small_robot
+    model = mjcf_model(file, calibrate=True, wheel_radius=0.033, track=0.16, effects=("command_delay", "pose_mount"))
+    wanted = {"drive.kp": 0.02, "drive.ki": 0.1, "drive.limit": 0.06, "wheels.radius": 0.034, "wheels.track": 0.152,
+              "geom.*_wheel.friction": 0.7, "geom.ball.friction": 0.04, "command_delay.delay": 0.03,
+              "pose_mount.x": 0.05}
+    params = set_parameters(model.params, list(wanted), jnp.array(list(wanted.values())))
+    spec, vehicle = model.vehicle(params, log.spec)
+    save_vehicle(tmp_path / "vehicle.toml", spec, vehicle)
+    spec, vehicle, _ = load_vehicle(tmp_path / "vehicle.toml")
+    assert spec.driven_axle == "front" and spec.reference_x == pytest.approx(0.03)  # the ball is 6 cm behind
+    assert spec.mass == pytest.approx(SMALL.mass, abs=0.002) and spec.wheel_radius == 0.033
+    found = dict(zip(NAMES, map(float, get_values(vehicle, NAMES)), strict=True))
+    assert found == pytest.approx({
+        "torque_drive.kp": 0.02, "torque_drive.ki": 0.1, "torque_drive.limit": 0.06, "slip_traction.mu": 0.7,
+        "wheel_radius_difference.common": 1 / 33, "track_width.error": -0.05, "command_delay.delay": 0.03,
+        "pose_mount.x": 0.05, "body.com_x": 0.03 + SMALL.com[0] * 1.12 / 1.2}, rel=1e-2)
+
+
+@pytest.mark.quick
+def test_a_robot_of_another_kind_becomes_no_vehicle_and_the_reason_is_said(small_robot, tmp_path):
+    log, file = small_robot
+    assert mjcf_model(file).vehicle(mjcf_model(file).params, log.spec) == "sizes and controller were not fitted"
+    from test_robots import robot_file, wheel
+
+    wheels = (wheel(f"{end}_{side}_wheel", x, y) for end, x in (("front", 0.25), ("rear", -0.25))
+              for side, y in (("left", 0.25), ("right", -0.25)))
+    model = mjcf_model(robot_file(tmp_path, *wheels), calibrate=True)
+    assert "skid-steered" in model.vehicle(model.params, log.spec)
 
 
 @pytest.mark.quick
