@@ -1,6 +1,7 @@
 """The usual first calibration: a small robot whose wheels, track and markers are not where its owner believes.
 
     python -m benchmarks.calibration                     # drives and fits it
+    python -m benchmarks.calibration --robot porter --file mjcf      # one of 9 kg, from a file with motors
     python -m benchmarks.calibration --parts files --folder ROBOTS   # loads and drives each robot file of a folder
 
 `small`: a robot of a kilogram is driven on the contact plant, which shares no code with the model, and fitted as by
@@ -15,13 +16,14 @@ import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from benchmarks.harness import figure, record
 from benchmarks.logs import CLAIM
 from benchmarks.plant.commands import nine
-from benchmarks.plant.first_day import FASTER, SLOWER, Wrong, make_uncalibrated, write_urdf
+from benchmarks.plant.first_day import FASTER, SLOWER, SMALL_ONES, Wrong, make_uncalibrated, write_mjcf, write_urdf
 from sysid.command_line import progress_bar
 from sysid.logs.log import load_log
 from sysid.pages.report import error_rows, summaries
@@ -42,6 +44,12 @@ class Benchmark:
 
     parts: tuple[str, ...] = ("small",)
     """Of small and files."""
+    robot: Literal["small", "porter"] = "small"
+    """One of 1.2 kg with quick controllers, or one of 9 kg with slow ones."""
+    file: Literal["urdf", "mjcf"] = "urdf"
+    """What its owner has of it."""
+    replicates: int = 3
+    """Drives of each manoeuvre."""
     folder: Path = Path("robots")
     """With robot files, for `files`."""
     seed: int = 0
@@ -53,7 +61,8 @@ class Benchmark:
 
 def small(config: Benchmark) -> dict[str, dict]:
     """Figures of the small robot."""
-    wrong = Wrong(x=0.05, y=-0.02)
+    wrong, chair = Wrong(x=0.05, y=-0.02), SMALL_ONES[config.robot]
+    write, suffix = (write_urdf, "urdf") if config.file == "urdf" else (write_mjcf, "xml")
     tables = {}
     for name, table in nine(config.seed).items():
         if name in MANOEUVRES:
@@ -62,9 +71,9 @@ def small(config: Benchmark) -> dict[str, dict]:
             tables[name] = kept
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        make_uncalibrated(folder / "log", "small", wrong, config.seed, 3, tables)
+        make_uncalibrated(folder / "log", config.robot, wrong, config.seed, config.replicates, tables)
         log = load_log(folder / "log")
-        settings = FitConfig(model=str(write_urdf(folder / "robot.urdf")), quick=config.quick,
+        settings = FitConfig(model=str(write(folder / f"robot.{suffix}", chair)), quick=config.quick,
                              elsewhere=config.elsewhere)
         progress, close = progress_bar(expected_steps(settings))
         try:
@@ -86,7 +95,8 @@ def small(config: Benchmark) -> dict[str, dict]:
         "mount_offset_deg": (abs(math.degrees(found["pose_mount.yaw"] - wrong.yaw)), "deg"),
         "small_robot_fit_s": (fit.seconds, "s"),
     }
-    return {name: figure([float(value)], unit) for name, (value, unit) in values.items()}
+    kind = "" if (config.robot, config.file) == ("small", "urdf") else f"_{config.robot}_{config.file}"
+    return {f"{name}{kind}": figure([float(value)], unit) for name, (value, unit) in values.items()}
 
 
 def files(config: Benchmark) -> dict[str, dict]:

@@ -121,8 +121,7 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
                       "deviations")
         print(f"  {sum(one['within'] for one in report['prior']['moved'])} parameters stayed within 90 %")
     print(table(report))
-    other = settings.model or log.fields.get("input") == "wheels"
-    fitted = "model.toml" if other else "vehicle.toml"
+    fitted = ", ".join(name for name in ("model.toml", "model.xml", "vehicle.toml") if (arguments.out / name).exists())
     print(f"wrote {arguments.out / 'report.html'}, report.json, {fitted} and the plots")
 
 

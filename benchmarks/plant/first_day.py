@@ -24,12 +24,19 @@ from benchmarks.plant.sensors import odometry, outside_pose
 from benchmarks.plant.trial import Noise, Plant
 from whill_mjx.logs.dataset import write_text
 
-BALL, BALL_X = 0.012, -0.06  # m, radius of the small robot's ball and its place
+SPIN = (0.3, 0.5, 0.3)  # inertia of a small robot's wheel over its mass times the square of its radius
 SMALL = Chair(
     nominal=Nominal(0.033, 0.16, 0.12, 1.2), radius=(0.033, 0.033), track=0.16, mass=1.2, com=(-0.02, 0.0, 0.03),
     gyration=(0.05, 0.055, 0.06), wheel_mass=0.04, armature=6e-5, damping=4e-4, friction=0.8, patch=5e-4,
     roller=0.05, roller_drag=0.0, kp=0.02, ki=0.1, torque_limit=0.06, delay=0.03,
 )
+PORTER = Chair(
+    nominal=Nominal(0.075, 0.34, 0.3, 9.0), radius=(0.075, 0.075), track=0.34, mass=9.0, com=(-0.04, 0.0, 0.06),
+    gyration=(0.1, 0.11, 0.13), wheel_mass=0.3, armature=4e-3, damping=5e-3, friction=0.7, patch=5e-4, roller=0.03,
+    roller_drag=0.0, kp=0.35, ki=0.9, torque_limit=1.2, delay=0.07,
+)
+SMALL_ONES = {"small": SMALL, "porter": PORTER}
+"""Two wheels and a ball that slides, 0.36 wheel radii large and half of the stated wheelbase behind."""
 SLOWER, FASTER = 0.25, 1.8  # of speeds and yaw rates of the chair's manoeuvres, for the small robot
 
 
@@ -52,8 +59,8 @@ class Wrong:
 
 
 def uncalibrated(vehicle: str, wrong: Wrong) -> Chair:
-    """A vehicle of `chair.VEHICLES`, or `small`, with true sizes that differ from its nominal ones."""
-    chair = SMALL if vehicle == "small" else VEHICLES[vehicle]
+    """A vehicle of `chair.VEHICLES` or `SMALL_ONES`, with true sizes that differ from its nominal ones."""
+    chair = (VEHICLES | SMALL_ONES)[vehicle]
     radius = chair.nominal.radius * (1 + wrong.radius)
     return replace(chair, radius=(radius, radius), track=chair.nominal.track * (1 + wrong.track))
 
@@ -66,7 +73,7 @@ def make_uncalibrated(
 
     Args:
         out: folder to write.
-        vehicle: of `chair.VEHICLES`, or `small`.
+        vehicle: of `chair.VEHICLES` or `SMALL_ONES`.
         wrong: what is wrong with the believed sizes.
         seed: of command levels, start headings, disturbances and sensor noise.
         replicates: drives of each manoeuvre.
@@ -74,7 +81,7 @@ def make_uncalibrated(
         ground_truth: whether the outside pose is written.
     """
     chair = uncalibrated(vehicle, wrong)
-    small = vehicle == "small"
+    small = vehicle in SMALL_ONES
     plant = SmallPlant(chair, COULOMB) if small else Plant(chair)
     tables = dict(manoeuvres or nine(seed))
     if small and manoeuvres is None:
@@ -107,20 +114,22 @@ def tracked(pose: np.ndarray, wrong: Wrong) -> np.ndarray:
 
 
 class SmallPlant(Plant):
-    """The small robot: cylinder wheels, a ball behind that slides."""
+    """A small robot: two wheels, a ball behind that slides."""
 
     @staticmethod
     def build(chair: Chair, contact: Contact = SLOW) -> mujoco.MjModel:
         """Its model."""
         frame = chair.mass - 2 * chair.wheel_mass
         inertia = " ".join(f"{frame * radius**2:.9g}" for radius in chair.gyration)
+        spin = " ".join(f"{share * chair.wheel_mass * chair.nominal.radius**2:.6g}" for share in SPIN)
+        ball, ball_x = ball_of(chair)
         solver = f'solref="0.006 1" solreffriction="{contact.friction_time:g} 1" solimp="0.95 0.99 0.0005"'
         tyre = f'condim="4" friction="{chair.friction} {chair.friction} {chair.patch} 1e-4 1e-4" {solver}'
         wheels = "".join(
             f'<body name="wheel_{side}" pos="0 {sign * chair.track / 2} 0"><joint name="wheel_{side}" axis="0 1 0" '
             f'damping="{chair.damping}" armature="{chair.armature}"/><inertial pos="0 0 0" mass="{chair.wheel_mass}" '
-            f'diaginertia="1.3e-5 2.2e-5 1.3e-5"/><geom name="tyre_{side}" type="ellipsoid" '
-            f'size="{radius} 0.009 {radius}"/></body>'
+            f'diaginertia="{spin}"/><geom name="tyre_{side}" type="ellipsoid" '
+            f'size="{radius} {0.27 * radius} {radius}"/></body>'
             for side, sign, radius in (("left", 1, chair.radius[0]), ("right", -1, chair.radius[1])))
         high = sum(chair.radius) / 2
         return mujoco.MjModel.from_xml_string(f"""
@@ -129,33 +138,68 @@ class SmallPlant(Plant):
   <worldbody><geom name="floor" type="plane" size="0 0 1"/>
     <body name="chassis" pos="0 0 {high}"><freejoint/>
       <inertial pos="{' '.join(map(str, chair.com))}" mass="{frame}" diaginertia="{inertia}"/>{wheels}
-      <body name="caster" pos="{BALL_X} 0 {BALL - high}"><geom name="ball" type="sphere" size="{BALL}"/></body>
+      <body name="caster" pos="{ball_x} 0 {ball - high}"><geom name="ball" type="sphere" size="{ball}"/></body>
     </body></worldbody>
   <contact><pair geom1="floor" geom2="tyre_left" {tyre}/><pair geom1="floor" geom2="tyre_right" {tyre}/>
     <pair geom1="floor" geom2="ball" condim="3" friction="{chair.roller} {chair.roller} 0 0 0" {solver}/></contact>
 </mujoco>""")
 
 
+def ball_of(chair: Chair) -> tuple[float, float]:
+    """Radius of a small robot's ball, and its place ahead of the axle [m]."""
+    return 0.36 * chair.nominal.radius, -chair.nominal.wheelbase / 2
+
+
+def write_mjcf(path: Path, chair: Chair = SMALL) -> Path:
+    """An MJCF file of a small robot with believed sizes: motors, and MuJoCo's own contacts."""
+    nominal, radius = chair.nominal, chair.nominal.radius
+    frame, (ball, ball_x) = chair.mass - 2 * chair.wheel_mass, ball_of(chair)
+    inertia, spin = (" ".join(f"{mass * length**2 * share:.6g}" for length, share in lengths) for mass, lengths in (
+        (frame, [(one, 1.0) for one in chair.gyration]), (chair.wheel_mass, [(radius, one) for one in SPIN])))
+    wheels = "".join(
+        f'<body name="{side}_wheel" pos="0 {sign * nominal.track / 2} 0"><joint name="{side}" axis="0 1 0" '
+        f'armature="{chair.armature}"/><inertial pos="0 0 0" mass="{chair.wheel_mass}" diaginertia="{spin}"/>'
+        f'<geom name="{side}_tyre" type="sphere" size="{radius}"/></body>'
+        for side, sign in (("left", 1), ("right", -1)))
+    limit = 2 * chair.torque_limit
+    motors = "".join(f'<motor name="{side}_motor" joint="{side}" ctrlrange="-{limit} {limit}"/>'
+                     for side in ("left", "right"))
+    write_text(path, f"""<mujoco model="small robot"><option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><geom name="floor" type="plane" size="0 0 1"/>
+    <body name="base" pos="0 0 {radius}"><freejoint/>
+      <inertial pos="{chair.com[0]} 0 {chair.com[2]}" mass="{frame}" diaginertia="{inertia}"/>
+      <geom name="ball" type="sphere" size="{ball}" pos="{ball_x} 0 {ball - radius}" friction="0.05" priority="1"/>
+      {wheels}</body></worldbody>
+  <actuator>{motors}</actuator>
+</mujoco>
+""")
+    return path
+
+
 def write_urdf(path: Path, chair: Chair = SMALL) -> Path:
-    """The robot file that the owner of the small robot has: believed sizes, a ball, boxes and cylinders."""
+    """The robot file that the owner of a small robot has: believed sizes, a ball, boxes and cylinders."""
     nominal, radius = chair.nominal, chair.nominal.radius
     frame = chair.mass - 2 * chair.wheel_mass
     ixx, iyy, izz = (frame * one**2 for one in chair.gyration)
+    turned, rolled = (share * chair.wheel_mass * radius**2 for share in SPIN[:2])
+    ball, ball_x = ball_of(chair)
     wheels = "".join(
-        f'<link name="{side}_wheel"><inertial><mass value="{chair.wheel_mass}"/><inertia ixx="1.3e-5" ixy="0" ixz="0" '
-        f'iyy="1.3e-5" iyz="0" izz="2.2e-5"/></inertial><collision><geometry><cylinder radius="{radius}" '
-        f'length="0.018"/></geometry></collision></link><joint name="{side}_wheel_joint" type="continuous">'
+        f'<link name="{side}_wheel"><inertial><mass value="{chair.wheel_mass}"/><inertia ixx="{turned:.6g}" ixy="0" '
+        f'ixz="0" iyy="{turned:.6g}" iyz="0" izz="{rolled:.6g}"/></inertial><collision><geometry>'
+        f'<cylinder radius="{radius}" length="{0.54 * radius}"/></geometry></collision></link>'
+        f'<joint name="{side}_wheel_joint" type="continuous">'
         f'<parent link="base_link"/><child link="{side}_wheel"/><origin xyz="0 {sign * nominal.track / 2} {radius}" '
         f'rpy="-1.5707963 0 0"/><axis xyz="0 0 1"/></joint>' for side, sign in (("left", 1), ("right", -1)))
     write_text(path, f"""<?xml version="1.0"?>
 <robot name="small_robot">
   <link name="base_link"><inertial><origin xyz="{chair.com[0]} 0 {radius + chair.com[2]}"/><mass value="{frame}"/>
     <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>
-    <collision><origin xyz="-0.01 0 0.065"/><geometry><box size="0.14 0.13 0.06"/></geometry></collision></link>
+    <collision><origin xyz="{ball_x / 6} 0 {2 * radius}"/><geometry>
+    <box size="{1.2 * nominal.wheelbase} {0.8 * nominal.track} {1.8 * radius}"/></geometry></collision></link>
   <link name="ball"><inertial><mass value="0.001"/><inertia ixx="1e-7" ixy="0" ixz="0" iyy="1e-7" iyz="0" izz="1e-7"/>
-    </inertial><collision><geometry><sphere radius="{BALL}"/></geometry></collision></link>
+    </inertial><collision><geometry><sphere radius="{ball}"/></geometry></collision></link>
   <joint name="ball_joint" type="fixed"><parent link="base_link"/><child link="ball"/>
-    <origin xyz="{BALL_X} 0 {BALL}"/></joint>
+    <origin xyz="{ball_x} 0 {ball}"/></joint>
   {wheels}
 </robot>
 """)

@@ -91,8 +91,8 @@ def fit_dataset(
 ) -> dict[str, Any]:
     """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
 
-    Of another model than the simulator's vehicle, model.toml is written instead of vehicle.toml, and model.xml where
-    it came from an MJCF or URDF file.
+    Of another model than the simulator's vehicle, model.toml is written, model.xml where it came from an MJCF or URDF
+    file, and vehicle.toml where a vehicle of the simulator drives alike.
 
     Args:
         path: dataset folder; only named in the report when `log` is given.
@@ -122,6 +122,9 @@ def fit_dataset(
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
     report = make_report(log, config, fit, rows, str(path), source)
+    vehicle = None if fit.model is None or fit.model.vehicle is None else fit.model.vehicle(fit.params, log.spec)
+    if isinstance(vehicle, str):
+        report["dataset"]["notes"].append(f"no vehicle of the simulator is written: {vehicle}")
     write_report(out / "report.json", report)
     write_plots(out, trials, initial, fitted, rows)
     series = collect(trials, initial, fitted)
@@ -134,4 +137,6 @@ def fit_dataset(
         save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report), known.as_table())
     else:
         save_model(out, fit.model, fit.params, intervals, provenance(report))
+        if isinstance(vehicle, tuple):
+            save_vehicle(out / "vehicle.toml", *vehicle, provenance=provenance(report))
     return report

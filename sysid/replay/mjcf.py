@@ -41,11 +41,13 @@ from sysid.replay.mjcf_file import (
     write_mjcf,
 )
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
-from sysid.replay.robot_check import rolling_ratio
-from sysid.replay.robot_drive import RobotDrive
+from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_vehicle import vehicle_of
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
 from whill_mjx.vehicle.model import import_mjx
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
 AROUND_ROBOT = ("command_delay", "acceleration_limit", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
@@ -100,7 +102,7 @@ def mjcf_model(
     if calibrate:
         # Where wheels slip in every turn, the track has no part of its own.
         drive = drive_entries(robot)
-        names = (*(one for one in names if not (robot.added and one.startswith("actuator."))),
+        names = (*(one for one in names if not ((robot.added or robot.motors) and one.startswith("actuator."))),
                  *drive, turning_inertia(robot),
                  *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
                  *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
@@ -148,7 +150,10 @@ def mjcf_model(
                                   if name in entries}, Path(folder) / "model.xml")
 
     around = AROUND_ROBOT if calibrate else ()
-    return Model(robot.path.name, plant, params, write, robot.notes, around).with_effects(effects)
+    def vehicle(params: Parameters, spec: VehicleSpec) -> tuple[VehicleSpec, VehicleParams] | str:
+        return vehicle_of(robot, entries, params, spec)
+
+    return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle).with_effects(effects)
 
 
 def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:

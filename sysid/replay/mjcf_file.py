@@ -695,7 +695,7 @@ def drive_entries(robot: Robot) -> dict[str, tuple[Entry, float, float, float]]:
         ids = tuple(robot.added)
         kp = Entry("drive.kp", "actuator_gainprm", ids, 0, "N m s/rad", ids, (2,))
         high = robot.spin / host.opt.timestep  # a wheel that slips is stable
-        found["drive.kp"] = (kp, min(load / 0.03, high / 2), load / 1.0, high)
+        found["drive.kp"] = (kp, min(load / 0.1, high / 2), load / 1.0, high)
     if both:
         ki = Entry("drive.ki", "actuator_gainprm", both, 0, "N m/rad", both, (1,))
         found["drive.ki"] = (ki, LAGGING * load, 0.3 * load, 2000.0 * load)

@@ -63,6 +63,8 @@ class Model:
     """What of its file was left out or replaced."""
     around: tuple[str, ...] = ()
     """Effects that it may have around it: a fit adds those that a log shows."""
+    vehicle: Callable[[Parameters, VehicleSpec], tuple[VehicleSpec, VehicleParams] | str] | None = None
+    """The vehicle of the simulator that drives alike, or why there is none."""
 
     def with_effects(self, names: Sequence[str]) -> Model:
         """The same model with effects of the catalogue around it; ValueError for those that act inside one."""
@@ -125,7 +127,7 @@ def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...
     return (*sizes, *(("odometry_scale",) if both else ()), "pose_mount")
 
 
-UNLIMITED = {"acceleration_limit.wheel": 60.0}
+UNLIMITED = {"acceleration_limit.wheel": 50.0}
 """Upper bounds where a limit no longer acts [m/s^2]: at the effect's usual bound of 5 a small robot takes 50 ms."""
 ODOMETRY_ALONE, POSE_ALONE, BOTH = ("odometry_lag",), ("pose_mount",), ("sensor_delay", "odometry_scale")
 """Effects around a model that show in one stream, or against the other."""

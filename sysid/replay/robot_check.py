@@ -9,13 +9,9 @@ import mujoco
 import numpy as np
 
 from sysid.replay.mjcf_file import KINDS, Robot
-from sysid.replay.robot_drive import RobotDrive
+from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
 
-SPIN = 5.0  # rad/s of a wheel in the drives that are tried
-SECONDS = 3.0  # of each; the first second is left out
-RAMP = 0.5  # s in which the command is reached: stiff servos would tip what is light in front
 STRAIGHT = 0.1  # share by which the speed may differ from the command
-SINKS = 0.05  # share by which a wheel may roll on less than its radius; one that does by more slips
 LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
 
 
@@ -60,22 +56,6 @@ def check_robot(robot: Robot) -> Check:
     took = SECONDS - 1
     return Check(_loads(robot), (v, omega), float(forward / took), float((yaw[-1] - yaw[second]) / took),
                  float((turned[-1] - turned[second]) / took))
-
-
-def rolling_ratio(robot: Robot) -> float:
-    """Way of a straight drive over what its wheels turn times their radius: MuJoCo's contacts are soft, wheels sink
-    into the floor and roll on less than their radius. 1 where the robot does not drive."""
-    steps, half = round(SECONDS / robot.host.opt.timestep), round(SECONDS / 2 / robot.host.opt.timestep)
-    commands = np.zeros((1, 1, steps, 2))
-    ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)
-    commands[..., 0] = SPIN * robot.wheel_radius * ramp
-    states = SimpleNamespace(qpos=robot.rest[None, None], qvel=np.zeros((1, 1, robot.host.nv)))
-    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
-    path = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 1, 3)))[0, 0, half:]
-    turned = path[1:, 3].sum() * robot.host.opt.timestep
-    way = np.hypot(*np.diff(path[:, :2], axis=0).T).sum()
-    ratio = float(way / turned) if turned > 0 else 1.0
-    return ratio if abs(ratio - 1) < SINKS else 1.0
 
 
 def _loads(robot: Robot) -> dict[str, float]:

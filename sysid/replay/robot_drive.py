@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -13,6 +14,10 @@ from mujoco import rollout
 from sysid.replay.cores import cores
 from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
 
+SPIN = 5.0  # rad/s of a wheel in the drives that are tried
+SECONDS = 3.0  # of each; the first second is left out
+RAMP = 0.5  # s in which the command is reached: stiff servos would tip what is light in front
+SINKS = 0.05  # share by which a wheel may roll on less than its radius; one that does by more slips
 LOST = 1e6  # m, rad or their rates: where a drive no longer means anything
 
 
@@ -82,6 +87,22 @@ class RobotDrive:
         left, right = (rims[..., robot.sides == side].mean(-1) for side in (0, 1))
         yaw = np.arctan2(forward[..., 1], forward[..., 0])
         return np.stack([where[..., 0], where[..., 1], yaw, (left + right) / 2, (right - left) / robot.track], axis=-1)
+
+
+def rolling_ratio(robot: Robot) -> float:
+    """Way of a straight drive over what its wheels turn times their radius: MuJoCo's contacts are soft, wheels sink
+    into the floor and roll on less than their radius. 1 where the robot does not drive."""
+    steps, half = round(SECONDS / robot.host.opt.timestep), round(SECONDS / 2 / robot.host.opt.timestep)
+    commands = np.zeros((1, 1, steps, 2))
+    ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)
+    commands[..., 0] = SPIN * robot.wheel_radius * ramp
+    states = SimpleNamespace(qpos=robot.rest[None, None], qvel=np.zeros((1, 1, robot.host.nv)))
+    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
+    path = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 1, 3)))[0, 0, half:]
+    turned = path[1:, 3].sum() * robot.host.opt.timestep
+    way = np.hypot(*np.diff(path[:, :2], axis=0).T).sum()
+    ratio = float(way / turned) if turned > 0 else 1.0
+    return ratio if abs(ratio - 1) < SINKS else 1.0
 
 
 def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp: float) -> None:

@@ -196,7 +196,7 @@ def test_inspect_says_what_was_understood_and_draws_it(tmp_path, capsys):
 def test_json_of_a_robot_is_all_that_comes_on_stdout(tmp_path):
     """In a process of its own, which imports MJX for the first time."""
     path = robot_file(tmp_path, *TWO)
-    command = [sys.executable, "-m", "sysid.inspect", str(path), "--json"]
+    command = [sys.executable, "-m", "sysid.inspect", str(path), "--json", "--out", str(tmp_path / "seen")]
     assert json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)["driven_wheels"] == 2
 
 

@@ -257,6 +257,8 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("incline.along_x", "incline.along_y", "slope.along_x", "slope.along_y"), (-1.5, 1.5)),
     "drive_gain_difference.difference": (-2.0, 2.0),
     "gyro_bias.scale": (-10.0, 10.0),
+    "torque_drive.kp": (1e-4, 2e3),
+    "torque_drive.limit": (1e-3, 2e4),
     "track_width.error": (-0.9, 5.0),
     "unnamed.quantity": (1.0, 11.0),
     **dict.fromkeys(("wheel_radius_difference.difference", "wheel_radius_difference.common"), (-0.6, 0.6)),

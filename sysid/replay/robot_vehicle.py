@@ -1,0 +1,109 @@
+"""A fitted robot as a vehicle of the simulator, where its kind has one: two driven wheels and supports that slide.
+
+What the fit knows of the robot goes over value by value: its mass distribution, the true sizes of its wheels, its
+controller, friction, and all effects around it. What a contact solver has no number for, such as how a tyre creeps, is
+taken for stiff. A vehicle of the simulator can be trained, closed into the loop and exported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
+from sysid.replay.models import Parameters, with_effects
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import VehicleParams
+
+CREEP, SIDE_CREEP = 0.002, 0.005  # m/s, sliding speeds of a stiff tyre along and across
+DRIVE = {"drive.kp": "torque_drive.kp", "drive.ki": "torque_drive.ki", "drive.limit": "torque_drive.limit"}
+FRICTION = ".friction"
+
+
+def vehicle_of(
+    robot: Robot, entries: dict[str, Entry | Size], params: Parameters, spec: VehicleSpec,
+) -> tuple[VehicleSpec, VehicleParams] | str:  # fmt: skip
+    """Spec and parameters of the vehicle that drives as the robot, or the reason why there is none.
+
+    Args:
+        robot: that was fitted.
+        entries: where its parameters stand.
+        params: fitted ones.
+        spec: of the log: stated wheel radius and track, and limits of commands.
+    """
+    values = {name: float(value) for name, value in params.values.items()}
+    if len(robot.wheels) != 2:
+        return "a skid-steered robot's wheels slide in another way than a vehicle's"
+    if not set(DRIVE) <= set(values) or "wheels.radius" not in values:
+        return "sizes and controller were not fitted"
+    if not robot.sliding:
+        return "its casters turn or swivel"
+    arrays: dict[str, np.ndarray] = {}
+    for name, entry in entries.items():
+        arrays.update(entry.changes(Overlaid(robot.host, arrays), values[name]))
+    mass, com, yaw_inertia, ahead, share = _at_rest(robot, arrays)
+    if ahead.min() < 0 < ahead.max():
+        return "it stands on supports before and behind its axle"
+    support = float(ahead.mean())
+    spec = replace(spec, mass=mass, drive="differential", driven_axle="rear" if support > 0 else "front",
+                   wheelbase=abs(support), rear_axle_x=None, wheel_inertia=robot.spin)
+    wheels, balls = (_friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
+    gain = float(abs(robot.host.actuator_gainprm[robot.actuators[0], 0])) if robot.motors else 1.0
+    found = {
+        "body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
+        "body.com_y": com[1], "body.com_z": com[2],
+        **{name: values[ours] * (gain if ours == "drive.kp" else 1.0) for ours, name in DRIVE.items()},
+        "torque_drive.windup": 1.0, "slip_traction.mu": wheels, "slip_traction.slip_speed": CREEP,
+        "slip_traction.side_slip_speed": SIDE_CREEP, "slip_traction.mu_free": balls, "yaw_scrub.torque": 0.0,
+        "rolling_resistance.mu_r": balls * share, "command_delay.delay": 0.0, "odometry_lag.time_constant": 0.0,
+        "wheel_radius_difference.common": values["wheels.radius"] / spec.wheel_radius - 1,
+        "wheel_radius_difference.difference": values.get("wheels.difference", 0.0),
+        "track_width.error": values.get("wheels.track", spec.track) / spec.track - 1}
+    around = {effect.name: effect for effect in params.effects}
+    base = with_effects(preset_params(spec, "physical"), ("wheel_radius_difference", "track_width", *around))
+    vehicle = set_values(base, list(found), jnp.asarray(list(found.values()), jnp.result_type(float)))
+    return spec, VehicleParams(vehicle.body, tuple(around.get(effect.name, effect) for effect in vehicle.effects))
+
+
+def _at_rest(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float, np.ndarray, float]:
+    """Mass, its centre (3,) from the axle's middle, yaw inertia about it, places of supports ahead of the axle, and the
+    share of the weight that they carry."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(host, data)
+    mujoco.mj_comPos(host, data)
+    model: Any = Overlaid(host, arrays)
+    root = int(host.body_rootid[host.jnt_bodyid[robot.joints[0]]])
+    turn = data.xmat[root].reshape(3, 3)
+    axle = data.xanchor[list(robot.joints)].mean(0)
+    ahead = turn @ robot.forward
+    axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
+    bodies = np.flatnonzero(host.body_rootid == root)
+    masses, places = model.body_mass[bodies], (data.xipos[bodies] - axle) @ axes.T
+    mass = float(masses.sum())
+    centre = masses @ places / mass
+    upright = np.square(data.ximat[bodies].reshape(-1, 3, 3)[:, 2])
+    inertia = (upright * model.body_inertia[bodies]).sum() + masses @ np.square(places - centre)[:, :2].sum(1)
+    supports = ((data.geom_xpos[list(robot.sliding)] - axle) @ axes.T)[:, 0]
+    return mass, centre, float(inertia), supports, float(np.clip(centre[0] / supports.mean(), 0.0, 1.0))
+
+
+def _tyres(robot: Robot) -> tuple[int, ...]:
+    body = robot.host.jnt_bodyid[robot.joints[0]]
+    return tuple(int(one) for one in np.flatnonzero(robot.host.body_weldid[robot.host.geom_bodyid] == body))
+
+
+def _friction(
+    robot: Robot, entries: dict[str, Entry | Size], values: dict[str, float], geoms: tuple[int, ...],
+) -> float:  # fmt: skip
+    """Fitted sliding friction of geoms, or that of the file."""
+    for name, entry in entries.items():
+        if name.endswith(FRICTION) and isinstance(entry, Entry) and set(entry.ids) & set(geoms):
+            return values[name]
+    return float(robot.host.geom_friction[list(geoms), 0].max())
