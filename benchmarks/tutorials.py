@@ -17,6 +17,7 @@ import os
 import re
 import runpy
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
@@ -153,11 +154,19 @@ def run_here(line: str) -> None:
 
 
 def run_shell(code: str) -> None:
-    """Run lines in bash with this Python and this repository; the first that fails ends them."""
+    """Run lines in bash with this Python and this repository; the first that fails ends them, and nothing stays."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     python_path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     given = {**os.environ, "PATH": path, "PYTHONPATH": python_path, "VIRTUAL_ENV": sys.prefix}
-    subprocess.run(["bash", "-e", "-o", "pipefail", "-c", code], env=given, check=True)
+    command = ["bash", "-e", "-o", "pipefail", "-c", code]
+    process = subprocess.Popen(command, env=given, start_new_session=True)
+    try:
+        status = process.wait()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)  # what the lines left running in the background
+    if status:
+        raise RuntimeError(f"bash ended with {status}.")
 
 
 def pages() -> list[Path]:

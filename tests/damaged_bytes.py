@@ -52,8 +52,11 @@ def damaged(draw, good: bytes):
     return data
 
 
-def check(path, good, read, examples=40):
-    """Write damaged files at `path` and read each: a value, or an error with the name of the file or its folder."""
+def check(path, good, read, examples=40, folder=None):
+    """Write damaged files at `path` and read each: a value, or an error with the name of the file or its folder.
+
+    `folder` is that of a dataset whose other files an error may name.
+    """
     @few(examples)
     @given(damaged(good))
     def one(data):
@@ -62,7 +65,7 @@ def check(path, good, read, examples=40):
             with Costs():
                 read()
         except (ValueError, FileNotFoundError) as error:
-            assert str(path.parent) in str(error) and len(str(error)) < 2000 + 3 * len(str(path))
+            assert str(folder or path.parent) in str(error) and len(str(error)) < 2000 + 3 * len(str(path))
             assert type(error) in (ValueError, FileNotFoundError)
 
     path.write_bytes(good)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import time
+from pathlib import Path
 
 import pytest
 
@@ -37,6 +39,12 @@ def test_a_block_is_changed_in_tests_alone_and_only_by_a_text_that_it_has(tmp_pa
         blocks(page_of(tmp_path, text.replace("tests: a", "tests: b").replace("b 100", "b")))
 
 
+def wait_until_gone(pid):
+    """Return when a process has ended; a zombie, which nobody has waited for, has."""
+    while (path := Path(f"/proc/{pid}/stat")).exists() and path.read_text().split()[2] != "Z":
+        time.sleep(0.01)
+
+
 @pytest.mark.quick
 def test_python_blocks_share_names_and_a_failing_one_is_named_by_page_and_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -44,7 +52,8 @@ def test_python_blocks_share_names_and_a_failing_one_is_named_by_page_and_line(t
     with pytest.raises(RuntimeError, match="page.md, line 6: NameError"):
         run_page(page_of(tmp_path, "```python\na = 1\n```\n\n```python\nb\n```\n"))
     with pytest.raises(RuntimeError, match="page.md, line 2"):
-        run_page(page_of(tmp_path, "```sh\nfalse\ntrue\n```\n"))
+        run_page(page_of(tmp_path, "```sh\nsleep 60 & echo $! > left\nfalse\ntrue\n```\n"))
+    wait_until_gone(int((tmp_path / "left").read_text()))
 
 
 @pytest.mark.quick

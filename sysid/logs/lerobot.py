@@ -202,7 +202,7 @@ def _file_episodes(
     wanted = dict.fromkeys(feature for feature, _ in parts.values())
     missing = sorted((set(wanted) | {"episode_index"}) - set(table))
     if missing:
-        raise ValueError(f"{file}: no column {missing[0]!r}, which {INFO} names. {AGAIN}")
+        raise ValueError(f"{file}: no column {shown(missing[0])}, which {INFO} names. {AGAIN}")
     also = [name for name in ("episode_index", "frame_index", "task_index") if name in table]
     try:
         arrays = {name: np.array(table[name], float).reshape(len(table[name]), -1) for name in (*wanted, *also)}

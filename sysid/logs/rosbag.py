@@ -139,8 +139,11 @@ def read_bag(
                          "repairs one.") from None
     streams = {}
     for stream, topic in chosen.items():
-        if len(rows[stream]) < 2:
+        spare = stream == "imu" and (topics or {}).get(stream) is None  # found by itself, and nothing depends on it
+        if len(rows[stream]) < 2 and not spare:
             raise _too_few(path, topic, len(rows[stream]), stream)
+        if not rows[stream]:
+            continue
         table = np.array([values for _, _, values in rows[stream]], float)
         unset = np.isinf(table).any(axis=1)
         finite = np.isfinite(table).all(axis=1) | (short_type(known[topic]) == "JointState") & ~unset
@@ -155,7 +158,7 @@ def read_bag(
         if not (finite | unset).all():
             notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
         times, stamps = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
-        if len(times) < 2 and stream == "imu" and stream not in (topics or {}):
+        if len(times) < 2 and spare:
             notes.append(f"{topic}: {len(times)} usable messages; it is left out")
             continue
         if len(times) < 2:

@@ -96,6 +96,11 @@ def sloping(drives, stages):
                       progress=lambda steps, stage: stages.append((steps, stage)))
 
 
+@pytest.fixture(scope="module")
+def report(sloping):
+    return make_report(sloping)
+
+
 def test_names_the_slope_and_its_size(sloping):
     assert sloping.search.verdict == "named"
     one = sloping.search.accepted[0]
@@ -226,8 +231,7 @@ def test_a_name_whose_law_the_drives_did_not_put_to_test_comes_with_a_warning(sl
     assert any("do not show whether slope grows as its law says" in one for one in said) == warns
 
 
-def test_report_and_vehicle_file(sloping, tmp_path):
-    report = make_report(sloping)
+def test_report_and_vehicle_file(sloping, report, tmp_path):
     write_run(tmp_path, sloping, report)
     read = json.loads((tmp_path / "report.json").read_text())
     assert read["verdict"] == "named"
@@ -254,9 +258,8 @@ def test_report_and_vehicle_file(sloping, tmp_path):
     assert "<html" in (tmp_path / "report.html").read_text()
 
 
-def test_before_is_the_vehicle_as_it_was_and_no_parameter_of_it_moved(sloping):
+def test_before_is_the_vehicle_as_it_was_and_no_parameter_of_it_moved(sloping, report):
     trials = (*sloping.log.training, *sloping.log.held_out)
-    report = make_report(sloping)
     as_it_was = replay(sloping, sloping.reference.params, trials)
     errors = [score(trial, one)["ground_truth"].trajectory for trial, one in zip(trials, as_it_was, strict=True)
               if trial.held_out]
@@ -300,8 +303,7 @@ def test_base_parameters_that_went_far_widen_the_interval_of_an_effect(sloping):
         assert low <= usual[name]["interval"][1] and high >= usual[name]["interval"][0]
 
 
-def test_the_report_says_what_a_named_effect_stood(sloping):
-    report = make_report(sloping)
+def test_the_report_says_what_a_named_effect_stood(report):
     evidence = report["effects"][0]["evidence"]
     assert {"heading along x", "heading along y"} <= {one["by"] for one in evidence["falsifiers"]}
     assert all(one["outcome"] != "falsified" for one in evidence["falsifiers"])

@@ -221,7 +221,7 @@ def test_a_damaged_dataset_of_lerobot(dataset, tmp_path, name):
             assert len({len(values) for values in table.columns.values()}) == 1
 
     path = tmp_path / name
-    check(path, path.read_bytes(), read)
+    check(path, path.read_bytes(), read, folder=tmp_path)
 
 
 def test_a_damaged_gyro_of_a_driving_log(dataset, tmp_path):

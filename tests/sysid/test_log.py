@@ -244,7 +244,7 @@ def test_the_hash_tells_changed_data(dataset):
 
 @pytest.mark.parametrize(("unit", "factor", "said"), [
     ("milliseconds", 1e3, "seems to be in milliseconds. Divide t by 1000"),
-    ("microseconds", 1e6, "seems to be in microseconds. Divide t by 1000000"),
+    ("microseconds", 1e6, "divide milli-, micro- or nanoseconds"),
     ("nanoseconds", 1e9, "seconds")])
 def test_times_in_another_unit_than_seconds_are_named_at_once(dataset, unit, factor, said):
     for file in (dataset / "trials" / "straight_1").glob("*.csv"):

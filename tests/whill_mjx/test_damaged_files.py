@@ -113,7 +113,7 @@ def test_a_damaged_map_that_is_imported(tmp_path):
 
     def read():
         try:
-            maps.main(maps.Import("import", path, tmp_path / "scene", pixels=100))
+            maps.main(maps.Import(path, tmp_path / "scene", pixels=100))
         except OptionError as error:
             raise ValueError(*error.args) from None
 

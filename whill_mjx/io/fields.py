@@ -300,7 +300,7 @@ DATASET = (
 
 COLUMNS = {field.name: field for field in (
     Field("t", "s", -DAY, DAY, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
-                                      "divide milli- or nanoseconds."),
+                                      "divide milli-, micro- or nanoseconds."),
     Field("x", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("y", "m", -1e6, 1e6, remedy="Convert it to metres."),
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),

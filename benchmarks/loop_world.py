@@ -1,4 +1,4 @@
-"""The contact plant in the world of a policy, for `bridge.simulate --simulator benchmarks.plant.world:ContactVehicle`.
+"""The contact plant in a policy's world: `bridge.simulate POLICY --simulator benchmarks.loop_world:ContactVehicle`.
 
 Scene and camera are those of the policy's task. What moves in it is the contact plant, which shares no code with the
 vehicle that the policy was trained on.
