@@ -48,7 +48,7 @@ class SteppedPlant(Plant):
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         return Pose(float(self.data.qpos[0]), float(self.data.qpos[1]), yaw, pitch, roll)
 
-    def drive(self, v: float, omega: float) -> None:
+    def drive_period(self, v: float, omega: float) -> None:
         """Drive one period with the command v [m/s], omega [rad/s]."""
         chair, data = self.chair, self.data
         rho = math.exp(-TICK / self.noise.correlation)

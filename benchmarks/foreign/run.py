@@ -58,7 +58,7 @@ def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list
                 novelty.append(round(float(getattr(policy, "novelty", 0.0)), 3))
             else:
                 command = (0.3, 0.0)
-            plant.drive(*command)
+            plant.drive_period(*command)
     finally:
         camera.close()
     return {"variant": variant, "seed": seed, "driver": driver, "end": end, "steps": steps, "novelty": novelty}
