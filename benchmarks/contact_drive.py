@@ -19,7 +19,8 @@ from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
 from benchmarks.plant.make import make_log
 from bridge.options import Parser, whole
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log
 from sysid.search.fitting import fit_log, predict
 from sysid.search.settings import FitConfig
 from whill_mjx.io.command_line import guarded

@@ -39,7 +39,8 @@ from benchmarks.fit_measured import drive, mrclam
 from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, show_parameters
 from benchmarks.fit_settings import Benchmark
 from benchmarks.harness import device_name, figure, record
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log
 from sysid.search.comparison import Judge
 from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, make_problem
 from sysid.search.settings import FitConfig

@@ -26,7 +26,8 @@ from benchmarks.harness import figure
 from sysid.errors.space import NUISANCE, Space, make_space, searched
 from sysid.intervals.independence import Evidence
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log
 from sysid.logs.synthetic import write_dataset
 from sysid.replay.models import with_effects
 from sysid.search.fitting import choose, fit_log, fitted_plant, make_problem

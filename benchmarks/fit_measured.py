@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.fit_scores import evaluate, gains, show, show_parameters
 from benchmarks.harness import figure, record
-from sysid.logs.log import Log, Trial
 from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
+from sysid.logs.records import Log, Trial
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 

@@ -34,7 +34,8 @@ from benchmarks.plant.chair import Chair, build
 from benchmarks.plant.make import make_log
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import estimate_noise
-from sysid.logs.log import Log, Trial, command_in_force, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log, Trial, command_in_force
 from sysid.search import least_squares, starts
 from sysid.search.comparison import Judge, Recorder
 from sysid.search.fitting import fit_log, make_problem

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.harness import figure
-from sysid.logs.log import Log, Trial
 from sysid.logs.metrics import own_floor
+from sysid.logs.records import Log, Trial
 from sysid.pages.report import error_rows, summaries
 from sysid.search.fitting import Fit, predict
 

@@ -18,7 +18,8 @@ from benchmarks.fit_jobs import RememberedCosts, reporter, staged
 from benchmarks.harness import figure
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import HUGE, Objective
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log
 from sysid.search import least_squares, starts, tpe
 from sysid.search.comparison import Judge, arrivals, trace
 from sysid.search.fitting import Problem, choose, fitted_plant

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.space import FIXED, make_space
-from sysid.logs.log import Log, Prediction, Trial
+from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import Drives, make_drives
 from sysid.missing.pose_fit import fit_poses

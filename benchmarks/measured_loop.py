@@ -35,16 +35,15 @@ from benchmarks.harness import figure, record
 from benchmarks.measured_laws import ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
-from sysid.logs.floor import BLOCKS, Measured, in_blocks, sums_of
-from sysid.logs.log import Log, Prediction, Trial
+from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.pose_lag import pose_lag
+from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.catalogue import PARAMETER
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
-from sysid.verdict.floor import FloorChange, compared
 from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing

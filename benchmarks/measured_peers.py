@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import PoseStream, Prediction, Trial, command_in_force
+from sysid.logs.records import PoseStream, Prediction, Trial, command_in_force
 
 DT = 0.05  # s
 BACK = 24  # steps of driving on as in the first instant, before the start: as late as a pose may be

@@ -184,7 +184,8 @@ class Naive:
 
     def numbers(self, log: Path) -> np.ndarray:
         """The seven numbers of a log: medians over its trials; nan where no trial shows one."""
-        from sysid.logs.log import command_in_force, load_log
+        from sysid.logs.log import load_log
+        from sysid.logs.records import command_in_force
         from sysid.logs.streams import response_shift
 
         rows = []

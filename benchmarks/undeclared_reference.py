@@ -15,7 +15,8 @@ from pathlib import Path
 
 from benchmarks import kept
 from benchmarks.plant.make import make_log
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import Log
 from sysid.missing.days import Reference
 from sysid.missing.reference import make_reference
 from sysid.pages.report import code_hashes

@@ -9,13 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sysid.logs.log import Command as Command
-    from sysid.logs.log import Log as Log
-    from sysid.logs.log import OdometryStream as OdometryStream
-    from sysid.logs.log import PoseStream as PoseStream
-    from sysid.logs.log import Trial as Trial
     from sysid.logs.log import load_log as load_log
     from sysid.logs.measured import load_any as load_any
+    from sysid.logs.records import Command as Command
+    from sysid.logs.records import Log as Log
+    from sysid.logs.records import OdometryStream as OdometryStream
+    from sysid.logs.records import PoseStream as PoseStream
+    from sysid.logs.records import Trial as Trial
     from sysid.pages.fit_report import fit_dataset as fit_dataset
     from sysid.pages.report import read_report as read_report
     from sysid.replay.mjcf import mjcf_model as mjcf_model

@@ -27,7 +27,8 @@ if starts(__name__):
     listen()
 
 from sysid import command_line
-from sysid.logs.log import Log, check_same_vehicle
+from sysid.logs.log import check_same_vehicle
+from sysid.logs.records import Log
 from sysid.logs.sources import refuse_recording
 from sysid.missing.catalogue import hypotheses, outside_hypotheses
 from sysid.run_folder import file_label, run_folder, settings_of

@@ -22,7 +22,7 @@ if starts(__name__):
 
 from sysid import command_line
 from sysid.logs.conversion import ConvertConfig, convert
-from sysid.logs.log import Log
+from sysid.logs.records import Log
 from whill_mjx.io.folders import LOCK_FILE, FolderRefused, check_place, lock_folder
 
 

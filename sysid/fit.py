@@ -17,8 +17,8 @@ if starts(__name__):
     listen()
 
 from sysid import command_line
-from sysid.logs.log import Log
 from sysid.logs.measured import load_any
+from sysid.logs.records import Log
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import parameter_table, table
 from sysid.replay.models import Model

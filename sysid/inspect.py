@@ -24,8 +24,8 @@ import numpy as np
 from sysid import command_line
 from sysid.logs.coverage import Blind
 from sysid.logs.inspection import inspect, load_whole, text
-from sysid.logs.log import Log
 from sysid.logs.next_drives import NextDrive, next_drives
+from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
 from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.formats import stamp

@@ -21,7 +21,7 @@ from sysid.errors.normal_equations import NormalEquations, make_equations
 from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior
 from sysid.errors.prior import Prior
 from sysid.errors.space import STEP, Space
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import on_processor
 from sysid.replay.quotients import Quotients

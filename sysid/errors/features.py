@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.replay.arrays import namespace
 from sysid.replay.records import Measured, Simulated
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.arrays import added, namespace
 

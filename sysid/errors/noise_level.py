@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from sysid.errors.noise import deviations
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 
 SETTLED = 2.0  # s of constant commands after which a motion counts as steady
 BLOCKS = 3  # independent parts of the drives that an error needs at least

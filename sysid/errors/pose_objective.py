@@ -21,8 +21,8 @@ from sysid.errors.normal_equations import NormalEquations, make_equations, summe
 from sysid.errors.prior import Prior
 from sysid.errors.robust import huber_weight
 from sysid.errors.space import Residuals, Space
-from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
+from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace
 from sysid.replay.records import Measured, Simulated
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS
+from sysid.logs.records import Prediction, Trial
 
 BLOCK = 2.0
 """Length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember."""

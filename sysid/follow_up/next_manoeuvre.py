@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.records import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values

@@ -27,7 +27,7 @@ from sysid.follow_up.tables import (
     turned,
 )
 from sysid.follow_up.terms import Term, columns_of, in_words
-from sysid.logs.log import Prediction, Trial
+from sysid.logs.records import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.models import with_effects

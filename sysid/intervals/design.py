@@ -11,8 +11,8 @@ import numpy as np
 from sysid.errors.pose_objective import DEFAULT_NOISE, Noise, Objective
 from sysid.errors.space import Space, make_space
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
-from sysid.logs.log import Command
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
+from sysid.logs.records import Command
 from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.rollout import Replay, make_batch, vehicle_plant
 from whill_mjx.vehicle.config import VehicleConfig

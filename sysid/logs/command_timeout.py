@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.log import Log, Trial, with_timeout
+from sysid.logs.records import Log, Trial, with_timeout
 from sysid.logs.streams import speeds
 
 QUIET = 2.5  # usual intervals between commands, beyond which they pause

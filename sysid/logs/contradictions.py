@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known

@@ -14,10 +14,12 @@ import numpy as np
 
 from sysid.logs import lerobot
 from sysid.logs.coverage import sanity
-from sysid.logs.log import Log, PoseStream, Start, Trial, load_log, load_trial, read_fields, spec_from_fields
+from sysid.logs.log import load_log, load_trial, read_fields, spec_from_fields
 from sysid.logs.measured import is_known
 from sysid.logs.metrics import relative_pose
+from sysid.logs.records import Log, PoseStream, Start, Trial
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
+from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
 from whill_mjx.io.command_line import Range
 from whill_mjx.io.fields import COLUMNS
@@ -118,7 +120,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
     held_out = config.held_out
-    if lerobot.is_lerobot(config.source):
+    if is_lerobot(config.source):
         episodes = lerobot.read(config.source)
         spec = _spec(config, episodes.spec)
         found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.logs.contradictions import contradictions
-from sysid.logs.log import Log, Trial, command_in_force
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
+from sysid.logs.records import Log, Trial, command_in_force
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import time_faults
 

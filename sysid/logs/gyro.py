@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-Trial = Any
-"""`sysid.logs.log.Trial`, which is loaded by what is here."""
+from sysid.logs.records import Trial
 
 SURE = 0.9
 """Least correlation of both turns, of either sign, that settles the sign."""

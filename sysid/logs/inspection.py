@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity
-from sysid.logs.log import Log, load_log
+from sysid.logs.log import load_log
 from sysid.logs.measured import detect_format, drive_spec, load_drive, load_mrclam, split
+from sysid.logs.records import Log
 from sysid.logs.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
 
 MAX_ROWS = 40  # trials listed one by one; more are summed up by group

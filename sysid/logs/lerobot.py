@@ -23,14 +23,15 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.columns import Table
-from sysid.logs.log import Log, OdometryStream, PoseStream, Trial, command_in_force, read_fields, spec_from_fields
+from sysid.logs.log import read_fields, spec_from_fields
+from sysid.logs.records import Log, OdometryStream, PoseStream, Trial, command_in_force
+from sysid.logs.sources import LEROBOT_INFO
 from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON, read_json
 from whill_mjx.logs.dataset import write_fields, write_json
 from whill_mjx.vehicle.specs import VehicleSpec
 
 VERSION = "v3.0"
-INFO = "meta/info.json"
 OURS = "meta/dataset.toml"  # nominal geometry, which the format has no place for
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 STEM = "frames"  # what the rows of an episode are called, as a file of columns
@@ -60,11 +61,6 @@ class Episodes:
     notes: tuple[str, ...]
 
 
-def is_lerobot(path: Path) -> bool:
-    """Whether a folder is a LeRobotDataset."""
-    return path.is_dir() and (path / INFO).is_file() and (path / "data").is_dir()
-
-
 def read(path: Path) -> Episodes:
     """The episodes of a LeRobotDataset, v3 or v2.
 
@@ -76,11 +72,12 @@ def read(path: Path) -> Episodes:
         return _read(pq, path)
     except (KeyError, IndexError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         reason = f"{type(error).__name__}: {str(error)[:LONGEST_REASON]}"
-        raise ValueError(f"{path}: {INFO} and the files beside it do not go together ({reason}). {AGAIN}") from None
+        raise ValueError(f"{path}: {LEROBOT_INFO} and the files beside it do not go together ({reason}). "
+                         f"{AGAIN}") from None
 
 
 def _read(pq: Any, path: Path) -> Episodes:
-    info = read_json(path / INFO, "missing.", AGAIN)
+    info = read_json(path / LEROBOT_INFO, "missing.", AGAIN)
     parts = _parts(path, info)
     files = sorted((path / "data").glob("*/*.parquet"))
     if not files:
@@ -146,7 +143,7 @@ def write(folder: Path, log: Log, fps: int | None = None) -> list[str]:
     _write_episodes(pq, folder, trials, lengths)
     _write_tasks(pq, folder, tasks)
     write_json(folder / "meta/stats.json", {name: _stats(values) for name, values in whole.items()})
-    write_json(folder / INFO, _info(log, fps, features, tasks, lengths))
+    write_json(folder / LEROBOT_INFO, _info(log, fps, features, tasks, lengths))
     write_fields(folder / "meta", log.spec)
     return [f"{len(trials)} episodes of {int(ends[-1])} frames at {fps} frames/s: commands move to the nearest frame, "
             f"by {500 / fps:.0f} ms at most, and measurements are interpolated"]
@@ -174,15 +171,15 @@ def _parts(path: Path, info: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
     """Column of numbers, named FEATURE/PART -> its feature and place in it."""
     features = info.get("features")
     if not isinstance(features, dict) or "timestamp" not in features:
-        raise ValueError(f"{path / INFO}: no features with a timestamp. {AGAIN}")
+        raise ValueError(f"{path / LEROBOT_INFO}: no features with a timestamp. {AGAIN}")
     found: dict[str, tuple[str, int]] = {}
     for name, about in features.items():
         shape = list(about.get("shape") or [1])
         if about.get("dtype") not in NUMBERS or len(shape) != 1 or name in COUNTERS:
             continue
         if not isinstance(shape[0], int) or not 0 < shape[0] <= WIDEST:
-            raise ValueError(f"{path / INFO}: the shape of {shown(name)} is {shown(shape)}; at most {WIDEST} numbers "
-                             f"are read. {AGAIN}")
+            raise ValueError(f"{path / LEROBOT_INFO}: the shape of {shown(name)} is {shown(shape)}; at most {WIDEST} "
+                             f"numbers are read. {AGAIN}")
         names = about.get("names")
         if isinstance(names, dict):  # {"motors": [...]} of version 2
             lists = [one for one in names.values() if isinstance(one, list)]
@@ -202,7 +199,7 @@ def _file_episodes(
     wanted = dict.fromkeys(feature for feature, _ in parts.values())
     missing = sorted((set(wanted) | {"episode_index"}) - set(table))
     if missing:
-        raise ValueError(f"{file}: no column {shown(missing[0])}, which {INFO} names. {AGAIN}")
+        raise ValueError(f"{file}: no column {shown(missing[0])}, which {LEROBOT_INFO} names. {AGAIN}")
     also = [name for name in ("episode_index", "frame_index", "task_index") if name in table]
     try:
         arrays = {name: np.array(table[name], float).reshape(len(table[name]), -1) for name in (*wanted, *also)}

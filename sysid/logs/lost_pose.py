@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.log import Log, Trial
+from sysid.logs.records import Log, Trial
 from sysid.logs.streams import added_up
 
 LOST = 0.5

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL, Pieces, Scenario
 
 SAMPLE_DT = 0.05  # s between the measurements that are planned with

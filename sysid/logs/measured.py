@@ -25,8 +25,9 @@ import numpy as np
 
 from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.gyro import told_sign
-from sysid.logs.log import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, hash_files
+from sysid.logs.log import hash_files
 from sysid.logs.lost_pose import without_lost
+from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
 from whill_mjx.io.fields import counted, shown

@@ -11,7 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, command_in_force, manoeuvre_of
+from sysid.logs.records import (
+    Command,
+    OdometryStream,
+    PoseStream,
+    Prediction,
+    Start,
+    Trial,
+    command_in_force,
+    manoeuvre_of,
+)
 from sysid.logs.replicates import same_course, shifts
 
 

@@ -14,8 +14,8 @@ from itertools import product
 import numpy as np
 
 from sysid.logs.coverage import Blind
-from sysid.logs.log import Command, Log
 from sysid.logs.manoeuvre_library import FRACTIONS, REVERSING, make_command
+from sysid.logs.records import Command, Log
 from whill_mjx.vehicle.specs import VehicleSpec
 
 COUNT = 3

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.log import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force
 from sysid.replay.cores import on_all_cores
 
 ROWS = 8  # of a stretch of steady driving, in which what a parabola over time does not explain is explained by the ages

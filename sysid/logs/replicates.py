@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.log import Command, Trial, command_in_force
+from sysid.logs.records import Command, Trial, command_in_force
 
 EXACT = 1e-6  # s, m/s, rad/s that equal tables may differ by
 NONE = 1e-3  # m/s or rad/s of a command below which nothing moves

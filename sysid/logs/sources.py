@@ -5,13 +5,18 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sysid.logs.lerobot import is_lerobot
 from sysid.logs.rosbag import SUFFIXES, find_bags, is_bag
 
+LEROBOT_INFO = "meta/info.json"
 HEAD = 4000  # bytes of a text that are looked at
 PACKED = (".zst", ".zstd", ".gz", ".zip", ".tar", ".tgz", ".bz2", ".xz")
 TRIAL_FILES = ("command.csv", "odometry.csv", "ground_truth.csv")
 TUM = 8  # numbers of a row: time, position, quaternion
+
+
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a LeRobotDataset."""
+    return path.is_dir() and (path / LEROBOT_INFO).is_file() and (path / "data").is_dir()
 
 
 def about(path: Path) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Trial, command_in_force
+from sysid.logs.records import Command, OdometryStream, PoseStream, Trial, command_in_force
 
 GRID_DT = 0.02  # s, of the signals that are compared
 SMOOTHING = 0.2  # s, over which positions are differenced

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.records import Plant
 from sysid.replay.rollout import make_batch, simulate, vehicle_plant
 from whill_mjx.logs.dataset import SensorNoise, write_fields, write_trial

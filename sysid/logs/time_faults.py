@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.logs.command_timeout import command_timeout
-from sysid.logs.log import OdometryStream, Trial
+from sysid.logs.records import OdometryStream, Trial
 
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at

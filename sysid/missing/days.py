@@ -12,7 +12,8 @@ import numpy as np
 from sysid.errors.features import CHANNELS
 from sysid.errors.noise import BIN_SHIFT, Whitener, replicate_groups, scatter
 from sysid.errors.space import Space
-from sysid.logs.log import START_NOISE, Trial
+from sysid.logs.log import START_NOISE
+from sysid.logs.records import Trial
 from sysid.logs.replicates import course_of, near
 from sysid.missing.evidence import Columns
 

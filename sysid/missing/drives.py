@@ -12,7 +12,7 @@ import numpy as np
 
 from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import BIN_SHIFT, roughness
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.quotients import Quotients

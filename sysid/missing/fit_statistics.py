@@ -23,7 +23,7 @@ from sysid.errors.noise import (
     roughness,
     scatter,
 )
-from sysid.logs.log import Prediction, Trial
+from sysid.logs.records import Prediction, Trial
 from sysid.replay.records import Measured
 from sysid.replay.rollout import padded
 from whill_mjx.io.fields import shown

@@ -10,8 +10,8 @@ import numpy as np
 
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.space import Space
-from sysid.logs.log import Trial
 from sysid.logs.metrics import replicate_noise
+from sysid.logs.records import Trial
 from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values

@@ -20,7 +20,7 @@ from sysid.errors.noise import (
 )
 from sysid.errors.prior import expected_sd
 from sysid.errors.space import Space, make_space
-from sysid.logs.log import Log, Trial
+from sysid.logs.records import Log, Trial
 from sysid.missing.base_fit import BaseFit
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
 from sysid.missing.drives import Drives, make_drives

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from sysid.errors.noise import repeated
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.missing.catalogue import LEVELS, Hypothesis, base_values
 from sysid.missing.days import Leftover, Reference, alike, difference_sizes
 from sysid.missing.drives import Drives

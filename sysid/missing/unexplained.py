@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors.features import CHANNELS
-from sysid.logs.log import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force
 
 TERMS = 8  # smooth functions of one quantity
 LAGS = 3  # bins over which the motion answers

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
+from sysid.logs.records import OdometryStream, PoseStream, Prediction, Trial
 from whill_mjx.io.html import charts, legend, table
 from whill_mjx.io.svg import Line, line_chart
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from sysid.intervals.uncertainty import Estimate
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from whill_mjx.vehicle.specs import VehicleSpec
 
 LEAST = 5e-4  # share of a size, or of a scale, that counts as nothing

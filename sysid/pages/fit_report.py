@@ -9,8 +9,8 @@ from typing import Any
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
 from sysid.logs import odometry_frames
-from sysid.logs.log import Log
 from sysid.logs.measured import load_any
+from sysid.logs.records import Log
 from sysid.missing.fit_statistics import statistics_of
 from sysid.pages.calibration import calibration_notes
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Log, command_in_force
+from sysid.logs.records import Log, command_in_force
 from sysid.logs.streams import speeds
 from whill_mjx.io.folders import whole_file
 

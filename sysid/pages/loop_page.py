@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Start
 from sysid.logs.metrics import METRICS, UNITS, integrate
+from sysid.logs.records import Start
 from sysid.pages.before_after import drive_pictures, drive_table
 from sysid.pages.loop_words import command_of, describe_unnamed, lead, not_determined, sentence, spoken, title, vehicles
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table

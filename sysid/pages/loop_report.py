@@ -79,8 +79,8 @@ from sysid.follow_up.trust import (
     warnings,
 )
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
-from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, own_floor
+from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
 from sysid.missing.days import Reference
 from sysid.missing.evidence import Evidence, Solver, at_fit

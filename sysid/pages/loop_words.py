@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.logs.log import Command
 from sysid.logs.manoeuvre_library import make_command
+from sysid.logs.records import Command
 
 DEGREES = {"rad": "degrees", "rad/s": "degrees/s", "rad/s^2": "degrees/s^2"}
 LISTED = 4  # names in a sentence

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from sysid.intervals.statistics import holm, mean_sd, sign_flip_p, smallest_p
-from sysid.logs.log import Log
 from sysid.logs.metrics import METRICS, UNITS
+from sysid.logs.records import Log
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range

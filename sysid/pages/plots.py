@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import OdometryStream, PoseStream, Prediction, Trial
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.records import OdometryStream, PoseStream, Prediction, Trial
 from sysid.pages.series import TrialSeries
 from sysid.search.result import Trace
 from whill_mjx.io.folders import whole_file

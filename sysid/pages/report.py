@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
+from sysid.logs.records import Prediction, Trial
 from sysid.pages.series import TrialSeries
 from whill_mjx.io.fields import Field, check_table, shown
 from whill_mjx.io.formats import upgraded

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.log import Prediction, Trial
 from sysid.logs.metrics import CHANNELS, ideal_replay
+from sysid.logs.records import Prediction, Trial
 from whill_mjx.io.folders import whole_file
 from whill_mjx.io.reading import read_arrays
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.replay import pieces
 from sysid.replay.arrays import namespace
 from sysid.replay.cores import cores, on_all_cores, on_processor

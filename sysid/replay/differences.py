@@ -18,7 +18,7 @@ import numpy as np
 
 from sysid.errors.pose_objective import Replays
 from sysid.errors.space import STEP, Space
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.replay.courses import CourseReplay, make_courses
 from sysid.replay.models import Parameters, set_parameters
 from sysid.replay.quotients import Quotients

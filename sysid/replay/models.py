@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 
 from sysid.errors.space import LOG_SPAN, Space
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.replay.records import Host, Plant
 from whill_mjx.effects import EFFECTS, make_effects
 from whill_mjx.effects.base import apply_chain

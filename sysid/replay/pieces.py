@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force
 
 LENGTH = 2.75  # s, of a piece
 OVERLAP = 2.0

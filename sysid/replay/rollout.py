@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.log import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
+from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
 from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.delays import delayed, without

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, Replays
-from sysid.logs.log import Log
 from sysid.logs.metrics import score
+from sysid.logs.records import Log
 from sysid.replay.differences import make_replay
 from sysid.replay.records import Simulated
 from sysid.replay.rollout import predictions

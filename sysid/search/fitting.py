@@ -18,7 +18,8 @@ from sysid.errors.space import Space, make_space, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
-from sysid.logs.log import Log, Prediction, Trial, check_same_vehicle
+from sysid.logs.log import check_same_vehicle
+from sysid.logs.records import Log, Prediction, Trial
 from sysid.logs.sources import refuse_recording
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model

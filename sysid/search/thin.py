@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from sysid.errors.space import Space
 from sysid.logs.coverage import Excitation, excitation
-from sysid.logs.log import Log, Trial
+from sysid.logs.records import Log, Trial
 
 LEAST_SECONDS = 2.0  # s of commanded motion that a log must have
 TURNS, DRIVES = 0.1, 0.05  # rad/s and m/s of commands below which nothing turns or drives

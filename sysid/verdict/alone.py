@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.errors.noise import repeated
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.found import Search, Thresholds
 from whill_mjx.effects import card_of

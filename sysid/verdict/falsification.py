@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
-from sysid.logs.log import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.missing.refit import Refitter, without_each
 from sysid.verdict.agreement import beside

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsification import put_to_test

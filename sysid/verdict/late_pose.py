@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.space import make_space
-from sysid.logs.log import Log
 from sysid.logs.pose_lag import Rates, pose_lag
+from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER
 from sysid.missing.evidence import with_values
 from sysid.missing.pose_fit import fit_poses

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.logs.log import Log, check_same_vehicle
+from sysid.logs.log import check_same_vehicle
+from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.errors.noise import repeated
 from sysid.errors.space import FIXED
-from sysid.logs.log import Log
+from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_hypotheses, with_catalogue
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from sysid.errors.noise_level import NoiseLevels
-from sysid.logs.log import Log
+from sysid.logs.floor import FloorChange
+from sysid.logs.records import Log
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, Wander
 from sysid.missing.evidence import Evidence, column_layout
@@ -18,7 +19,6 @@ from sysid.replay.records import Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
-from sysid.verdict.floor import FloorChange
 from sysid.verdict.found import NullRefits, Search, Thresholds
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 

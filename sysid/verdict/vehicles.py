@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.space import make_space, searched
-from sysid.logs.log import Trial
+from sysid.logs.records import Trial
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import Drives, make_drives
 from sysid.missing.pose_fit import fit_poses

@@ -15,7 +15,8 @@ from benchmarks.plant.first_day import SMALL, Wrong, make_uncalibrated, tracked,
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.prior import UNKNOWN, bounds_alone
 from sysid.intervals.uncertainty import Estimate
-from sysid.logs.log import Log, OdometryStream, PoseStream, load_log, make_trial
+from sysid.logs.log import load_log, make_trial
+from sysid.logs.records import Log, OdometryStream, PoseStream
 from sysid.logs.synthetic import write_dataset
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes

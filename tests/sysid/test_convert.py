@@ -16,8 +16,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import sysid.convert as convert_module
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.inspection import load_whole
-from sysid.logs.log import Command, OdometryStream, PoseStream, load_log, make_trial
+from sysid.logs.log import load_log, make_trial
 from sysid.logs.measured import load_any, load_drive
+from sysid.logs.records import Command, OdometryStream, PoseStream
 from sysid.logs.rosbag import yaw_of
 from sysid.logs.sources import refuse_recording
 from sysid.logs.wheel_states import CHAIR_DEFINITION, CHAIR_STATE, JOYSTICK_FIELDS

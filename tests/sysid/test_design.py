@@ -23,9 +23,10 @@ from sysid.intervals.design import (
     splitting_scores,
 )
 from sysid.intervals.uncertainty import PRIOR_SD
-from sysid.logs.log import Command, read_csv
+from sysid.logs.log import read_csv
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, make_command, placement
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.records import Command
 from sysid.replay.records import Plant
 from whill_mjx.vehicle.parameters import get_values
 from whill_mjx.vehicle.specs import WHILL_CR

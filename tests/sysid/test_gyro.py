@@ -12,7 +12,8 @@ from benchmarks.plant.sensors import Gyro
 from sysid.errors.features import CHANNELS, GYRO, channel_names, make_features
 from sysid.errors.pose_objective import estimate_noise
 from sysid.logs.gyro import with_sign
-from sysid.logs.log import GyroStream, Log, load_log
+from sysid.logs.log import load_log
+from sysid.logs.records import GyroStream, Log
 from sysid.logs.synthetic import write_dataset
 from sysid.replay.courses import CourseReplay
 from sysid.replay.models import function_model, set_parameters

@@ -11,7 +11,7 @@ from conftest import unicycle_objective
 from sysid.errors.space import Space
 from sysid.intervals import independence, uncertainty
 from sysid.intervals.sandwich import sandwich
-from sysid.logs.log import Command, Start, Trial
+from sysid.logs.records import Command, Start, Trial
 from sysid.search import least_squares
 
 DRIVES, SAMPLES, PARAMETERS = 12, 80, 3

@@ -14,8 +14,9 @@ import pytest
 import sysid
 from sysid.convert import main
 from sysid.logs.conversion import ConvertConfig, convert
-from sysid.logs.lerobot import DATA, INFO
+from sysid.logs.lerobot import DATA
 from sysid.logs.log import load_log
+from sysid.logs.sources import LEROBOT_INFO as INFO
 from sysid.logs.sources import about
 from whill_mjx.io.command_line import OptionError
 

@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from sysid.logs.log import load_log, manoeuvre_of
+from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
+from sysid.logs.records import manoeuvre_of
 from sysid.logs.streams import trial_quality
 from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia

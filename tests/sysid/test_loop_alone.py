@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sysid.errors.features import BIN, bin_width, make_features
-from sysid.logs.log import Command, Log, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
 from sysid.missing.signatures import manoeuvre_groups

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sysid.follow_up.changes import by_manoeuvre, squared_errors, worse
-from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial
 from sysid.logs.metrics import score
+from sysid.logs.records import Command, OdometryStream, PoseStream, Prediction, Start, Trial
 
 pytestmark = pytest.mark.quick
 T = np.linspace(0.0, 12.0, 121)

@@ -6,7 +6,7 @@ import pytest
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
 from sysid.logs.floor import BLOCKS, in_blocks, last_change, over_days, sums_of
-from sysid.logs.log import Command, GyroStream, Log, OdometryStream, Start, Trial
+from sysid.logs.records import Command, GyroStream, Log, OdometryStream, Start, Trial
 from sysid.missing.days import Leftover, Reference
 from sysid.missing.reference import BLOCK
 from sysid.verdict.floor import floor_change

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.logs.log import Command, OdometryStream, Start, Trial
+from sysid.logs.records import Command, OdometryStream, Start, Trial
 from sysid.missing.catalogue import Hypothesis, hypotheses, outside_hypotheses
 from sysid.missing.catalogue import falsifiers as known
 from sysid.missing.joint_fit import Refit

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sysid.errors.space import Space
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.pose_lag import pose_lag, sign_flips
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.evidence import Columns
 from sysid.missing.joint_fit import Refit

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from sysid.errors.noise import Whitener
-from sysid.logs.log import Command, Start
+from sysid.logs.records import Command, Start
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import Leftover, Reference, expected_without, mean_by_day
 from sysid.missing.evidence import Evidence, column_layout

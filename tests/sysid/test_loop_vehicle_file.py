@@ -120,7 +120,7 @@ def replace_names(count):
     """Trials of which none repeats another."""
     from types import SimpleNamespace
 
-    from sysid.logs.log import Command
+    from sysid.logs.records import Command
 
     t = np.array([0.0, 1.0])
     return tuple(SimpleNamespace(manoeuvre=str(i), command=Command(t, t, t), odometry=None, ground_truth=None)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sysid.errors.noise import replicate_groups as groups_of_bins
-from sysid.logs.log import Command, OdometryStream, PoseStream, Prediction, Start, Trial, manoeuvre_of
 from sysid.logs.metrics import ideal_replay, integrate, noise_floor, replicate_groups, rmse, score
+from sysid.logs.records import Command, OdometryStream, PoseStream, Prediction, Start, Trial, manoeuvre_of
 from sysid.pages.report import summaries
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
 

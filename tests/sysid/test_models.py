@@ -18,7 +18,8 @@ from cart import cart
 
 from sysid import fit as fit_module
 from sysid.fit import Arguments
-from sysid.logs.log import Command, OdometryStream, PoseStream, make_trial
+from sysid.logs.log import make_trial
+from sysid.logs.records import Command, OdometryStream, PoseStream
 from sysid.logs.synthetic import write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay

@@ -18,7 +18,8 @@ from sysid.follow_up.next_manoeuvre import (
     plan_drives,
     write_next_command,
 )
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial, read_csv
+from sysid.logs.log import read_csv
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
 from sysid.missing.drives import make_drives
 from sysid.missing.joint_fit import Refit

@@ -10,7 +10,7 @@ import pytest
 
 from sysid.errors.noise import fit_whitener, scatter
 from sysid.errors.noise_level import NoiseLevels, NoisyDrives, noise_levels, said, steady_bins
-from sysid.logs.log import Command
+from sysid.logs.records import Command
 from sysid.missing.days import Leftover, Reference, Wander
 from sysid.missing.signatures import white_leftover
 from sysid.verdict.result import Prepared

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sysid.logs.log import Command, OdometryStream, Start, Trial
 from sysid.logs.odometry_frames import at_frames, find_period
+from sysid.logs.records import Command, OdometryStream, Start, Trial
 
 NOISE = 3e-4  # m and rad, of a row: ticks of an encoder
 

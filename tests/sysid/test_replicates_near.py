@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.logs.log import Command, OdometryStream, Start, Trial
+from sysid.logs.records import Command, OdometryStream, Start, Trial
 from sysid.missing.days import alike
 
 pytestmark = pytest.mark.quick

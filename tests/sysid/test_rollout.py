@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import TRUTH, unicycle_plant
 
-from sysid.logs.log import Command, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.rollout import Replay, make_batch, predictions
 
 

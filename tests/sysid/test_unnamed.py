@@ -12,8 +12,8 @@ from sysid.errors.space import make_space
 from sysid.follow_up.tables import Products, Table, few_terms, gains_without, shift
 from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.follow_up.unnamed import Bench, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
-from sysid.logs.log import OdometryStream, PoseStream, Start, Trial
 from sysid.logs.manoeuvre_library import make_command
+from sysid.logs.records import OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values
 from sysid.missing.unexplained import PHASES, align, wave_turns
 from sysid.pages.loop_page import describe_unnamed

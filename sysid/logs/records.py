@@ -1,0 +1,217 @@
+"""What a driving log holds: commands, measured streams, starts and trials."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from whill_mjx.vehicle.specs import VehicleSpec
+
+GYRO_SPACING = 0.05
+"""Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Commanded velocities; each holds until the next."""
+
+    t: np.ndarray  # (T,) s
+    v: np.ndarray  # (T,) m/s
+    omega: np.ndarray  # (T,) rad/s
+
+    @property
+    def table(self) -> np.ndarray:
+        """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
+        return np.column_stack([self.t, self.v, self.omega])
+
+
+@dataclass(frozen=True)
+class OdometryStream:
+    """What the vehicle's own odometry reported; channels that were not logged are None."""
+
+    t: np.ndarray  # (T,) s
+    x: np.ndarray | None  # (T,) m, from the trial's start
+    y: np.ndarray | None  # (T,) m
+    yaw: np.ndarray | None  # (T,) rad, unwrapped
+    v: np.ndarray  # (T,) m/s
+    omega: np.ndarray  # (T,) rad/s
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 5) of x, y [m], yaw [rad], v [m/s] and omega [rad/s]; nan where not logged."""
+        absent = np.full(len(self.t), np.nan)
+        pose = [absent if one is None else one for one in (self.x, self.y, self.yaw)]
+        return np.stack([*pose, self.v, self.omega], axis=-1)
+
+
+@dataclass(frozen=True)
+class PoseStream:
+    """Outside measurement of the reference point in a fixed room frame."""
+
+    t: np.ndarray  # (T,) s
+    x: np.ndarray  # (T,) m
+    y: np.ndarray  # (T,) m
+    yaw: np.ndarray  # (T,) rad, unwrapped
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 3) of x, y [m] and yaw [rad]."""
+        return np.stack([self.x, self.y, self.yaw], axis=-1)
+
+
+@dataclass(frozen=True)
+class GyroStream:
+    """The turn of the body, added up from a yaw rate that is measured on the vehicle."""
+
+    t: np.ndarray  # (T,) s
+    turn: np.ndarray  # (T,) rad, from the first sample
+
+    @classmethod
+    def of_rates(cls, t: np.ndarray, omega: np.ndarray) -> GyroStream:
+        """That of yaw rates (T,) [rad/s], at samples that are at least `GYRO_SPACING` apart."""
+        turn = np.concatenate([[0.0], np.cumsum(np.diff(t) * (omega[1:] + omega[:-1]) / 2)])
+        kept, last = [], -np.inf
+        for i, now in enumerate(t):
+            if now - last >= GYRO_SPACING - 1e-9:
+                kept.append(i)
+                last = now
+        return cls(t[kept], turn[kept])
+
+    @property
+    def values(self) -> np.ndarray:
+        """(T, 1) of the turn."""
+        return self.turn[:, None]
+
+    def until(self, end: float) -> GyroStream:
+        """The samples up to a time [s]."""
+        inside = self.t <= end
+        return GyroStream(self.t[inside], self.turn[inside])
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where and how fast the vehicle starts: room frame, reference point."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    v: float = 0.0
+    omega: float = 0.0
+    position_sigma: float = 0.0
+    """Standard error of x and y [m]."""
+    yaw_sigma: float = 0.0
+    """Standard error of yaw [rad]."""
+    odometry_position_sigma: float = 0.0
+    """Standard error of the origin from which the odometry counts x and y [m]."""
+    odometry_yaw_sigma: float = 0.0
+    """Standard error of the heading from which it counts yaw, and along which x points [rad]."""
+    measured: bool = False
+    """Whether the pose is the outside measurement at t = 0 itself."""
+    rest: float = 0.0
+    """Until when poses were averaged for it [s]."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One drive (or one window of a longer one)."""
+
+    name: str
+    """Of its folder, or of the window."""
+    manoeuvre: str
+    """Trials of one manoeuvre with equal commands are replicates."""
+    command: Command
+    """What the vehicle was told."""
+    odometry: OdometryStream | None
+    """What it reported; None where that was not logged."""
+    ground_truth: PoseStream | None
+    """Its pose as measured from outside; None where that was not logged."""
+    start: Start
+    """Pose and speed at t = 0."""
+    held_out: bool = False
+    """Whether a fit must not look at it."""
+    group: str = ""
+    """Terrain or robot; part of a selection."""
+    breaks: tuple[tuple[float, float], ...] = ()
+    """Times between which the outside pose moved by an unknown amount [s]."""
+    gyro: GyroStream | None = None
+    """Turn of the body by a yaw rate measured on the vehicle, counter-clockwise."""
+
+    @property
+    def duration(self) -> float:
+        """Time of the last measurement [s]; the trial starts at 0."""
+        return max(float(s.t[-1]) for s in (self.odometry, self.ground_truth) if s is not None)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A simulated trial at the times of the measurements."""
+
+    ground_truth: PoseStream | None
+    odometry: OdometryStream | None
+    gyro: GyroStream | None = None
+
+
+def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
+    """Index of the command that holds at times t (T,); -1 before the first."""
+    return np.searchsorted(command.t, t + 1e-9, side="right") - 1
+
+
+@dataclass(frozen=True)
+class Log:
+    """All trials of one vehicle."""
+
+    name: str
+    """Of its folder."""
+    spec: VehicleSpec
+    """Nominal vehicle that was driven."""
+    trials: tuple[Trial, ...]
+    """All drives, training and held out."""
+    sha256: str
+    """Over names and contents of its files."""
+    notes: tuple[str, ...] = ()
+    """What its reader found worth saying."""
+    fields: dict[str, Any] = field(default_factory=dict)
+    """Content of dataset.toml."""
+
+    @property
+    def training(self) -> tuple[Trial, ...]:
+        """The trials that are fitted."""
+        return tuple(trial for trial in self.trials if not trial.held_out)
+
+    @property
+    def held_out(self) -> tuple[Trial, ...]:
+        """The trials that are kept aside."""
+        return tuple(trial for trial in self.trials if trial.held_out)
+
+    def select(self, keep: Callable[[Trial], bool]) -> Log:
+        """The same log with only the trials that `keep` accepts."""
+        return replace(self, trials=tuple(trial for trial in self.trials if keep(trial)))
+
+
+def held_from_middle(rates: Command) -> Command:
+    """Measured speeds as commands: each holds from half an interval before its time to half an interval after."""
+    middle = (rates.t[1:] + rates.t[:-1]) / 2
+    return Command(np.concatenate([rates.t[:1], middle]), rates.v, rates.omega)
+
+
+def with_timeout(command: Command, timeout: float) -> Command:
+    """The commands that a base takes which stops where none has come for a time [s]: standstill in each longer pause,
+    and after the last."""
+    pauses = np.diff(np.append(command.t, np.inf)) > timeout + 1e-6
+    stop = pauses & ((command.v != 0) | (command.omega != 0))
+    t = np.concatenate([command.t, command.t[stop] + timeout])
+    order = np.argsort(t, kind="stable")
+    zero = np.zeros(int(stop.sum()))
+    return Command(t[order], np.append(command.v, zero)[order], np.append(command.omega, zero)[order])
+
+
+def manoeuvre_of(trial_name: str) -> str:
+    """Name without its replicate number, the number of a drive within a recording, or a recorder's date: circle_2,
+    circle_2-03 and circle_2024_05_31-10_20_30 -> circle."""
+    recording = re.sub(r"(?<=\w)-\d{2,3}$", "", trial_name)
+    undated = re.sub(r"(?<=\w)_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d(_\d+)?$", "", recording)
+    return re.sub(r"_\d+$", "", recording) if undated == recording else undated
