@@ -92,11 +92,11 @@ def simulator(tracks: list[Track], walls: tuple[float, float]) -> Callable[[floa
     """Function of mean speed, its spread and the time gap that gives the tracks of simulated people."""
     begin = min(track.time[0] for track in tracks)
     duration = max(track.time[-1] for track in tracks) - begin + 15.0
-    first = np.array([track.place[0] for track in tracks])
+    begins = np.array([track.place[0] for track in tracks])
     last = np.array([track.place[-1] for track in tracks])
-    way = np.sign(last[:, 0] - first[:, 0])
-    route = jnp.asarray(np.stack([first, last + np.stack([3.0 * way, 0.0 * way], 1)], 1), jnp.float32)
-    enter, come, out = jnp.asarray([track.time[0] - begin for track in tracks]), jnp.asarray(first), jnp.asarray(last)
+    way = np.sign(last[:, 0] - begins[:, 0])
+    route = jnp.asarray(np.stack([begins, last + np.stack([3.0 * way, 0.0 * way], 1)], 1), jnp.float32)
+    enter, first, out = jnp.asarray([track.time[0] - begin for track in tracks]), jnp.asarray(begins), jnp.asarray(last)
     side, count = jnp.asarray(way), len(tracks)
     nobody = jnp.zeros(count, bool)
     people = people_on(jax.random.key(0), Crowd(), route, jnp.zeros(count, jnp.int32), nobody)
@@ -115,7 +115,7 @@ def simulator(tracks: list[Track], walls: tuple[float, float]) -> Callable[[floa
 
         def one_step(carry, number):
             crowd, entered = carry
-            apart = jnp.linalg.norm(crowd.position[None] - come[:, None], axis=-1)
+            apart = jnp.linalg.norm(crowd.position[None] - first[:, None], axis=-1)
             blocked = jnp.any(crowd.there & (apart < 2 * law.RADIUS + law.ASIDE), -1)
             enters = (number * DT >= enter) & ~entered & ~blocked
             crowd = law.walk(dataclasses.replace(crowd, there=crowd.there | enters), near, None, DT)
@@ -231,8 +231,11 @@ def main(options: Options) -> None:
     if options.fit:
         search(options.recordings)
         return
-    distance, headway, own, figures = {}, {}, {}, {}
+    distance: dict[str, float] = {}
     flow: dict[str, float] = {}
+    headway: dict[str, float] = {}
+    own: dict[str, float] = {}
+    figures = {}
     for name, recording in RECORDINGS.items():
         tracks = read(options.recordings, recording)
         simulated = simulator(tracks, recording.walls)(recording.speed, recording.spread, GAP)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from whill_mjx.world.collision import HALVINGS, Stadiums, distances
 from whill_mjx.world.people import body
 from whill_mjx.world.people.around import mover_of, near_in
-from whill_mjx.world.people.crowd import People
+from whill_mjx.world.people.crowd import People, join
 from whill_mjx.world.people.law import walk
 from whill_mjx.world.scene import Footprint, Scene
 
@@ -39,11 +39,9 @@ def scene_without_people(scene: Scene) -> Scene:
 
 def scene_with_people(scene: Scene, people: People, key: jax.Array) -> Scene:
     """A scene with people in it, seen, scanned and hit; those that it has already stay."""
-    there = scene.people
-    if there is not None:
-        from whill_mjx.world.people.crowd import join
-
-        scene, people = scene_without_people(scene), join(there, people)
+    if scene.people is not None:
+        people = join(scene.people, people)
+        scene = scene_without_people(scene)
     return dataclasses.replace(scene, solids=body.added(scene.solids, people, key), people=people)
 
 
