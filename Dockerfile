@@ -1,7 +1,7 @@
 # whill-mjx with JAX for CPUs, or for NVIDIA GPUs with --build-arg EXTRA=[cuda]. The tests check its files, and build no image.
 #
 #     docker build -t whill-mjx .
-#     docker run --rm -v "$PWD/runs:/work/runs" whill-mjx python -m whill_mjx.train --out runs/train
+#     docker run --rm -v "$PWD/runs:/home/driver/runs" whill-mjx python -m whill_mjx.train --out runs/train
 FROM python:3.12-slim
 ARG EXTRA=""
 
@@ -17,7 +17,7 @@ COPY dreamer dreamer
 COPY bridge bridge
 RUN pip install --no-cache-dir -c constraints.txt ".${EXTRA}"
 
-RUN useradd --create-home driver && mkdir -p /work/runs && chown -R driver /work
+RUN useradd --create-home driver && mkdir -p /home/driver/runs && chown -R driver /home/driver
 USER driver
-WORKDIR /work
+WORKDIR /home/driver
 CMD ["python", "-m", "whill_mjx"]

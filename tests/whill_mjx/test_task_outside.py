@@ -231,7 +231,7 @@ def test_an_ending_with_a_name_of_the_library_is_refused():
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("name", [name for name in TASKS if name != "map_goal"])  # which needs a map
+@pytest.mark.parametrize("name", [name for name in TASKS if name != "map_goal"])  # it needs a map
 def test_every_task_that_ships_begins_free_and_away_from_its_goal(name):
     from whill_mjx.vehicle.specs import WHILL_CR
     from whill_mjx.world.scene import clearance, footprint
@@ -245,5 +245,5 @@ def test_every_task_that_ships_begins_free_and_away_from_its_goal(name):
         return free, jnp.linalg.norm(task.goal(world.scene) - start[:2])
 
     free, away = jax.jit(jax.vmap(look))(jax.random.split(jax.random.key(1), 200))
-    assert float(free.min()) > 0.05 and float(away.min()) > task.goal_radius + 0.5
-    assert np.isfinite(away).all()
+    assert float(free.min()) > 0.05 and np.isfinite(away).all()
+    assert name == "follow" or float(away.min()) > task.goal_radius + 0.5  # a person is near at first, and walks away
