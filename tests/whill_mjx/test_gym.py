@@ -105,7 +105,8 @@ def test_options_change_the_episode_and_unknown_ones_are_refused(env):
     env.reset(seed=1)
     _, info = env.reset(seed=1, options={"start_y": 0.25})
     assert info["y"] == pytest.approx(0.25, abs=1e-3)
-    for wrong, words in (({"start_z": 1.0}, "no option 'start_z'.*known: .*start_y"), ({"light": "dim"}, "light is .dim.; it must be a number")):
+    unknown, text = "no option 'start_z'.*known: .*start_y", "light is 'dim'; it must be a number"
+    for wrong, words in (({"start_z": 1.0}, unknown), ({"light": "dim"}, text)):
         with pytest.raises(ValueError, match=words):
             env.reset(options=wrong)
 
