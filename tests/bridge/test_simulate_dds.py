@@ -95,7 +95,7 @@ def test_the_shipped_layouts_show_topics_that_the_simulator_publishes_in_their_t
         return {name: kinds for name, kinds in peer.node.get_topic_names_and_types()
                 if peer.node.get_publishers_info_by_topic(name)}
 
-    peer.wait_until(lambda _: "/sensing/lidar/scan" in published(_) and "/map" in published(_))
+    peer.wait_until(lambda _: {topic for topic, _ in shown} <= published(_).keys())
     topics = published(peer)
     for topic, kind in shown:
         assert topic in topics and kind in (None, topics[topic][0]), topic

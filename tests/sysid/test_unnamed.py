@@ -46,7 +46,7 @@ def bench():
     space = make_space(params, spec, ["torque_drive.kp", "rolling_resistance.mu_r"])
     scale = np.array([0.004, 0.008, 0.01, 0.01, 0.01])
     reference = SimpleNamespace(
-        width=BIN,
+        width=BIN, gyro=False,
         params=params, space=space, u=space.to_unit(space.initial), factors=np.ones((4, 5)),
         whitener=Whitener(scale, np.zeros((1, 5, 5)), np.eye(5)), target_of=lambda drives: drives.target)
     trials = tuple(trial_of(name, heading) for heading, name in enumerate(DRIVES))
