@@ -54,7 +54,7 @@ def subject():
     whitener = Whitener(np.array([0.005, 0.01, 0.01, 0.01, 0.01]), np.zeros((1, 5, 5)), np.eye(5))
     reference = SimpleNamespace(params=params, space=space, u=space.to_unit(space.initial), spread=1e-4 * np.eye(2),
                                 whitener=whitener, factors=np.ones((4, 5)), target_of=lambda drives: drives.target,
-                                width=BIN)
+                                width=BIN, gyro=False)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
     log = SimpleNamespace(spec=spec, training=(straight_trial(),), name="drives")
     drives = make_drives(plant, full, names, log.training)
