@@ -99,6 +99,7 @@ def test_an_average_follows_the_parameters_and_learning_does_not_notice():
     assert state.agent.acting is state.agent.average
 
 
+@pytest.mark.long
 def test_an_evaluation_made_ahead_is_compiled_when_it_is_due_and_leaves_the_run_as_it_was(tmp_path):
     env, config = corridor_env(2), tiny_config()
     traced, ahead, due = [], [], []

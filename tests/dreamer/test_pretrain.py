@@ -140,6 +140,7 @@ def test_a_killed_pretraining_goes_on_from_its_last_checkpoint(straight, tmp_pat
     assert [path.name for path in checkpoint.complete(tmp_path / "checkpoints")][-1] == f"{COUNTED:012d}"
 
 
+@pytest.mark.long
 def test_seeds_side_by_side_pretrain_as_each_alone_with_a_mirror_and_targets(tmp_path):
     mirror = Mirror(
         lambda state, obs, worlds: jax.tree.map(lambda x: x[None], obs), lambda action, worlds: action[None, :, ::-1]

@@ -439,6 +439,7 @@ def test_replicates_move_alike_unless_the_room_does_something(drives, sloping):
     assert np.sqrt(np.square(once - every).mean()) < 1e-4
 
 
+@pytest.mark.long
 def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
     made = refitter_of(sloping).drives
     every = np.arange(len(made.trials))

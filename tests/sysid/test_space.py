@@ -83,6 +83,7 @@ def test_a_step_along_the_valley_of_what_is_told_per_inertia_stays_on_its_floor(
     np.testing.assert_array_equal(fixed.moved(at, np.full_like(at, 0.01)), at + 0.01)
 
 
+@pytest.mark.long
 def test_along_that_valley_a_vehicle_drives_nearly_alike(tmp_path):
     """The list of what is told per inertia is what the vehicle's equations say; a straight step leaves the valley."""
     spec, params, space = light_space()

@@ -82,6 +82,7 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     assert (difference > 3).mean() < 0.02  # only pixels on an edge
 
 
+@pytest.mark.long
 def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode():
     env, params = make_env("corridor", height=16, width=16)
     batch = make_batch(env, params, 2, second_tries=0.5)

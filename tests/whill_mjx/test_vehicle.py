@@ -142,6 +142,7 @@ def test_suspension_carries_the_weight_and_shifts_it_towards_the_centre_of_mass(
     assert load[0] > load[1]  # centre of mass to the left
 
 
+@pytest.mark.long
 def test_physics_steps_of_any_length_carry_springs_of_any_stiffness():
     """Springs of 0.3 mm swing at 181 1/s, those of 20 um at 700: with loads of the start of the step, steps of 20 ms
     would let wheels hop, and the chair slide past its stop."""
