@@ -101,16 +101,26 @@ def vehicles(report: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
+MANOEUVRE_WORDS = {
+    "prbs": "random full steps of speed and yaw rate", "chirp": "swings that get quicker and quicker",
+    "yaw_sine": "slow turns to both sides on the spot", "step_ladder": "forward and back by growing steps",
+    "turn_ladder": "turns on the spot by growing steps", "stop_and_go": "full speed and stop, forward and back",
+    "square": "a square to the left and one to the right", "arcs": "arcs forward and back to both sides",
+}  # fmt: skip
+"""Of the manoeuvres that `sysid.logs.manoeuvre_library` makes."""
+
+
 def sentence(proposal: Mapping[str, Any]) -> str:
     """A proposal of a next drive in words."""
     parts = []
     if proposal["name"] is not None:
         parameters, start = proposal["parameters"], proposal["start"]
         times = f"{proposal['replicates']} times" if proposal["replicates"] > 1 else "once"
-        parts.append(f"{proposal['name']} at up to {parameters['v']:.2g} m/s and {parameters['omega']:.2g} rad/s, "
-                     f"heading {math.degrees(start['heading']):.0f} degrees at the start, {times}, separates "
-                     f"{', '.join(proposal['splits'])} apart by {proposal['expected_separation']:.0f} standard "
-                     f"deviations a drive ({proposal['file']})")
+        name = MANOEUVRE_WORDS.get(proposal["name"], spoken(proposal["name"]))
+        parts.append(f"{name} at up to {parameters['v']:.2g} m/s and {parameters['omega']:.2g} rad/s, starting at a "
+                     f"heading of {math.degrees(start['heading']):.0f} degrees, driven {times}, separates "
+                     f"{' from '.join(map(spoken, proposal['splits']))} by {proposal['expected_separation']:.0f} "
+                     f"standard deviations a drive ({proposal['file']})")
     for one in proposal["not_split"]:
         parts.append(f"no drive separates {' from '.join(one['effects'])}; {one['sensor']} would")
     return "; ".join(parts)

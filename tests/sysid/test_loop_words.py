@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sysid.logs.manoeuvre_library import OWN
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.loop_report import wrapped
-from sysid.pages.loop_words import lead, size, title
+from sysid.pages.loop_words import MANOEUVRE_WORDS, lead, sentence, size, title
 
 pytestmark = pytest.mark.quick
 
@@ -90,3 +91,12 @@ def test_the_drive_that_is_shown_is_held_out_and_the_one_of_median_error():
 def test_long_lines_are_folded_and_words_stay_whole():
     folded = wrapped("  lives in " + "somewhere " * 30, 60)
     assert max(map(len, folded.splitlines())) <= 60 and folded.splitlines()[1].startswith("    somewhere")
+
+
+def test_every_manoeuvre_of_the_library_has_words_and_both_effects_are_named():
+    assert MANOEUVRE_WORDS.keys() == OWN.keys()
+    proposal = {"name": "prbs", "parameters": {"v": 0.6, "omega": 0.5}, "start": {"heading": 0.0}, "replicates": 1,
+                "splits": ["side_force", "wind"], "expected_separation": 15.2, "file": "next_command.csv",
+                "not_split": []}
+    said = sentence(proposal)
+    assert said.startswith(MANOEUVRE_WORDS["prbs"]) and "separates side force from wind by 15 standard" in said
