@@ -59,11 +59,11 @@ def test_a_drive_that_a_person_ends_is_put_aside_and_no_trial(graph, commands):
     robot.wait_for_status(since=0, driving=True)
     collision = robot.publisher("std_msgs/Bool", "collision_sensor")
     robot.wait_until(lambda _: collision.get_subscription_count())
-    graph.wait_for("manoeuvre", "driving")
+    logs = commands.parent / "logs"
+    robot.wait_until(lambda _: any(path.read_text().count("\n") > 2 for path in logs.rglob("command.csv")))
     collision.publish(message_type("std_msgs/Bool")(data=True))
     graph.wait_for("manoeuvre", "stopped on the way")
     assert graph.end("manoeuvre", signal.SIGINT) == 3
-    logs = commands.parent / "logs"
     assert not list((logs / "trials").iterdir())
     (aside,) = (logs / "aborted").iterdir()
     assert rows(aside / "command.csv")
