@@ -211,7 +211,8 @@ def test_a_signal_to_a_forked_child_ends_the_child_alone():
             time.sleep(60)
         print("begun", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM, sep="\\n", flush=True)
         """, first="""
-        import os, signal
+        import os, signal, warnings
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against a fork among threads
         os.register_at_fork(after_in_child=lambda: os.kill(os.getpid(), signal.SIGTERM))  # it comes before all else
         """)  # fmt: skip
     assert child.stdout.read() == "True\n" and child.wait() == 0 and not child.stderr.read()
