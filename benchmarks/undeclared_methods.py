@@ -6,7 +6,7 @@ A method is an object or a class without arguments with
     judge(ready, log)      log: folder of the log in question -> a verdict
 
 A verdict is a dict: "verdict" is "none", "named" or "unexplained"; "named" comes with "effects", a list of effects.
-Each effect is a name of `VOCABULARY`, or a list of names that the method cannot tell apart. Folders hold driving-log
+Each effect is a name of `VOCABULARY`, or a list of names that the method cannot separate. Folders hold driving-log
 datasets (docs/log_format.md): TOML and CSV, which a method may read as it likes.
 """
 

@@ -38,7 +38,7 @@ class Stream:
     def _open(self, reliable: bool) -> None:
         before, self._reliable = self._reader, reliable
         profile = ros.reliable(DEPTH) if reliable else ros.best_effort(DEPTH)
-        if before is not None and self.raw:  # whose messages cannot be told apart while there are two readers
+        if before is not None and self.raw:  # whose messages cannot be distinguished while there are two readers
             self.node.destroy_subscription(before)
             before = None
         self._reader = ros.subscribe_counting_losses(self.node, self.kind, self.name, self._heard, profile, self._count,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, ParamSpec
+from typing import Any, Literal, ParamSpec, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -193,6 +193,25 @@ def train(
         raise ValueError(f"seed = {seed}: several seeds run in one program on one device. Give one, or no devices.")
     run = _Run(env, config, out, total_steps, options)
     run.begin(seed, mesh)
+    carry_out(run)
+    return run.result()
+
+
+class Run(Protocol):
+    """A training that has begun."""
+
+    def go_on(self) -> None:
+        """Iterate to the end."""
+
+    def interrupted(self) -> None:
+        """Keep what is done."""
+
+    def close(self) -> None:
+        """End what shows and logs it."""
+
+
+def carry_out(run: Run) -> None:
+    """Bring a run to its end; Ctrl-C keeps what is done and goes on to the caller."""
     try:
         run.go_on()
     except KeyboardInterrupt:
@@ -200,7 +219,6 @@ def train(
         raise
     finally:
         run.close()
-    return run.result()
 
 
 class _Run:

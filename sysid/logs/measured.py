@@ -25,7 +25,7 @@ import numpy as np
 
 from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.gyro import told_sign
-from sysid.logs.log import hash_files
+from sysid.logs.log import hash_files, load_log
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
@@ -488,8 +488,6 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     dataset's rows that were held between updates (`sysid.logs.streams.without_held`). A base that stops by itself where
     no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """
-    from sysid.logs.log import load_log
-
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
         log: Log = with_own_timeout(_without_held(load_log(path)))

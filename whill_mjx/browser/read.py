@@ -88,7 +88,7 @@ def is_run(path: Path) -> bool:
 
 
 def read_runs(paths: Sequence[Path]) -> list[Run]:
-    """All runs, under names that tell them apart."""
+    """All runs, under names that distinguish them."""
     return [read_run(path, name) for path, name in zip(paths, _names(paths), strict=True)]
 
 

@@ -12,7 +12,7 @@ import jax
 
 from dreamer import checkpoint
 from dreamer.progress import Progress
-from dreamer.train import TrainingOptions, in_thread
+from dreamer.train import TrainingOptions, carry_out, in_thread
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
@@ -49,13 +49,7 @@ def train_ppo(
     out.mkdir(parents=True, exist_ok=True)
     run = _Run(env, config, out, total_steps, options)
     run.begin(seed, last_step)
-    try:
-        run.go_on()
-    except KeyboardInterrupt:
-        run.interrupted()
-        raise
-    finally:
-        run.bar.close()
+    carry_out(run)
     return run.state.params, run.env_steps, run.updates, run.wall_s()
 
 
@@ -119,6 +113,10 @@ class _Run:
         """Keep what is done; an evaluation that is due would be missing from the run that goes on from here."""
         if checkpoint.is_whole(self.state) and not self._due(int(self.state.updates)):
             self._save()
+
+    def close(self) -> None:
+        """End the bar."""
+        self.bar.close()
 
     def _due(self, done: int) -> bool:
         return done == self.last or done * self.each // self.options.eval_every > self.logged
