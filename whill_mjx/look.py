@@ -27,7 +27,7 @@ import numpy as np
 from tqdm import tqdm
 
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
-from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
+from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, plan_action
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
@@ -178,10 +178,7 @@ def film_of(options: Look) -> list[np.ndarray]:
         draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, 144, 192, best))
         return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)]
     env, params = _env(options)
-    config = for_task(env.task)
-    key, plan_key = jax.random.split(jax.random.key(options.seed))
-    state = jax.jit(partial(reset_state, env, params))(key)
-    plan = first_plan(config, env, state, plan_key)
+    config, state, plan, plan_key = _start(options, env, params)
 
     def one_step(state, plan, step_key):
         action, plan = plan_action(config, env, state, plan, step_key)
@@ -215,14 +212,19 @@ def _env(options: Look) -> tuple[Env, VehicleParams]:
         return make_env(task, looks=options.looks)
 
 
+def _start(options: Look, env: Env, params: VehicleParams) -> tuple[PlannerConfig, State, jax.Array, jax.Array]:
+    """What a planner's episode begins with: its settings, the state, a plan, and the key of all later plans."""
+    config = for_task(env.task)
+    key, plan_key = jax.random.split(jax.random.key(options.seed))
+    state = jax.jit(partial(reset_state, env, params))(key)
+    return config, state, first_plan(config, env, state, plan_key), plan_key
+
+
 def record(options: Look) -> int:
     """Drive an episode with the planner for the Rerun viewer; returns its number of control periods."""
     env, params = _env(options)
     env = dataclasses.replace(env, task=dataclasses.replace(env.task, action_repeat=1))
-    config = for_task(env.task)
-    key, plan_key = jax.random.split(jax.random.key(options.seed))
-    state = jax.jit(partial(reset_state, env, params))(key)
-    plan = first_plan(config, env, state, plan_key)
+    config, state, plan, plan_key = _start(options, env, params)
 
     def one_step(state, plan, step_key):
         action, plan = plan_action(config, env, state, plan, step_key)
