@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.sharding import Mesh
 
@@ -266,11 +268,13 @@ def compile_iteration(
 
 
 def compile_init(env: FunctionalEnv, config: DreamerConfig, seed: int, mesh: Mesh | None = None) -> Any:
-    """The compiled `init_state`, () -> state, each array made where it belongs."""
+    """The compiled `init_state`, () -> state, each array made where it belongs; one program serves all seeds."""
 
-    def begin() -> TrainState:
+    def begin(seed: jax.Array) -> TrainState:
         return init_state(env, config, seed)
 
+    given = np.int64(seed).astype(np.int32)  # as JAX itself reads a seed
     if mesh is None:
-        return jax.jit(begin)
-    return jax.jit(begin, out_shardings=parallel.state_shardings(mesh, jax.eval_shape(begin), env.num_envs))
+        return partial(jax.jit(begin), given)
+    placement = parallel.state_shardings(mesh, jax.eval_shape(begin, given), env.num_envs)
+    return partial(jax.jit(begin, out_shardings=placement), given)

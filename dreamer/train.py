@@ -34,6 +34,7 @@ EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
 StopFn = Callable[[dict[str, float]], bool]
 P = ParamSpec("P")
+COMPILING = "compiling training and evaluation: usually 1 to 2 minutes, seconds where they are kept of an earlier run"
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
@@ -235,7 +236,7 @@ class _Run:
 
     def begin(self, seed: int | Sequence[int], mesh: Mesh | None) -> None:
         """Restore or make the state, and compile the program of an iteration."""
-        options = self.options
+        options, self._called = self.options, time.monotonic()
         options.announce("preparing the training: first worlds and parameters")
         self.state, self._wall_before = _first_state(self.env, self.config, self.out, seed, options.resume, mesh)
         self._began = time.monotonic()
@@ -253,9 +254,9 @@ class _Run:
         self._compiled = compiled
         if options.eval_ahead is not None and mesh is None and self.env_steps < self.total_steps:
             self._ready = in_thread(options.eval_ahead, self.state.agent.acting)
-        options.announce("compiling the training program, usually 1 to 2 minutes")
+        options.announce(COMPILING)
         self._iterate = compiled(train_iteration if self._counted else pretrain.pretrain_iteration)
-        options.announce("training")
+        options.announce(f"training; its program was ready after {time.monotonic() - self._began:.0f} s")
         self._bar = Progress(self.total_steps, self.env_steps, options.progress and parallel.is_first_process())
         self._meter = Meter()
         self._saved_at = self._logged_at = time.monotonic()
@@ -317,6 +318,9 @@ class _Run:
         self._meter.add(metrics, steps)
         self._meter.wait_for_previous()
         self._iterations += 1
+        if self._iterations == 1:
+            jax.block_until_ready(metrics)
+            self.options.announce(f"first step after {time.monotonic() - self._called:.0f} s")
         return begins
 
     def _log_where_due(self, now: float, finished: bool, begins: bool) -> None:
@@ -443,7 +447,7 @@ def _init(
     config = replace(config, replay_memory=_memory(env, config, alone))
     if isinstance(seed, int):
         return compile_init(env, config, seed, mesh)
-    return jax.jit(lambda: seeds.init_states(env, config, seed))
+    return functools.partial(jax.jit(lambda each: seeds.init_states(env, config, each)), np.asarray(seed, np.int32))
 
 
 def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["device", "host"]:

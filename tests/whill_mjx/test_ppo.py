@@ -32,7 +32,7 @@ QUIET = TrainingOptions(progress=False)
 
 def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
     env, iterations = half_lit_env(16), 40
-    state = jax.jit(lambda: init_state(env, TINY, iterations, 0))()
+    state = jax.jit(lambda: init_state(env, TINY, 0))()
     run = jax.jit(lambda state: iterate(env, TINY, iterations, state), donate_argnums=0)
     rewards = []
     for _ in range(iterations):
@@ -119,7 +119,7 @@ def test_the_exported_network_acts_like_the_trained_one(tmp_path):
 @pytest.mark.quick
 def test_minibatches_that_do_not_divide_a_rollout_are_refused():
     with pytest.raises(ValueError, match="minibatches"):
-        init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 1, 0)
+        init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 0)
     with pytest.raises(ValueError, match="epochs"):
         PpoConfig(epochs=0)
 

@@ -114,7 +114,7 @@ class Course:
         for begin in range(0, len(keys), size):
             index = (begin + np.arange(size)) % len(keys)
             given = jax.tree.map(lambda leaf, index=index: leaf[index], (params, keys, condition, memory))
-            parts.append(jax.device_get(run(*given)))
+            parts.append(jax.device_get(run(driver.weights, *given)))
         whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(keys)], *parts)
         return Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
 
@@ -127,7 +127,7 @@ class Course:
         keys, actions = episodes.keys, _actions(episodes)
         params, memory = self.vehicles(keys), (jnp.asarray(actions), jnp.zeros(len(keys), jnp.int32))
         run = self._rollout(_REPLAY, View(frames=True))
-        frames = jax.device_get(run(params, keys, None, memory).frames)
+        frames = jax.device_get(run(None, params, keys, None, memory).frames)
 
         def view(params: VehicleParams, key: jax.Array, scene: Any, row: jax.Array) -> jax.Array:
             state = reset_state(self.env, params, key)
@@ -160,8 +160,9 @@ class Course:
         name = (driver, view)
         if name not in self._compiled:
 
-            def run(params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
-                return rollout(self.env, params, keys, driver, condition, view=view, memory=memory)
+            def run(weights: Any, params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
+                given = dataclasses.replace(driver, weights=weights)
+                return rollout(self.env, params, keys, given, condition, view=view, memory=memory)
 
             self._compiled[name] = jax.jit(run)
         return self._compiled[name]
