@@ -15,7 +15,7 @@ import zlib
 from pathlib import Path
 
 FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
-KEPT_S = 0.2
+KEPT_S = 0.05
 """Programs that compile faster are not kept [s]."""
 MOST_BYTES = 2_000_000_000
 """Size of the folder at the start of a command; the programs that were unused for longest make room."""
