@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections import Counter
 from contextlib import contextmanager
 
 import jax
@@ -44,6 +45,20 @@ def compilation_cache(tmp_path_factory):
         folder = folder.parent
     with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=0.1):
         yield
+
+
+@pytest.fixture
+def programs():
+    """Counts cache_hits and cache_misses of the compiled programs; every one of the test is kept."""
+    counted = Counter()
+
+    def count(name, **about):
+        counted[name.rpartition("/")[2]] += 1
+
+    jax.monitoring.register_event_listener(count)
+    with options(jax_persistent_cache_min_compile_time_secs=0.0):
+        yield counted
+    jax.monitoring.unregister_event_listener(count)
 
 
 @pytest.fixture(scope="module", autouse=True)

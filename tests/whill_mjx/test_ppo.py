@@ -144,6 +144,14 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
     assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)
 
 
+def test_another_seed_and_more_steps_run_the_programs_that_were_kept(tmp_path, programs):
+    env, each = half_lit_env(4), 4 * TINY.rollout
+    for seed, steps in ((0, 2 * each), (1, 3 * each)):
+        programs.clear()
+        train_ppo(env, TINY, tmp_path / str(seed), steps, seed, QUIET)
+    assert programs["cache_misses"] == 0 and programs["cache_hits"] >= 2
+
+
 def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp_path):
     env, each = half_lit_env(4), 4 * TINY.rollout
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dreamer import checkpoint
@@ -64,19 +65,21 @@ class _Run:
 
     def begin(self, seed: int, last_step: int | None) -> None:
         """Restore or make the state, and prepare the program of an iteration."""
-        options, self.called = self.options, time.monotonic()
+        options, self.began = self.options, time.monotonic()
         self.last = self.iterations if last_step is None else min(self.iterations, -(-last_step // self.each))
         options.announce("preparing the training: first worlds and parameters")
-        self.state, self.wall_before = _first_state(self.env, self.config, self.out, seed)
-        self.done, self.began = int(self.state.updates), time.monotonic()
-        self.logged = self.env_steps // options.eval_every
-        _keep_lines(self.out / "metrics.jsonl", self.env_steps)
-        early = options.eval_ahead if self.done < self.last else None
-        options.announce(COMPILING)
-        self.ready = [] if early is None else [in_thread(early, self.state.params)]
         total = np.int32(self.iterations)
         program = jax.jit(lambda state, total: iterate(self.env, self.config, total, state), donate_argnums=0)
-        compiled = program.lower(self.state, total).compile()
+        shapes = jax.eval_shape(lambda: init_state(self.env, self.config, seed))
+        early = in_thread(program.lower(shapes, total).compile)  # while the first state is made
+        self.state, self.wall_before = _first_state(self.env, self.config, self.out, seed)
+        self.done = int(self.state.updates)
+        self.logged = self.env_steps // options.eval_every
+        _keep_lines(self.out / "metrics.jsonl", self.env_steps)
+        ahead = options.eval_ahead if self.done < self.last else None
+        options.announce(COMPILING)
+        self.ready = [] if ahead is None else [in_thread(ahead, jax.tree.map(jnp.copy, self.state.params))]
+        compiled = early.result()
         self.run = lambda state: compiled(state, total)
         options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
         self.saved_at = time.monotonic()
@@ -107,7 +110,7 @@ class _Run:
                 self.bar.show(self.env_steps, {})
             if running is None:
                 jax.block_until_ready(metrics)
-                self.options.announce(f"first step after {time.monotonic() - self.called:.0f} s")
+                self.options.announce(f"first step after {time.monotonic() - self.began:.0f} s")
             running = metrics
             if self._due(self.done):
                 line = self._evaluated(metrics)
