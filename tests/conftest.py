@@ -39,11 +39,15 @@ def options(**values):
 
 @pytest.fixture(scope="session", autouse=True)
 def compilation_cache(tmp_path_factory):
-    """One cache of compiled programs for all workers of a run and for the processes that tests start."""
+    """One cache of compiled programs for all workers of a run and for the processes that tests start.
+
+    JAX_COMPILATION_CACHE_DIR names one that is kept for later runs.
+    """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=0.1):
+    kept = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled"))
+    with options(jax_compilation_cache_dir=kept, jax_persistent_cache_min_compile_time_secs=0.1):
         yield
 
 

@@ -87,7 +87,7 @@ class Course:
     def __init__(self, env: Env, params: VehicleParams, spread: float = 0.0, batch: int = 1000):
         """Take an environment, its nominal vehicle, a relative spread of its parameters, and episodes at a time."""
         self.env, self.params, self.spread, self.batch = env, params, spread, batch
-        self._compiled: dict[Any, Callable[..., Rollout]] = {}
+        self._compiled: dict[Any, Callable[..., Any]] = {}
 
     def vehicles(self, keys: jax.Array) -> VehicleParams:
         """Vehicle of each episode, leaves (N, ...)."""
@@ -118,12 +118,20 @@ class Course:
         whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(keys)], *parts)
         return Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
 
-    def film(self, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
+    def film(self, episodes: Episodes, batch: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Images of the camera (N, T + 1, H, W, 3) during recorded episodes, and views from above twice as high.
 
         The recorded actions are replayed, not decided again: a policy rounds otherwise in a batch of another size, and
-        may then arrive where it collided. The views from above show the recorded places.
+        may then arrive where it collided. The views from above show the recorded places. One program of `batch`
+        episodes films any number of them; None takes all at a time.
         """
+        count = episodes.count
+        size = batch or count
+        parts = [self._film(episodes.some((begin + np.arange(size)) % count)) for begin in range(0, count, size)]
+        frames, views = (np.concatenate(each)[:count] for each in zip(*parts, strict=True))
+        return frames, views
+
+    def _film(self, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
         keys, actions = episodes.keys, _actions(episodes)
         params, memory = self.vehicles(keys), (jnp.asarray(actions), jnp.zeros(len(keys), jnp.int32))
         run = self._rollout(_REPLAY, View(frames=True))
@@ -134,8 +142,9 @@ class Course:
             vehicle = place(self.env.model, params, row[0], row[1], row[2])
             return top_view(self.env, dataclasses.replace(state, scene=scene, vehicle=vehicle))
 
-        views = jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, None, None, 0))))
-        return frames, jax.device_get(views(params, keys, episodes.scene, episodes.trace))
+        if "views" not in self._compiled:
+            self._compiled["views"] = jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, None, None, 0))))
+        return frames, jax.device_get(self._compiled["views"](params, keys, episodes.scene, episodes.trace))
 
     def blinded(self, driver: Driver, keys: jax.Array, blind: str, sighted: Episodes) -> Episodes:
         """The same episodes without sight.
