@@ -6,7 +6,6 @@ has left there; they train with other seeds.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -19,6 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
+
+import jax
 
 from benchmarks.harness import figure, record
 from whill_mjx.io.command_line import COUNT, run
@@ -141,11 +142,12 @@ def main(options: Options) -> None:
     for part in options.parts:
         folder = Path(tempfile.mkdtemp(prefix="speed_"))
         try:
-            path = record("speed", CLAIM, measure(options, part, folder))
+            figures = measure(options, part, folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-        figures = json.loads(path.read_text())["figures"]
-        print(part, {name: round(one["value"], 3) for name, one in figures.items()}, flush=True)
+        before = "cpu_" if jax.devices()[0].platform == "cpu" else ""
+        path = record("speed", CLAIM, {f"{before}{name}": one for name, one in figures.items()})
+        print(path, {name: round(one["value"], 3) for name, one in figures.items()}, flush=True)
 
 
 if __name__ == "__main__":
