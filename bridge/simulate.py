@@ -219,9 +219,11 @@ def main(arguments: list[str] | None = None) -> int:
     compiling: Any = contextlib.nullcontext()
     if options.simulator.startswith("bridge.simulate:"):  # others may abort with it
         from whill_mjx.io.command_line import guarded
+        from whill_mjx.io.compiled import keep_compiled
         from whill_mjx.processor import share_results
 
         share_results()
+        keep_compiled()
         compiling = guarded("bridge.simulate: stopped")  # a signal ends it while XLA compiles, too
     with compiling:
         try:

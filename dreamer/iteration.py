@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from fractions import Fraction
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.sharding import Mesh
 
@@ -16,6 +18,7 @@ from dreamer import agent as agents
 from dreamer import exploration, parallel, replay, sensors, spaces
 from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
+from dreamer.host_replay import HostFrames
 from dreamer.replay import Batch, Replay
 from dreamer.rssm import Latent
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
@@ -254,23 +257,46 @@ def compile_iteration(
     env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None, step: Any = train_iteration
 ) -> Any:
     """The compiled iteration, state -> (state, metrics), with the state donated; of `step`, if another one is meant."""
+    return lower_iteration(env, config, state, mesh, step).compile()
+
+
+def lower_iteration(
+    env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None, step: Any = train_iteration
+) -> jax.stages.Lowered:
+    """The same before XLA's part; `state` may be its shapes. Further trainings in a process trace nothing again."""
+    if mesh is None:
+        on_host = isinstance(state.replay.obs, HostFrames)  # memory that must not be held by a kept program
+        program = (_iteration.__wrapped__ if on_host else _iteration)(env, config, step)
+        return program.lower(state)
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
         return step(env, config, state, mesh)
 
-    if mesh is None:
-        return jax.jit(iterate, donate_argnums=0).lower(state).compile()
     placement = parallel.state_shardings(mesh, state, env.num_envs)
     out = (placement, parallel.replicated(mesh))
-    return jax.jit(iterate, donate_argnums=0, in_shardings=(placement,), out_shardings=out).lower(state).compile()
+    return jax.jit(iterate, donate_argnums=0, in_shardings=(placement,), out_shardings=out).lower(state)
+
+
+@lru_cache(maxsize=8)
+def _iteration(env: FunctionalEnv, config: DreamerConfig, step: Any) -> Any:
+    return jax.jit(lambda state: step(env, config, state, None), donate_argnums=0)
 
 
 def compile_init(env: FunctionalEnv, config: DreamerConfig, seed: int, mesh: Mesh | None = None) -> Any:
-    """The compiled `init_state`, () -> state, each array made where it belongs."""
+    """The compiled `init_state`, () -> state, each array made where it belongs; one program serves all seeds."""
 
-    def begin() -> TrainState:
+    given = np.int64(seed).astype(np.int32)  # as JAX itself reads a seed
+    if mesh is None:
+        on_host = config.replay_memory == "host"  # each state has memory of its own
+        return partial((_beginning.__wrapped__ if on_host else _beginning)(env, config), given)
+
+    def begin(seed: jax.Array) -> TrainState:
         return init_state(env, config, seed)
 
-    if mesh is None:
-        return jax.jit(begin)
-    return jax.jit(begin, out_shardings=parallel.state_shardings(mesh, jax.eval_shape(begin), env.num_envs))
+    placement = parallel.state_shardings(mesh, jax.eval_shape(begin, given), env.num_envs)
+    return partial(jax.jit(begin, out_shardings=placement), given)
+
+
+@lru_cache(maxsize=8)
+def _beginning(env: FunctionalEnv, config: DreamerConfig) -> Any:
+    return jax.jit(lambda seed: init_state(env, config, seed))

@@ -7,6 +7,7 @@ loops: with a count of its own for each run, `vmap` would have to copy the repla
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -68,8 +69,9 @@ def compile_iterations(
     env: FunctionalEnv, config: DreamerConfig, state: TrainState, step: Any = train_iteration
 ) -> Callable[[TrainState], Any]:
     """The compiled `train_iterations`, with the state donated."""
+    return _iterations(env, config, step).lower(state).compile()
 
-    def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_iterations(env, config, state, step)
 
-    return jax.jit(iterate, donate_argnums=0).lower(state).compile()
+@lru_cache(maxsize=8)
+def _iterations(env: FunctionalEnv, config: DreamerConfig, step: Any) -> Any:
+    return jax.jit(lambda state: train_iterations(env, config, state, step), donate_argnums=0)

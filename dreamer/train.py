@@ -24,7 +24,14 @@ from dreamer.agent import AgentState
 from dreamer.board import Board
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
-from dreamer.iteration import TrainState, compile_init, compile_iteration, init_state, train_iteration
+from dreamer.iteration import (
+    TrainState,
+    compile_init,
+    compile_iteration,
+    init_state,
+    lower_iteration,
+    train_iteration,
+)
 from dreamer.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
@@ -34,6 +41,7 @@ EvalFn = Callable[[Params, int], dict[str, float]]
 MetricsFn = Callable[[dict[str, float]], None]
 StopFn = Callable[[dict[str, float]], bool]
 P = ParamSpec("P")
+COMPILING = "compiling training and evaluation: usually 1 to 2 minutes, seconds where they are kept of an earlier run"
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
@@ -235,10 +243,10 @@ class _Run:
 
     def begin(self, seed: int | Sequence[int], mesh: Mesh | None) -> None:
         """Restore or make the state, and compile the program of an iteration."""
-        options = self.options
+        options, self._began = self.options, time.monotonic()
         options.announce("preparing the training: first worlds and parameters")
+        early = self._compiled_ahead(seed, mesh)
         self.state, self._wall_before = _first_state(self.env, self.config, self.out, seed, options.resume, mesh)
-        self._began = time.monotonic()
         self.env_steps = int(self.state.env_steps)
         self._done = pretrain.counters(self.state)
         place = pretrain.position(self.config, {"env_steps": self.env_steps, **self._done})
@@ -252,14 +260,30 @@ class _Run:
 
         self._compiled = compiled
         if options.eval_ahead is not None and mesh is None and self.env_steps < self.total_steps:
-            self._ready = in_thread(options.eval_ahead, self.state.agent.acting)
-        options.announce("compiling the training program, usually 1 to 2 minutes")
-        self._iterate = compiled(train_iteration if self._counted else pretrain.pretrain_iteration)
-        options.announce("training")
+            self._ready = in_thread(options.eval_ahead, jax.tree.map(jnp.copy, self.state.agent.acting))
+        options.announce(COMPILING)
+        step = train_iteration if self._counted else pretrain.pretrain_iteration
+        self._iterate = compiled(step) if early is None else early.result()
+        options.announce(f"training; its program was ready after {time.monotonic() - self._began:.0f} s")
         self._bar = Progress(self.total_steps, self.env_steps, options.progress and parallel.is_first_process())
         self._meter = Meter()
         self._saved_at = self._logged_at = time.monotonic()
         self._evaluated = self.env_steps // options.eval_every
+
+    def _compiled_ahead(self, seed: int | Sequence[int], mesh: Mesh | None) -> Future | None:
+        """The program of an iteration, compiled while the first state is made.
+
+        None where that state comes first: one to go on from may be refused, memory of the host is part of its program.
+        """
+        resumed = self.options.resume and checkpoint.complete(self.out / "checkpoints")
+        if not isinstance(seed, int) or mesh is not None or self.config.pretrain_steps or resumed:
+            return None
+        where = self.config.replay_memory
+        if where == "host" or (where == "auto" and not _fits(self.env, self.config)):
+            return None
+        config = replace(self.config, replay_memory="device")
+        shapes = jax.eval_shape(compile_init(self.env, config, seed))
+        return in_thread(lower_iteration(self.env, self.config, shapes).compile)
 
     def go_on(self) -> None:
         """Iterate to the end."""
@@ -317,6 +341,9 @@ class _Run:
         self._meter.add(metrics, steps)
         self._meter.wait_for_previous()
         self._iterations += 1
+        if self._iterations == 1:
+            jax.block_until_ready(metrics)
+            self.options.announce(f"first step after {time.monotonic() - self._began:.0f} s")
         return begins
 
     def _log_where_due(self, now: float, finished: bool, begins: bool) -> None:
@@ -392,10 +419,10 @@ def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
                          "folder.")
 
 
-def in_thread(call: Callable[[Params], Any], params: Params) -> Future:
-    """A call beside what follows, with a copy of the parameters, which may be donated meanwhile."""
+def in_thread(call: Callable[..., Any], *given: Any) -> Future:
+    """A call beside what follows. XLA compiles without holding Python's lock; arrays must not be donated meanwhile."""
     threads = ThreadPoolExecutor(1)
-    started = threads.submit(call, jax.tree.map(jnp.copy, params))
+    started = threads.submit(call, *given)
     threads.shutdown(wait=False)
     return started
 
@@ -443,7 +470,7 @@ def _init(
     config = replace(config, replay_memory=_memory(env, config, alone))
     if isinstance(seed, int):
         return compile_init(env, config, seed, mesh)
-    return jax.jit(lambda: seeds.init_states(env, config, seed))
+    return functools.partial(jax.jit(lambda each: seeds.init_states(env, config, each)), np.asarray(seed, np.int32))
 
 
 def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["device", "host"]:
@@ -455,17 +482,27 @@ def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["
         )
     if config.replay_memory != "auto" or not alone:
         return "host" if config.replay_memory == "host" else "device"
-    there = replace(config, replay_memory="device")
-    memory = jax.eval_shape(lambda: replay.init(there, env.num_envs, env.obs_shape, 1, 1 + config.mirror))
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(memory.obs))
-    if host_replay.fits(size, jax.devices()[0]):
+    if _fits(env, config):
         return "device"
+    size = _observation_bytes(env, config)
     print(
         f"The replay's observations would take {size / 1e9:.1f} GB, more than half of the device's memory: they are "
         "kept in the host's, which is slower. A smaller replay_capacity keeps them on the device.",
         file=sys.stderr,
     )
     return "host"
+
+
+def _fits(env: FunctionalEnv, config: DreamerConfig) -> bool:
+    """Whether the device has room for the observations of the replay."""
+    return host_replay.fits(_observation_bytes(env, config), jax.devices()[0])
+
+
+def _observation_bytes(env: FunctionalEnv, config: DreamerConfig) -> int:
+    """Size of the observations of the replay."""
+    there = replace(config, replay_memory="device")
+    memory = jax.eval_shape(lambda: replay.init(there, env.num_envs, env.obs_shape, 1, 1 + config.mirror))
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(memory.obs))
 
 
 def _evaluated(figures: dict[str, float]) -> dict[str, str]:

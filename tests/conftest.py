@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections import Counter
 from contextlib import contextmanager
 
 import jax
@@ -38,12 +39,30 @@ def options(**values):
 
 @pytest.fixture(scope="session", autouse=True)
 def compilation_cache(tmp_path_factory):
-    """One cache of compiled programs for all workers of a run and for the processes that tests start."""
+    """One cache of compiled programs for all workers of a run and for the processes that tests start.
+
+    JAX_COMPILATION_CACHE_DIR names one that is kept for later runs.
+    """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    with options(jax_compilation_cache_dir=str(folder / "compiled"), jax_persistent_cache_min_compile_time_secs=0.1):
+    kept = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled"))
+    with options(jax_compilation_cache_dir=kept, jax_persistent_cache_min_compile_time_secs=0.1):
         yield
+
+
+@pytest.fixture
+def programs():
+    """Counts cache_hits and cache_misses of the compiled programs; every one of the test is kept."""
+    counted = Counter()
+
+    def count(name, **about):
+        counted[name.rpartition("/")[2]] += 1
+
+    jax.monitoring.register_event_listener(count)
+    with options(jax_persistent_cache_min_compile_time_secs=0.0):
+        yield counted
+    jax.monitoring.unregister_event_listener(count)
 
 
 @pytest.fixture(scope="module", autouse=True)

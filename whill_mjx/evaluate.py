@@ -297,7 +297,7 @@ def draw(
     if len(failed) and options.videos:
         def failures(path: Path) -> None:
             shown = episodes.some(failed[: options.videos])
-            pages.episode_video(shown, *course.film(shown), path, rate)
+            pages.episode_video(shown, *course.film(shown, options.videos), path, rate)
 
         jobs["failures.mp4"] = failures
     written = []

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +38,7 @@ if starts(__name__):
     say_loading()
 
 import jax
+import jax.numpy as jnp
 
 from dreamer import checkpoint, parallel
 from dreamer.export import PolicyContract, export_policy, export_sensing
@@ -445,15 +447,16 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     )  # fmt: skip
     course = make_course(preset, vehicle)
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
-    vehicles, control_dt = course.vehicles(keys), course.env.model.config.control_dt
+    vehicles = course.vehicles(keys)
+    step, carry = policy_of(options, preset, course)
 
     @jax.jit
-    def ends(params: Any) -> dict[str, jax.Array]:
-        step, carry = ppo_policy(preset, params, control_dt, course.env)
-        return rollout(course.env, vehicles, keys, step_driver(step, carry, preset.task.action_repeat)).ends
+    def ends(params: Any, vehicles: Any, keys: jax.Array) -> dict[str, jax.Array]:
+        driver = step_driver(step, params, carry, preset.task.action_repeat)
+        return rollout(course.env, vehicles, keys, driver).ends
 
     def evaluate(params: Any, env_steps: int) -> dict[str, float]:
-        episodes = jax.device_get(ends(params))
+        episodes = jax.device_get(ends(params, vehicles, keys))
         return mean_figures({**episodes, "return": episodes["episode_return"]})
 
     stopper = Stopper(options.out, preset.stop_success)
@@ -501,12 +504,12 @@ def make_course(preset: Preset, vehicle: Path) -> Course:
     return Course(batch.env, batch.params)
 
 
-def policy_of(options: TrainOptions, preset: Preset, result: Trained, course: Course) -> tuple[Step, dict[str, Any]]:
+def policy_of(options: TrainOptions, preset: Preset, course: Course) -> tuple[Step, dict[str, Any]]:
     """What drives, and is exported: the step of one instance and its first carry."""
     control_dt = course.env.model.config.control_dt
     if options.learner == "ppo":
-        return ppo_policy(preset, result.params, control_dt, course.env)
-    return dreamer_policy(preset, result.params, control_dt)
+        return ppo_policy(preset, control_dt, course.env)
+    return dreamer_policy(preset, control_dt)
 
 
 def evaluate_policy(
@@ -516,7 +519,8 @@ def evaluate_policy(
     from whill_mjx.evaluation import pictures
 
     course = make_course(preset, vehicle)
-    driver = step_driver(*policy_of(options, preset, result, course), preset.task.action_repeat)
+    step, carry = policy_of(options, preset, course)
+    driver = step_driver(step, jax.tree.map(jnp.asarray, result.params), carry, preset.task.action_repeat)
     drivers = {"policy": driver, "random": random_driver(preset.task.action_repeat)}
     if options.planner:
         drivers["planner"] = planner_driver(course.env)
@@ -554,12 +558,13 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
         action_repeat=task.action_repeat,
         camera=camera_contract(course.env.model, course.params),
     )
-    step, carry = policy_of(options, preset, result, course)
+    policy, carry = policy_of(options, preset, course)
+    weights = jax.tree.map(jnp.asarray, result.params)
     if "surprise" in carry:
         keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
-        largest, _ = largest_surprise(course.env, course.params, step, carry, keys)
+        largest, _ = largest_surprise(course.env, course.params, policy, weights, carry, keys)
         contract = dataclasses.replace(contract, novelty=limits(largest))
-    shown = obs_shape_of(course.env)
+    shown, step = obs_shape_of(course.env), partial(policy, weights)
     try:
         if isinstance(shown, dict):
             return export_sensing(path, step, carry, shown, result.params, contract, vehicle_file=vehicle)

@@ -121,6 +121,14 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due_and_leaves_the_run_
     assert len(ahead) == 1  # nothing is left to train
 
 
+def test_another_seed_runs_the_programs_that_were_kept(tmp_path, programs):
+    for seed in (0, 1):
+        programs.clear()
+        env = corridor_env(2)  # as in another process, nothing is traced already
+        train(env, tiny_config(), tmp_path / str(seed), 64, seed, TrainingOptions(progress=False))
+    assert programs["cache_misses"] == 0 and programs["cache_hits"] >= 2
+
+
 def test_training_goes_on_while_an_evaluation_waits_for_its_compilation(tmp_path, monkeypatch):
     env, config = corridor_env(2), tiny_config()
     over, stopped_at = threading.Event(), []

@@ -32,7 +32,7 @@ QUIET = TrainingOptions(progress=False)
 
 def test_ppo_learns_to_point_at_the_lit_half_from_pixels():
     env, iterations = half_lit_env(16), 40
-    state = jax.jit(lambda: init_state(env, TINY, iterations, 0))()
+    state = jax.jit(lambda: init_state(env, TINY, 0))()
     run = jax.jit(lambda state: iterate(env, TINY, iterations, state), donate_argnums=0)
     rewards = []
     for _ in range(iterations):
@@ -119,7 +119,7 @@ def test_the_exported_network_acts_like_the_trained_one(tmp_path):
 @pytest.mark.quick
 def test_minibatches_that_do_not_divide_a_rollout_are_refused():
     with pytest.raises(ValueError, match="minibatches"):
-        init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 1, 0)
+        init_state(half_lit_env(3), PpoConfig(rollout=5, minibatches=8), 0)
     with pytest.raises(ValueError, match="epochs"):
         PpoConfig(epochs=0)
 
@@ -142,6 +142,14 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
     assert len(traced) == 1 and asked == [0, each, 2 * each]
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)
+
+
+def test_another_seed_and_more_steps_run_the_programs_that_were_kept(tmp_path, programs):
+    env, each = half_lit_env(4), 4 * TINY.rollout
+    for seed, steps in ((0, 2 * each), (1, 3 * each)):
+        programs.clear()
+        train_ppo(env, TINY, tmp_path / str(seed), steps, seed, QUIET)
+    assert programs["cache_misses"] == 0 and programs["cache_hits"] >= 2
 
 
 def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp_path):

@@ -35,7 +35,7 @@ def run(tmp_path_factory):
     """A finished run of the smoke preset with a built-in vehicle."""
     options = TrainOptions(
         out=tmp_path_factory.mktemp("run"), vehicle=Path("whill_cr_ramp"), preset="smoke", steps=200, episodes=8,
-        planner=False, safety="safe",
+        planner=False, safety="safe", videos=1,
     )  # fmt: skip
     return options, main(options)
 

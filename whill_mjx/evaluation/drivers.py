@@ -25,13 +25,20 @@ class Driver:
     name: str
     begin: Callable[[State, jax.Array], Any]
     """(state, key) -> memory."""
-    act: Callable[[Any, State, jax.Array, jax.Array], tuple[Any, jax.Array]]
+    act: Callable[..., tuple[Any, jax.Array]]
     """(memory, true state, image (H, W, 3) uint8 or the sensors' values by name, key) -> memory, action (2,) in
     [-1, 1]."""
     period: int = 1
     """Control periods from one decision to the next; the action is held in between."""
     sees: bool = True
     """Whether `act` looks at the image; if not, none is rendered."""
+    weights: Any = None
+    """Arrays that `act` then gets before the others: arguments of a compiled evaluation, which serves any values."""
+
+    def decide(self, memory: Any, state: State, image: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        """Memory and action of one instance."""
+        before = () if self.weights is None else (self.weights,)
+        return self.act(*before, memory, state, image, key)
 
 
 def policy_driver(policy: PolicyFile) -> Driver:

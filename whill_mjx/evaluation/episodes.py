@@ -87,7 +87,7 @@ class Course:
     def __init__(self, env: Env, params: VehicleParams, spread: float = 0.0, batch: int = 1000):
         """Take an environment, its nominal vehicle, a relative spread of its parameters, and episodes at a time."""
         self.env, self.params, self.spread, self.batch = env, params, spread, batch
-        self._compiled: dict[Any, Callable[..., Rollout]] = {}
+        self._compiled: dict[Any, Callable[..., Any]] = {}
 
     def vehicles(self, keys: jax.Array) -> VehicleParams:
         """Vehicle of each episode, leaves (N, ...)."""
@@ -114,28 +114,37 @@ class Course:
         for begin in range(0, len(keys), size):
             index = (begin + np.arange(size)) % len(keys)
             given = jax.tree.map(lambda leaf, index=index: leaf[index], (params, keys, condition, memory))
-            parts.append(jax.device_get(run(*given)))
+            parts.append(jax.device_get(run(driver.weights, *given)))
         whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(keys)], *parts)
         return Episodes(whole.trace, whole.ends, whole.scene, keys, self.env.model.config.control_dt)
 
-    def film(self, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
+    def film(self, episodes: Episodes, batch: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Images of the camera (N, T + 1, H, W, 3) during recorded episodes, and views from above twice as high.
 
         The recorded actions are replayed, not decided again: a policy rounds otherwise in a batch of another size, and
-        may then arrive where it collided. The views from above show the recorded places.
+        may then arrive where it collided. The views from above show the recorded places. One program of `batch`
+        episodes films any number of them; None takes all at a time.
         """
+        count = episodes.count
+        size = batch or count
+        parts = [self._film(episodes.some((begin + np.arange(size)) % count)) for begin in range(0, count, size)]
+        frames, views = (np.concatenate(each)[:count] for each in zip(*parts, strict=True))
+        return frames, views
+
+    def _film(self, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
         keys, actions = episodes.keys, _actions(episodes)
         params, memory = self.vehicles(keys), (jnp.asarray(actions), jnp.zeros(len(keys), jnp.int32))
         run = self._rollout(_REPLAY, View(frames=True))
-        frames = jax.device_get(run(params, keys, None, memory).frames)
+        frames = jax.device_get(run(None, params, keys, None, memory).frames)
 
         def view(params: VehicleParams, key: jax.Array, scene: Any, row: jax.Array) -> jax.Array:
             state = reset_state(self.env, params, key)
             vehicle = place(self.env.model, params, row[0], row[1], row[2])
             return top_view(self.env, dataclasses.replace(state, scene=scene, vehicle=vehicle))
 
-        views = jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, None, None, 0))))
-        return frames, jax.device_get(views(params, keys, episodes.scene, episodes.trace))
+        if "views" not in self._compiled:
+            self._compiled["views"] = jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, None, None, 0))))
+        return frames, jax.device_get(self._compiled["views"](params, keys, episodes.scene, episodes.trace))
 
     def blinded(self, driver: Driver, keys: jax.Array, blind: str, sighted: Episodes) -> Episodes:
         """The same episodes without sight.
@@ -160,8 +169,9 @@ class Course:
         name = (driver, view)
         if name not in self._compiled:
 
-            def run(params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
-                return rollout(self.env, params, keys, driver, condition, view=view, memory=memory)
+            def run(weights: Any, params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
+                given = dataclasses.replace(driver, weights=weights)
+                return rollout(self.env, params, keys, given, condition, view=view, memory=memory)
 
             self._compiled[name] = jax.jit(run)
         return self._compiled[name]

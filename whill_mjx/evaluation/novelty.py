@@ -18,24 +18,25 @@ SLOW, STOP = 0.9, 0.99
 
 
 def largest_surprise(
-    env: Env, params: Any, act: Callable, carry: dict[str, Any], keys: jax.Array
+    env: Env, params: Any, act: Callable, weights: Any, carry: dict[str, Any], keys: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
     """Largest surprise of each episode (N,) [nat], and whether it arrived (N,).
 
     Args:
         env, params: the policy's own world.
-        act: (carry, image) -> carry, action; the carry holds "surprise".
+        act: (weights, carry, image) -> carry, action; the carry holds "surprise".
+        weights: of the policy.
         carry: at the start.
         keys: (N,) of the episodes.
     """
     length = -(-env.task.max_steps // env.task.action_repeat)
 
-    def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def one(weights: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         state, first = reset(env, params, key)
 
         def decide(before, index):
             state, memory, image, most, arrived = before
-            memory, action = act(memory, image)
+            memory, action = act(weights, memory, image)
             now = jnp.where((index >= SETTLED) & ~state.done, jnp.mean(memory["surprise"]), 0.0)
             state, seen = step(env, params, state, action)
             arrived = jnp.maximum(arrived, seen.metrics["success"])
@@ -45,7 +46,7 @@ def largest_surprise(
         last, _ = jax.lax.scan(decide, start, jnp.arange(length))
         return last[3], last[4]
 
-    most, arrived = jax.jit(jax.vmap(one))(keys)
+    most, arrived = jax.jit(jax.vmap(one, in_axes=(None, 0)))(weights, keys)
     return np.asarray(most), np.asarray(arrived)
 
 

@@ -203,7 +203,7 @@ class _Episodes:
         step = loop["step"]
         states, image, past = self._see(step, loop["states"], loop["past"])
         step_keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(self.keys)
-        memory, action = jax.vmap(self.driver.act)(loop["memory"], states, image, step_keys)
+        memory, action = jax.vmap(self.driver.decide)(loop["memory"], states, image, step_keys)
         return states, memory, jnp.clip(action, -1.0, 1.0), image, past
 
     def _hold(self, loop: dict[str, Any]) -> tuple[State, Any, jax.Array, Any, Any]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
+from whill_mjx.io.compiled import keep_compiled
 from whill_mjx.processor import keep_results_apart, share_results
 
 GRACE_S = 1.2
@@ -136,6 +137,8 @@ def run(
 ) -> None:  # fmt: skip
     """Read `options` from the command line, check them and call `main`; what goes wrong ends with one line.
 
+    What XLA compiles is kept for later runs (`whill_mjx.io.compiled`).
+
     Args:
         options: dataclass of the options; numbers may be Annotated with a `Range`.
         main: gets the options.
@@ -149,6 +152,7 @@ def run(
         chosen = _parsed(options, description, positional, args)
         check_options(chosen)
         (share_results if shares(chosen) else keep_results_apart)()
+        keep_compiled()
         main(chosen)
 
 

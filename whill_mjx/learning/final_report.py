@@ -44,7 +44,7 @@ def write_report(
     def films() -> None:
         find_ffmpeg()  # before the work
         shown = episodes.some(np.concatenate([first, failed[:videos]]))
-        frames, above = course.film(shown)
+        frames, above = course.film(shown, videos)
         for name, part in (("camera.mp4", slice(0, len(first))), ("failures.mp4", slice(len(first), None))):
             if len(frames[part]):
                 chosen = shown.some(np.arange(shown.count)[part])

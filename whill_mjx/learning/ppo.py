@@ -184,7 +184,7 @@ def empty_frames(config: PpoConfig, obs_shape: Any, batch: tuple[int, ...], stac
     return {**empty, "vector": jnp.zeros((*batch, size))} if size else empty
 
 
-def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) -> PpoState:
+def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
     """State before the first step; `env` is a vector environment (`num_envs`, `obs_shape`, `action_dim`, reset, step).
 
     Raises:
@@ -198,7 +198,7 @@ def init_state(env: Any, config: PpoConfig, total_iterations: int, seed: int) ->
     zero = jnp.zeros(())
     scale = ReturnScale(jnp.zeros(env.num_envs), zero, zero, zero)
     return PpoState(
-        params, optimiser(config, total_iterations).init(params), env_state, step, push(empty, step.obs, step.is_first),
+        params, optimiser(config, 1).init(params), env_state, step, push(empty, step.obs, step.is_first),
         scale, key, jnp.zeros((), jnp.int32),
     )  # fmt: skip
 
@@ -212,17 +212,18 @@ def check_minibatches(config: PpoConfig, instances: int) -> None:
         )
 
 
-def optimiser(config: PpoConfig, total_iterations: int) -> optax.GradientTransformation:
-    """Adam with a clipped gradient and a rate that falls to zero over the run."""
-    steps = total_iterations * config.epochs * config.minibatches
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.adam(optax.linear_schedule(config.lr, 0.0, max(steps, 1)), eps=1e-5),
-    )
+def optimiser(config: PpoConfig, total_iterations: int | jax.Array) -> optax.GradientTransformation:
+    """Adam with a clipped gradient and a rate that falls to zero over the run, of any length in one program."""
+    steps = jnp.maximum(total_iterations, 1) * config.epochs * config.minibatches
+
+    def rate(count: jax.Array) -> jax.Array:
+        return config.lr * (1.0 - jnp.clip(count, 0, steps) * (1.0 / steps))
+
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 
 def iterate(
-    env: Any, config: PpoConfig, total_iterations: int, state: PpoState
+    env: Any, config: PpoConfig, total_iterations: int | jax.Array, state: PpoState
 ) -> tuple[PpoState, dict[str, jax.Array]]:
     """One rollout and its updates. Compile it once with the state donated.
 

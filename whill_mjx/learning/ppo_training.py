@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from dreamer import checkpoint
 from dreamer.progress import Progress
-from dreamer.train import TrainingOptions, carry_out, in_thread
+from dreamer.train import COMPILING, TrainingOptions, carry_out, in_thread
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
@@ -63,16 +65,23 @@ class _Run:
 
     def begin(self, seed: int, last_step: int | None) -> None:
         """Restore or make the state, and prepare the program of an iteration."""
-        options = self.options
+        options, self.began = self.options, time.monotonic()
         self.last = self.iterations if last_step is None else min(self.iterations, -(-last_step // self.each))
-        options.announce("compiling the training program, usually 1 to 2 minutes")
-        self.state, self.wall_before = _first_state(self.env, self.config, self.out, self.iterations, seed)
-        self.done, self.began = int(self.state.updates), time.monotonic()
+        options.announce("preparing the training: first worlds and parameters")
+        total = np.int32(self.iterations)
+        program = jax.jit(lambda state, total: iterate(self.env, self.config, total, state), donate_argnums=0)
+        shapes = jax.eval_shape(lambda: init_state(self.env, self.config, seed))
+        early = in_thread(program.lower(shapes, total).compile)  # while the first state is made
+        self.state, self.wall_before = _first_state(self.env, self.config, self.out, seed)
+        self.done = int(self.state.updates)
         self.logged = self.env_steps // options.eval_every
         _keep_lines(self.out / "metrics.jsonl", self.env_steps)
-        early = options.eval_ahead if self.done < self.last else None
-        self.ready = [] if early is None else [in_thread(early, self.state.params)]
-        self.run = jax.jit(lambda state: iterate(self.env, self.config, self.iterations, state), donate_argnums=0)
+        ahead = options.eval_ahead if self.done < self.last else None
+        options.announce(COMPILING)
+        self.ready = [] if ahead is None else [in_thread(ahead, jax.tree.map(jnp.copy, self.state.params))]
+        compiled = early.result()
+        self.run = lambda state: compiled(state, total)
+        options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
         self.saved_at = time.monotonic()
         self.bar = Progress(self.iterations * self.each, self.env_steps, options.progress)
 
@@ -99,6 +108,9 @@ class _Run:
             if self.options.progress:
                 jax.block_until_ready(running)  # the device stays at most one iteration behind the bar
                 self.bar.show(self.env_steps, {})
+            if running is None:
+                jax.block_until_ready(metrics)
+                self.options.announce(f"first step after {time.monotonic() - self.began:.0f} s")
             running = metrics
             if self._due(self.done):
                 line = self._evaluated(metrics)
@@ -140,9 +152,9 @@ class _Run:
         return line
 
 
-def _first_state(env: Any, config: PpoConfig, out: Path, iterations: int, seed: int) -> tuple[PpoState, float]:
+def _first_state(env: Any, config: PpoConfig, out: Path, seed: int) -> tuple[PpoState, float]:
     """State to start from and the time [s] already spent."""
-    state = jax.jit(lambda: init_state(env, config, iterations, seed))()
+    state = jax.jit(lambda seed: init_state(env, config, seed))(np.int32(seed))
     restored = checkpoint.restore(out / "checkpoints", state, config)
     return (state, 0.0) if restored is None else (restored[0], float(restored[1]["wall_s"]))
 

@@ -17,7 +17,7 @@ import numpy as np
 from dreamer import agent as agents
 from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
-from dreamer.types import FunctionalEnv, Mirror, Params, Transition
+from dreamer.types import FunctionalEnv, Mirror, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import POSE_METRICS, Env, State, make_env
 from whill_mjx.evaluation.drivers import Driver
@@ -387,31 +387,30 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
     return tuple(found)
 
 
-def dreamer_policy(preset: Preset, params: Params, control_dt: float) -> tuple[Step, dict[str, Any]]:
-    """The trained agent as the step of one instance, limits included, and its first carry."""
+def dreamer_policy(preset: Preset, control_dt: float) -> tuple[Step, dict[str, Any]]:
+    """The agent as the step of one instance, limits included, and its first carry."""
     learner = preset.learner
-    params = jax.tree.map(jnp.asarray, params)
     carry = agents.policy_carry(learner, 2)
     if preset.looks == "rich":
         carry[agents.SURPRISE] = jnp.zeros(1)
     return limited_policy(
-        preset.task, preset.safety, lambda carry, image: agents.policy_step(learner, params, carry, image),
+        preset.task, preset.safety, lambda params, carry, image: agents.policy_step(learner, params, carry, image),
         carry, control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 
-def ppo_policy(preset: Preset, params: Any, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+def ppo_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
     """The same of the model-free baseline, for what `env` shows."""
     return limited_policy(
-        preset.task, preset.safety, lambda carry, image: ppo.policy_step(preset.ppo, params, carry, image),
+        preset.task, preset.safety, lambda params, carry, image: ppo.policy_step(preset.ppo, params, carry, image),
         ppo.policy_carry(preset.ppo, obs_shape_of(env)), control_dt * preset.task.action_repeat,
     )  # fmt: skip
 
 
-def step_driver(step: Step, carry: dict[str, Any], period: int, name: str = "policy") -> Driver:
+def step_driver(step: Step, weights: Any, carry: dict[str, Any], period: int) -> Driver:
     """A policy step as a driver of evaluations."""
 
-    def act(memory: Any, state: State, image: jax.Array, key: jax.Array) -> tuple[Any, jax.Array]:
-        return step(memory, image)  # or the values of the sensors by name
+    def act(weights: Any, memory: Any, state: State, image: jax.Array, key: jax.Array) -> tuple[Any, jax.Array]:
+        return step(weights, memory, image)  # or the values of the sensors by name
 
-    return Driver(name, lambda state, key: carry, act, period)
+    return Driver("policy", lambda state, key: carry, act, period, weights=weights)

@@ -84,7 +84,8 @@ def penalty(safety: Safety, clearance: jax.Array, change: jax.Array, seconds: fl
     return safety.clearance_gain * seconds * short + safety.change_gain * jnp.sum(jnp.abs(change))
 
 
-Step = Callable[[dict[str, jax.Array], Any], tuple[dict[str, jax.Array], jax.Array]]
+Step = Callable[[Any, dict[str, jax.Array], Any], tuple[dict[str, jax.Array], jax.Array]]
+"""(weights, carry, image or observations by name) -> carry, action (2,), of one instance."""
 
 
 def limited_policy(
@@ -98,9 +99,9 @@ def limited_policy(
         return step, carry
     low, high = command_range(task)
 
-    def limited(carry: dict[str, jax.Array], image: Any) -> tuple[dict[str, jax.Array], jax.Array]:
+    def limited(weights: Any, carry: dict[str, jax.Array], image: Any) -> tuple[dict[str, jax.Array], jax.Array]:
         inner = {name: value for name, value in carry.items() if name != "command"}
-        inner, action = step(inner, image)
+        inner, action = step(weights, inner, image)
         action = limit_action(task, safety, action, carry["command"], seconds)
         return {**inner, "command": low + (action + 1.0) / 2.0 * (high - low)}, action
 
