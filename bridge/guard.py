@@ -17,10 +17,13 @@ from typing import Any
 from bridge import ros
 from bridge.commands import CommandTopic
 from bridge.options import Parser, ends_at_ctrl_c, whole
+from bridge.vehicle_time import VehicleTime
 
 SILENCE = 0.15
 """[s]; a driving policy node gives a sign of life at least every 50 ms."""
 WATCH_PERIOD = 0.01
+LATE = 0.05
+"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile, and judges nothing."""
 BEAT_PERIOD = 0.05
 REPEATS = 10
 """Zeros sent per stop, 50 ms apart."""
@@ -43,7 +46,7 @@ class Watchdog:
         self._driving: dict[str, float] = {}  # time of the last sign of life of each session that drives
         self._stands = False  # whether the last command on the topic was zero
         self._left = 0
-        self._next = 0.0
+        self._next = self._ticked = 0.0
 
     def heartbeat(self, now: float, session: str, driving: bool) -> None:
         """Take a heartbeat of a policy node."""
@@ -63,8 +66,9 @@ class Watchdog:
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
+        late, self._ticked = now - self._ticked > LATE, now
         for session, alive in list(self._driving.items()):
-            if now - alive > SILENCE:
+            if now - alive > SILENCE and not late:
                 del self._driving[session]
                 if not self._stands:
                     self._left, self._next = REPEATS, now
@@ -86,7 +90,11 @@ class GuardNode:
 
         self.node, self.watchdog = node, Watchdog()
         self._follow = options.follow
-        self._missing_since = time.monotonic() + PATIENCE
+        self._followed = time.monotonic() + PATIENCE
+        self.now: Callable[[], float] = time.monotonic
+        if ros.uses_simulated_time(node):
+            self.now = vehicle_time = VehicleTime()
+            ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
         self._ready = False
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
@@ -98,10 +106,7 @@ class GuardNode:
 
     def finished(self) -> bool:
         """Return whether the one node that this guard follows is gone."""
-        now = time.monotonic()
-        if self._follow in self.watchdog.heard:
-            self._missing_since = now
-        return bool(self._follow) and now - self._missing_since > FORGET
+        return bool(self._follow) and time.monotonic() - self._followed > 2 * FORGET
 
     def _on_command(self, v: float, omega: float) -> None:
         self.watchdog.command(v != 0 or omega != 0)  # not-finite values compare unequal to 0: they count as motion
@@ -109,11 +114,12 @@ class GuardNode:
     def _on_heartbeat(self, message: Any) -> None:
         beat = read_beat(message.data, session=str, driving=bool)
         if beat and self._follow in ("", beat["session"]):
-            self.watchdog.heartbeat(time.monotonic(), beat["session"], beat["driving"])
+            self._followed = time.monotonic()
+            self.watchdog.heartbeat(self.now(), beat["session"], beat["driving"])
 
     def _on_watch(self) -> None:
         stops = self.watchdog.stops
-        if self.watchdog.tick(time.monotonic()):
+        if self.watchdog.tick(self.now()):
             self._on_beat()  # first, so that nobody takes the zero for a stranger's
             self.topic.publish(0.0, 0.0)
         if self.watchdog.stops != stops:
