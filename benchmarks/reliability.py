@@ -286,6 +286,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--keep", type=Path, default=Path("runs/reliability"), help="folder to go on in")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of reliability.json")
     given = parser.parse_args(arguments)
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; the commands need it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     kept = Kept(given.keep)
     commands = {name: (QUICK if given.quick else COMMANDS)[name] for name in given.commands}
     parts: dict[str, Callable[[], Figures]] = {
