@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 
 def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
@@ -28,7 +28,16 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
 
 
 class Parser(argparse.ArgumentParser):
-    """An `argparse.ArgumentParser` whose complaint is one line, without the usage."""
+    """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse an empty word, which as a path would be the folder that the command is called in."""
+        words = sys.argv[1:] if args is None else list(args)
+        for before, word in zip(["", *words], words, strict=False):
+            if not word.strip() or word.startswith("--") and word.endswith("="):
+                self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable of the shell. "
+                           "Give a value")
+        return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and end with code 2."""
