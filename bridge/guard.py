@@ -21,6 +21,9 @@ from bridge.vehicle_time import VehicleTime
 
 SILENCE = 0.15
 """[s]; a driving policy node gives a sign of life at least every 50 ms."""
+SIMULATED = 10.0
+"""How many times as long the two may not hear each other in simulated time: processes of a busy computer wait for each
+other, and nobody sits on the vehicle."""
 WATCH_PERIOD = 0.01
 LATE = 0.05
 """A watch that comes this much [s] after the one before has not yet read what arrived meanwhile, and judges nothing."""
@@ -36,7 +39,9 @@ PATIENCE = 30.0
 class Watchdog:
     """Decides when to send zeros; pure, with injected time."""
 
-    def __init__(self) -> None:
+    def __init__(self, silence: float = SILENCE) -> None:
+        self.silence = silence
+        """Seconds after which a driving node that gave no sign of life is stopped."""
         self.stops = 0
         """How often a node was found silent while it drove."""
         self.zeros = 0
@@ -68,7 +73,7 @@ class Watchdog:
         """Return whether to publish a zero now."""
         late, self._ticked = now - self._ticked > LATE, now
         for session, alive in list(self._driving.items()):
-            if now - alive > SILENCE and not late:
+            if now - alive > self.silence and not late:
                 del self._driving[session]
                 if not self._stands:
                     self._left, self._next = REPEATS, now
@@ -93,7 +98,7 @@ class GuardNode:
         self._followed = time.monotonic() + PATIENCE
         self.now: Callable[[], float] = time.monotonic
         if ros.uses_simulated_time(node):
-            self.now = vehicle_time = VehicleTime()
+            self.now, self.watchdog = (vehicle_time := VehicleTime()), Watchdog(SIMULATED * SILENCE)
             ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
         self._ready = False
         self._type = String
@@ -123,7 +128,8 @@ class GuardNode:
             self._on_beat()  # first, so that nobody takes the zero for a stranger's
             self.topic.publish(0.0, 0.0)
         if self.watchdog.stops != stops:
-            self.node.get_logger().error(f"the policy node gave no sign of life for {SILENCE} s: vehicle stopped")
+            self.node.get_logger().error(f"the policy node gave no sign of life for {self.watchdog.silence:g} s: "
+                                         "vehicle stopped")
 
     def _on_beat(self) -> None:
         watchdog = self.watchdog
@@ -161,9 +167,10 @@ class GuardLink:
     RESTART = 2.0
     """Seconds between two starts of a guard that ended."""
 
-    def __init__(self, session: str, topic: str, start: Callable[[], Any] | None) -> None:
+    def __init__(self, session: str, topic: str, start: Callable[[], Any] | None, simulated: bool = False) -> None:
         """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
         self.session, self.topic = session, topic
+        self._stale = self.STALE * (SIMULATED if simulated else 1.0)
         self.zeros = self.stops = 0
         self._start, self._process = start, None
         self._started = -self.RESTART
@@ -184,7 +191,7 @@ class GuardLink:
         if not beat:
             return
         ours = beat["topic"] == self.topic and self.session in beat["hears"]
-        if not ours and now - self._trusted < self.STALE:
+        if not ours and now - self._trusted < self._stale:
             return  # a second guard, such as that of an earlier node that was killed
         if ours:
             self._trusted = now
@@ -195,7 +202,7 @@ class GuardLink:
         """Return why nobody would stop the vehicle if this process died; empty where a guard would."""
         if self._process is not None and self._process.poll() is not None:
             return f"the guard ended with code {self._process.returncode}"
-        if self._heard is None or now - self._heard > self.STALE:
+        if self._heard is None or now - self._heard > self._stale:
             return "no guard is running"
         if self._beat["topic"] != self.topic:
             return f"the guard follows {self._beat['topic']}, not {self.topic}"

@@ -35,7 +35,7 @@ class Parser(argparse.ArgumentParser):
         words = sys.argv[1:] if args is None else list(args)
         for before, word in zip(["", *words], words, strict=False):
             if not word.strip() or word.startswith("--") and word.endswith("="):
-                self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable of the shell. "
+                self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable. "
                            "Give a value")
         return super().parse_known_args(words, namespace)
 

@@ -69,7 +69,7 @@ class VehicleNode:
         self.supervisor = decider.supervisor
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
-                               self._start_guard if options.guard == "own" else None)
+                               self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))
         self._inputs = inputs.SafetyInputs(self.supervisor, options)
         self._ear = Ear()
         self._string = String
