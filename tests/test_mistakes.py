@@ -88,6 +88,8 @@ def mistakes(tmp_path_factory):
     ("fit", "data --spread 0", "--spread 0.0: must be above 0"),
     ("fit", "data --method newton", "--method"),
     ("fit", "data --out ''", "--out: an empty word"),
+    ("fit", "data --out data", "--out data: holds dataset.toml of something else"),
+    ("fit", "data --out data/trials/new", "--out data/trials/new: lies among the trials of"),
     ("fit", "''", "the command line: an empty word"),
     ("fit", "data --out=", "--out: an empty word"),
     ("fit", "data --train ' '", "--train: an empty word"),
