@@ -14,8 +14,8 @@ class VehicleTime:
     steady clock, however fast the simulation is. Pure, with injected steady clock.
     """
 
-    LONGEST = 0.5
-    """Interval of messages on /clock [s] beyond which they count as late."""
+    LONGEST = 0.05
+    """Interval of messages on /clock [s] beyond which they count as late: those of a slow computer."""
 
     def __init__(self, steady: Callable[[], float] = time.monotonic) -> None:
         self._steady = steady

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import runpy
 import shlex
 import shutil
@@ -68,6 +69,7 @@ def mistakes(tmp_path_factory):
     (folder / "notes").mkdir()
     (folder / "notes" / "diary.txt").write_text("mine")
     (folder / "empty").mkdir()
+    os.mkfifo(folder / "pipe")
     (folder / "training").mkdir()
     (folder / "training" / "run.json").write_text('{"kind": "whill_mjx.train", "identity": {"seed": 0}}')
     (folder / "model.txt").write_text("")
@@ -96,6 +98,8 @@ def mistakes(tmp_path_factory):
     ("fit", "nowhere", "nowhere"),
     ("fit", "file", "file"),
     ("fit", "empty", "empty: no dataset.toml"),
+    ("fit", "pipe", "pipe: a pipe or a device"),
+    ("convert", "pipe --out new", "pipe"),
     ("fit", "data --parameters body.nope", "body.nope"),
     ("fit", "data --effects nope", "no effect 'nope'"),
     ("fit", "data --profile nope", "profile of 'nope'"),
