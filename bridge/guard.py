@@ -16,7 +16,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
-from bridge.options import Parser, ends_at_ctrl_c, whole
+from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
 from bridge.vehicle_time import VehicleTime
 
 SILENCE = 0.15
@@ -220,7 +220,7 @@ class GuardLink:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = Parser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
-    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
     parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",

@@ -24,7 +24,7 @@ from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
 from bridge.fitted_reach import simulate_reach
-from bridge.options import Parser, ends_at_ctrl_c, in_range, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
@@ -250,7 +250,7 @@ def main(arguments: list[str] | None = None) -> int:
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
-        print(f"{NAME}: {error}", file=sys.stderr)
+        print(f"{NAME}: {said(error)}", file=sys.stderr)
         return 2
     print(f"{NAME}: {place}", file=sys.stderr)
     if options.check:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from functools import wraps
@@ -66,6 +67,24 @@ def in_range(
         return value
 
     return read
+
+
+TOPIC = re.compile(r"(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+def topic_name(text: str) -> str:
+    """A type for `add_argument`: the name of a topic as ROS allows it, relative or absolute."""
+    if text and not TOPIC.fullmatch(text):  # a default may be none
+        raise argparse.ArgumentTypeError(f"{text!r} is no name of a topic. Letters, digits, '_' and '/' make one, like "
+                                         "whill/odom")
+    return text
+
+
+def said(error: BaseException) -> str:
+    """Return what went wrong with a file or an option, without the number of the system's error."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}. Choose another place"
+    return str(error)
 
 
 def result_file(text: str) -> Path:

@@ -19,7 +19,7 @@ from bridge import inputs, ros
 from bridge.bases import BASES
 from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
 from bridge.guard import BEAT_PERIOD, GuardLink
-from bridge.options import in_range, whole
+from bridge.options import in_range, topic_name, whole
 from bridge.safety import Command, State, Supervisor
 from bridge.vehicle_time import VehicleTime
 from bridge.whill import ChairGate, ChairState
@@ -245,13 +245,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the base, the command topic, the guard and the stops from outside."""
     parser.add_argument("--base", choices=sorted(BASES), default="whill",
                         help="what is below the command topic: its range, and whether it needs zeros held after a stop")
-    parser.add_argument("--whill-state", default="", metavar="TOPIC",
+    parser.add_argument("--whill-state", type=topic_name, default="", metavar="TOPIC",
                         help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
                              f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
     parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: those of policy and base")
     parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
-    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
     parser.add_argument("--guard", choices=("own", "other"), default="own",

@@ -280,7 +280,10 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
     ("simulate", "--simulator os:nope", "nope"), ("simulate", "nowhere", "nowhere"),
     ("simulate", "--results empty", "--results"),
     ("chair", "--wheel-radius nan", "--wheel-radius"), ("chair", "--tread 0", "--tread"), ("chair", "x", "x"),
-    ("guard", "--realtime -1", "--realtime"), ("guard", "--command-type Tw", "--command-type"),
+    ("guard", "--command-topic ///", "--command-topic"), ("drive", "nowhere --image-topic 1a", "--image-topic"),
+    ("record", "new t --imu-topic 'a b'", "--imu-topic"), ("chair", "--state-topic a/", "--state-topic"),
+    ("record", "file t", "file/trials: Not a directory"), ("guard", "--realtime -1", "--realtime"),
+    ("guard", "--command-type Tw", "--command-type"),
 ])  # fmt: skip
 def test_a_mistake_in_the_bridge_ends_with_one_line(command, words, told, mistakes, monkeypatch, capsys):
     monkeypatch.chdir(mistakes)
