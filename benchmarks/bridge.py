@@ -102,7 +102,8 @@ def export_stand_in(folder: Path) -> Path:
         return {"deter": deter}, jnp.where(x.mean() > 0.99, jnp.nan, action)
 
     contract = PolicyContract(action_low=(-0.5, -0.6), action_high=(1.0, 0.6), task="stand-in")
-    return export_policy(folder, step, {"deter": np.zeros(HIDDEN, np.float32)}, weights, contract, check_steps=20)
+    return export_policy(folder, step, {"deter": np.zeros(HIDDEN, np.float32)}, weights, contract,
+                         check_steps=1000)
 
 
 class Run:
@@ -354,8 +355,10 @@ def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, re
 
 
 def measure_policy(policy: Path, seconds: float) -> Figures:
-    """Return duration and cold start of the policy, and the size of what it needs."""
+    """Return duration, cold start and parity of the policy, and the size of what it needs."""
+    parity = json.loads((policy / "policy.json").read_text())["parity"]
     return {
+        "policy_parity": ([parity["max_abs_action_drift"]], f"of the action, ONNX and JAX, {parity['steps']} recurrent steps"),
         "policy_p99_ms": ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms"),
         "cold_start_s": ([cold_start(policy) for _ in range(3)], "s"),
         "installed_mb": ([installed_mb("numpy", "onnxruntime")], "MB of numpy, onnxruntime and what they require"),
