@@ -358,7 +358,8 @@ def measure_policy(policy: Path, seconds: float) -> Figures:
     """Return duration, cold start and parity of the policy, and the size of what it needs."""
     parity = json.loads((policy / "policy.json").read_text())["parity"]
     return {
-        "policy_parity": ([parity["max_abs_action_drift"]], f"of the action, ONNX and JAX, {parity['steps']} recurrent steps"),
+        "policy_parity": ([parity["max_abs_action_drift"]],
+                          f"of the action, ONNX and JAX, {parity['steps']} recurrent steps"),
         "policy_p99_ms": ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms"),
         "cold_start_s": ([cold_start(policy) for _ in range(3)], "s"),
         "installed_mb": ([installed_mb("numpy", "onnxruntime")], "MB of numpy, onnxruntime and what they require"),
