@@ -10,8 +10,8 @@ start them, at random moments. A run is lost work where its newest step is older
 results are not those of a run left alone, and half written where a file with its final name cannot be read. The run
 left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
 
-What was measured is kept in --keep: a benchmark that is stopped goes on there, and figures are those of all rooms and
-commands that it holds of this commit.
+What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms that it
+holds, each with its commit, and of all commands that it holds of this commit.
 """
 
 from __future__ import annotations
@@ -92,11 +92,11 @@ class Kept:
     def __init__(self, folder: Path):
         self.folder, self._commit = folder, provenance()["commit"]
 
-    def read(self, name: str) -> dict[str, Any]:
+    def read(self, name: str, any_commit: bool = False) -> dict[str, Any]:
         """What is known; empty where nothing is, or it is of another commit."""
         path = self.folder / f"{name}.json"
-        found = json.loads(path.read_text()) if path.exists() else {}
-        return found if found.get("commit") == self._commit else {}
+        found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+        return found if any_commit or found.get("commit") == self._commit else {}
 
     def write(self, name: str, found: dict[str, Any]) -> None:
         """Keep it."""
@@ -123,11 +123,12 @@ def damaged_files(rooms: list[str], count: int, jobs: int, kept: Kept) -> Figure
             kept.write(f"files_{room}", found)
             said = [one[:300] for one in found["failed"]]
             print(f"{room}: {found['readers']} readers, {len(said)} failed {said}", flush=True)
-    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}"))}
+    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}", any_commit=True))}
     failed = [one for found in known.values() for one in found["failed"]]
     hangs = [one for one in failed if "SECONDS" in one or "process_time" in one]
     memory = [one for one in failed if "BYTES" in one or "_peak" in one or "MemoryError" in one]
     about = {"files_per_reader": {room: found["count"] for room, found in known.items()},
+             "commits": {room: found["commit"] for room, found in known.items()},
              "readers": sum(found["readers"] for found in known.values())}
     counts = {"undocumented": len(failed) - len(hangs) - len(memory), "hangs": len(hangs), "memory": len(memory)}
     device = next(iter(known.values()))["device"]
@@ -142,9 +143,10 @@ def mistaken_commands() -> Figures:
 
 def started(words: list[str], out: Path) -> subprocess.Popen[str]:
     """A command at work in a folder."""
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                            env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+                            env={**os.environ, "PYTHONPATH": path})  # fmt: skip
 
 
 def half_written(out: Path) -> list[Path]:
@@ -195,7 +197,7 @@ def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], kil
     number, chosen = SIGNALS[found["kills"] % len(SIGNALS)], random.Random(found["kills"] + 1000 * len(found["bits"]))
     child, begun = started(words, out), time.time()
     try:
-        child.communicate(timeout=chosen.uniform(1.0, 600.0 / kills + 5.0))
+        said = child.communicate(timeout=chosen.uniform(1.0, 600.0 / kills + 5.0))[1]
     except subprocess.TimeoutExpired:
         found["lost"] += time.time() - max(newest(out), begun) > MINUTE
         child.send_signal(number)
@@ -204,11 +206,17 @@ def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], kil
         found["half_written"] += len(half_written(out))
         found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
     else:
-        settle(name, out, found, child.returncode)
+        settle(name, out, found, child.returncode, said)
 
 
-def settle(name: str, out: Path, found: dict[str, Any], code: int) -> None:
-    """Keep the bits of a run that came to its end, and begin anew."""
+def settle(name: str, out: Path, found: dict[str, Any], code: int, said: str) -> None:
+    """Keep the bits of a run that came to its end, and begin anew.
+
+    Raises:
+        RuntimeError: it failed before it had made its folder, so no kill can be measured.
+    """
+    if code and not out.exists():
+        raise RuntimeError(f"{name} ended with {code}: {said.strip().splitlines()[-1:]}")
     found["bits"].append(digest(name, out) if code == 0 else f"exit code {code}")
     shutil.rmtree(out)
 
@@ -227,8 +235,8 @@ def kill_again_and_again(name: str, words: list[str], kills: int, kept: Kept) ->
             print(f"{name}: {found['kills']} of {kills} kills", flush=True)
         if broken.exists() or not found["bits"]:
             child = started(words, broken)
-            child.communicate()
-            settle(name, broken, found, child.returncode)
+            said = child.communicate()[1]
+            settle(name, broken, found, child.returncode, said)
         if alone is not None:
             found["alone"] = alone.result()
     found["different"] = sum(bits != found["alone"]["bits"] for bits in found["bits"])
