@@ -102,7 +102,8 @@ def export_stand_in(folder: Path) -> Path:
         return {"deter": deter}, jnp.where(x.mean() > 0.99, jnp.nan, action)
 
     contract = PolicyContract(action_low=(-0.5, -0.6), action_high=(1.0, 0.6), task="stand-in")
-    return export_policy(folder, step, {"deter": np.zeros(HIDDEN, np.float32)}, weights, contract, check_steps=20)
+    return export_policy(folder, step, {"deter": np.zeros(HIDDEN, np.float32)}, weights, contract,
+                         check_steps=1000)
 
 
 class Run:
@@ -297,16 +298,18 @@ Figures = dict[str, tuple[list[float], str]]
 def measure_steady(policy: Path, folder: Path, domain: int, seconds: float) -> Figures:
     """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives."""
     figures: Figures = {}
-    healthy_stops, growth = 0, []
+    healthy_stops, missed, growth, memory = 0, 0, [], []
     for number, suffix in enumerate(("", "_realtime")):
         run = Run(folder, policy, "EndlessRobot", domain + 2 * number, realtime=bool(suffix))
         time.sleep(5)
         before = memory_mb(run.drive.pid)
         time.sleep(seconds)
-        growth.append(memory_mb(run.drive.pid) - before)
+        memory.append(memory_mb(run.drive.pid))
+        growth.append(memory[-1] - before)
         results, drive = run.finish()
         healthy_stops += stops(drive)
         delays, intervals = settled(results)
+        missed += int((intervals > 150).sum())
         figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
         figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
         figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
@@ -316,12 +319,16 @@ def measure_steady(policy: Path, folder: Path, domain: int, seconds: float) -> F
         time.sleep(seconds + 5)
         results, drive = run.finish()
         healthy_stops += stops(drive)
-        figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(settled(results)[0], 99))], "ms")
+        delays, intervals = settled(results)
+        missed += int((intervals > 150).sum())
+        figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
         end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
         shown = sum(t < end - 0.01 for t in results["image_times"])
         figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
     figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
     figures["healthy_stops"] = ([float(healthy_stops)], f"stops in {4 * (seconds + 5):.0f} healthy seconds")
+    figures["missed_ticks"] = ([float(missed)], f"commands 50 ms late in {4 * seconds:.0f} healthy seconds")
+    figures["drive_memory_mb"] = (memory, "MB of the policy node, resident, after a drive")
     figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first 5 s")
     return figures
 
@@ -348,8 +355,11 @@ def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, re
 
 
 def measure_policy(policy: Path, seconds: float) -> Figures:
-    """Return duration and cold start of the policy, and the size of what it needs."""
+    """Return duration, cold start and parity of the policy, and the size of what it needs."""
+    parity = json.loads((policy / "policy.json").read_text())["parity"]
     return {
+        "policy_parity": ([parity["max_abs_action_drift"]],
+                          f"of the action, ONNX and JAX, {parity['steps']} recurrent steps"),
         "policy_p99_ms": ([float(np.percentile(policy_times(policy, int(10 * seconds)), 99))], "ms"),
         "cold_start_s": ([cold_start(policy) for _ in range(3)], "s"),
         "installed_mb": ([installed_mb("numpy", "onnxruntime")], "MB of numpy, onnxruntime and what they require"),

@@ -1,6 +1,6 @@
 """The simulator as a robot, between processes over real DDS: rows recorded, lock-step, resets, damaged messages.
 
-    python -m benchmarks.bridge_simulator [--parts record lock_step fuzz]
+    python -m benchmarks.bridge_simulator [--parts record lock_step stale fuzz]
 
 The vehicle is a point, so the figures are of the bridge and not of the physics. The recorder hears numbered odometry of
 another process at 100 Hz while two busy processes take the cores. Figures go to bridge.json.
@@ -25,10 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bridge import CLAIM, Figures, cpu_model, memory_mb
+from benchmarks.bridge import CLAIM, EndlessRobot, Figures, cpu_model, memory_mb
 from benchmarks.harness import figure, record
 from bridge.episodes import PATIENCE
 from bridge.options import Parser, in_range, whole
+from bridge.simulated import Frame
 from whill_mjx.io.command_line import guarded
 
 SENDER = """
@@ -49,6 +50,48 @@ for i in range(int(sys.argv[2])):
     time.sleep(max(0.0, began + (i + 1) * 0.01 - time.monotonic()))
 time.sleep(1.0)
 """
+
+
+RELAY = """
+import contextlib, random, time, rclpy
+from rclpy.executors import ExternalShutdownException
+from sensor_msgs.msg import Image
+rclpy.init()
+node, rng, kept = rclpy.create_node("relay"), random.Random(0), []
+out = node.create_publisher(Image, "delayed/image", 20)
+def relay(message):
+    kept.append(message)
+    for one in rng.sample(kept, min(len(kept), 2)):
+        out.publish(one)
+    time.sleep(rng.uniform(0, 0.002))
+    out.publish(message)
+    out.publish(rng.choice(kept))
+    del kept[:-20]
+node.create_subscription(Image, "sensing/camera/front/image_raw", relay, 20)
+with contextlib.suppress(ExternalShutdownException):
+    rclpy.spin(node)
+"""
+"""Sends each image late, with older ones before and after it."""
+
+
+class NumberedRobot(EndlessRobot):
+    """A point whose images show the number of their episode, beside that of their step."""
+
+    def reset(self, seed: int) -> Frame:
+        """Begin the episode of a seed."""
+        self.episode = seed
+        return super().reset(seed)
+
+    def _frame(self, v: float, omega: float) -> Frame:
+        frame = super()._frame(v, omega)
+        frame.image[1, :2, 0] = divmod(self.episode, 256)
+        return frame
+
+
+def numbers_of(image: np.ndarray) -> tuple[int, int]:
+    """Episode and step, one of the first 64, that an image shows."""
+    high, low = (int(value) for value in image[1, :2, 0])
+    return 256 * high + low, int(np.flatnonzero(image[0, :, 0] != 120)[0])
 
 
 @contextlib.contextmanager
@@ -87,12 +130,12 @@ def rows_kept(kind: str, domain: int, seconds: float, folder: Path) -> float:
 class Simulator:
     """A point robot behind topics, with episode control."""
 
-    def __init__(self, domain: int, folder: Path) -> None:
+    def __init__(self, domain: int, folder: Path, robot: str = "benchmarks.bridge:EndlessRobot") -> None:
         log = folder / f"simulate_{domain}.log"
         with open(log, "w") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "bridge.simulate", "--simulator", "benchmarks.bridge:EndlessRobot", "--port",
-                 "0", "--wait", "1000"], env=environment_of(domain), stdout=file, stderr=file)
+                [sys.executable, "-m", "bridge.simulate", "--simulator", robot, "--port", "0", "--wait", "1000"],
+                env=environment_of(domain), stdout=file, stderr=file)
         end = time.monotonic() + 60
         while "port " not in log.read_text():
             if time.monotonic() > end or self.process.poll() is not None:
@@ -115,7 +158,7 @@ def measure_lock_step(domain: int, folder: Path, steps: int, resets: int) -> Fig
     try:
         env = RosEnv(simulator.port)
         env.reset(seed=0)
-        rates, wrong = [], 0
+        rates = []
         for _ in range(5):
             began = time.perf_counter()
             for _ in range(steps):
@@ -124,17 +167,35 @@ def measure_lock_step(domain: int, folder: Path, steps: int, resets: int) -> Fig
         took = []
         for seed in range(resets):
             began = time.perf_counter()
-            image, _ = env.reset(seed=seed)
+            env.reset(seed=seed)
             took.append(1e3 * (time.perf_counter() - began))
-            wrong += int(image[0, 0, 0] != 0)  # the first step of an episode is drawn at column 0
-            image, *_ = env.step(np.array([0.3, 0.0]))
-            wrong += int(image[0, 1, 0] != 1)
         env.close()
     finally:
         simulator.close()
     return {"ros_env_steps_per_second": (rates, "1/s, lock-step, 64x64, a point robot"),
-            "ros_env_reset_p99_ms": ([float(np.percentile(took, 99))], f"ms of {resets} resets, image included"),
-            "ros_env_stale_images": ([float(wrong)], f"of {2 * resets} images after resets")}
+            "ros_env_reset_p99_ms": ([float(np.percentile(took, 99))], f"ms of {resets} resets, image included")}
+
+
+def measure_stale(domain: int, folder: Path, resets: int) -> Figures:
+    """Images of another episode or step than the one asked for, where a relay delays images and sends older ones."""
+    os.environ.update(environment_of(domain))
+    from bridge.ros_env import RosEnv
+
+    simulator = Simulator(domain, folder, "benchmarks.bridge_simulator:NumberedRobot")
+    relay = subprocess.Popen([sys.executable, "-c", RELAY], env=environment_of(domain))
+    try:
+        env, wrong = RosEnv(simulator.port, image_topic="delayed/image"), 0
+        for seed in range(resets):
+            image, _ = env.reset(seed=seed)
+            wrong += numbers_of(image) != (seed, 0)
+            image, *_ = env.step(np.array([0.3, 0.0]))
+            wrong += numbers_of(image) != (seed, 1)
+        env.close()
+    finally:
+        relay.terminate()
+        relay.wait(30)
+        simulator.close()
+    return {"ros_env_stale_images": ([float(wrong)], f"of {2 * resets} images after resets, delayed and out of order")}
 
 
 SENDERS = 6
@@ -238,11 +299,11 @@ def main() -> None:
     """Measure and record."""
     parser = Parser(prog="python -m benchmarks.bridge_simulator", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("record", "lock_step", "fuzz")
+    parts = ("record", "lock_step", "stale", "fuzz")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--seconds", type=in_range(0), default=60.0, help="of each recording")
     parser.add_argument("--steps", type=whole(), default=500, help="of each of five rounds in lock-step")
-    parser.add_argument("--resets", type=whole(), default=1000)
+    parser.add_argument("--resets", type=whole(), default=10_000)
     parser.add_argument("--messages", type=whole(), default=100_000, help="damaged ones")
     options = parser.parse_args()
     domain, figures = 61 + os.getpid() % 30, {}
@@ -254,6 +315,8 @@ def main() -> None:
                                                "share of rows at 100 Hz, two burners")
         if "lock_step" in options.parts:
             figures |= measure_lock_step(domain + 2, folder, options.steps, options.resets)
+        if "stale" in options.parts:
+            figures |= measure_stale(domain + 4, folder, options.resets)
         if "fuzz" in options.parts:
             figures |= measure_fuzz(domain + 3, folder, options.messages)
     figures["simulator_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, after the runs above")

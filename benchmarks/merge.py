@@ -13,6 +13,7 @@ from pathlib import Path
 from benchmarks.harness import RESULTS
 from bridge.options import Parser
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.reading import read_json
 
 
 def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> Path:
@@ -22,7 +23,9 @@ def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> 
         ValueError: `source` has no figure of a name asked for.
     """
     target = results / source.name
-    content = json.loads(source.read_text())
+    content = read_json(source, "no such file. Give a result file.", "Give a result file of a benchmark.")
+    if not isinstance(content.get("figures"), dict):
+        raise ValueError(f"{source}: has no figures. Give a result file of a benchmark.")
     if missing := sorted(set(only) - set(content["figures"])):
         raise ValueError(f"{source} has no figure {', '.join(missing)}; it has {', '.join(content['figures'])}.")
     if only:

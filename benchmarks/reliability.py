@@ -7,15 +7,18 @@
 
 Damaged files and mistaken commands are those of the tests, more of them. Kills and Ctrl-C meet the commands as users
 start them, at random moments. A run is lost work where its newest step is older than a minute, different where its
-results are not those of a run left alone, and half written where a file with its final name cannot be read.
+results are not those of a run left alone, and half written where a file with its final name cannot be read. The run
+left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
 
-What was measured is kept in --keep: a benchmark that is stopped goes on there, and figures are those of all rooms and
-commands that it holds of this commit.
+What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms that it
+holds, each with its commit, and of all commands that it holds of this commit.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
 import json
 import os
 import random
@@ -27,13 +30,14 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, figure, provenance, record
+from benchmarks.harness import RESULTS, device_name, figure, provenance, record
 from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import write_whole
@@ -43,7 +47,7 @@ ROOT = Path(__file__).parents[1]
 PARTS = ("files", "options", "kills", "ctrl_c")
 CHAIR = "sysid/data/chair"
 COMMANDS = {
-    "fit": ["sysid.fit", CHAIR],
+    "fit": ["sysid.fit", CHAIR, "--starts", "4"],
     "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "100"],
     "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "6000",
               "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "20"],
@@ -65,6 +69,8 @@ ROOMS = {
 RESULT = {"fit": "vehicle.toml", "close_loop": "vehicle.toml", "train": "policy/weights.npz"}
 """File whose bits are compared."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+NO_SAVES = (".lock", "run.json", "stderr")
+"""Files that a run does not go on from, beside its logs (.jsonl)."""
 MINUTE = 60.0
 Figures = dict[str, dict[str, Any]]
 
@@ -86,34 +92,47 @@ class Kept:
     def __init__(self, folder: Path):
         self.folder, self._commit = folder, provenance()["commit"]
 
-    def read(self, name: str) -> dict[str, Any]:
+    def read(self, name: str, any_commit: bool = False) -> dict[str, Any]:
         """What is known; empty where nothing is, or it is of another commit."""
         path = self.folder / f"{name}.json"
-        found = json.loads(path.read_text()) if path.exists() else {}
-        return found if found.get("commit") == self._commit else {}
+        found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+        return found if any_commit or found.get("commit") == self._commit else {}
 
     def write(self, name: str, found: dict[str, Any]) -> None:
         """Keep it."""
         write_whole(self.folder / f"{name}.json", json.dumps({**found, "commit": self._commit}, indent=1) + "\n")
 
 
-def damaged_files(rooms: list[str], count: int, kept: Kept) -> Figures:
+def damaged_room(room: str, count: int, jobs: int) -> dict[str, Any]:
+    """What the tests of a room say of `count` damaged files for each reader, spread over `jobs` processes.
+
+    Each process draws files of its own: hypothesis seeds itself where DAMAGED_FILES is given.
+    """
+    paths, each = [f"tests/{path}" for path in ROOMS[room]], str(-(-count // jobs))
+    with ThreadPoolExecutor(jobs) as pool:
+        parts = list(pool.map(lambda _: tested(paths, DAMAGED_FILES=each), range(jobs)))
+    failed = [one for _, messages in parts for one in messages]
+    return {"count": count, "readers": parts[0][0], "failed": failed, "device": device_name()}
+
+
+def damaged_files(rooms: list[str], count: int, jobs: int, kept: Kept) -> Figures:
     """Readers that let out another exception, hang or need too much, of `count` damaged files each."""
     for room in rooms:
         if kept.read(f"files_{room}").get("count", 0) < count:
-            paths = [f"tests/{path}" for path in ROOMS[room]]
-            cases, failed = tested(paths, DAMAGED_FILES=str(count))
-            kept.write(f"files_{room}", {"count": count, "readers": cases, "failed": failed})
-            print(f"{room}: {cases} readers, {len(failed)} failed {[one[:300] for one in failed]}", flush=True)
-    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}"))}
+            found = damaged_room(room, count, jobs)
+            kept.write(f"files_{room}", found)
+            said = [one[:300] for one in found["failed"]]
+            print(f"{room}: {found['readers']} readers, {len(said)} failed {said}", flush=True)
+    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}", any_commit=True))}
     failed = [one for found in known.values() for one in found["failed"]]
     hangs = [one for one in failed if "SECONDS" in one or "process_time" in one]
     memory = [one for one in failed if "BYTES" in one or "_peak" in one or "MemoryError" in one]
     about = {"files_per_reader": {room: found["count"] for room, found in known.items()},
+             "commits": {room: found["commit"] for room, found in known.items()},
              "readers": sum(found["readers"] for found in known.values())}
-    return {"fuzz_undocumented": {**figure([float(len(failed) - len(hangs) - len(memory))], "count"), **about},
-            "fuzz_hangs": {**figure([float(len(hangs))], "count"), **about},
-            "fuzz_memory": {**figure([float(len(memory))], "count"), **about}}
+    counts = {"undocumented": len(failed) - len(hangs) - len(memory), "hangs": len(hangs), "memory": len(memory)}
+    device = next(iter(known.values()))["device"]
+    return {f"fuzz_{name}": {**figure([float(number)], "count", device), **about} for name, number in counts.items()}
 
 
 def mistaken_commands() -> Figures:
@@ -124,9 +143,10 @@ def mistaken_commands() -> Figures:
 
 def started(words: list[str], out: Path) -> subprocess.Popen[str]:
     """A command at work in a folder."""
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                            env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+                            env={**os.environ, "PYTHONPATH": path})  # fmt: skip
 
 
 def half_written(out: Path) -> list[Path]:
@@ -145,46 +165,82 @@ def half_written(out: Path) -> list[Path]:
 
 
 def newest(out: Path) -> float:
-    """When the newest file of a run was written; 0 where there is none."""
-    return max((path.stat().st_mtime for path in out.rglob("*") if path.is_file()), default=0.0)
+    """When a run last saved what it goes on from, or a result; 0 where it never did."""
+    times = [0.0]
+    for path in out.rglob("*"):
+        if path.name not in NO_SAVES and path.suffix != ".jsonl":
+            with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+                times.append(path.stat().st_mtime)
+    return max(times)
+
+
+def left_alone(name: str, words: list[str], out: Path) -> dict[str, Any]:
+    """Seconds that a run takes when nobody ends it, and the longest time for which it saved nothing."""
+    shutil.rmtree(out, ignore_errors=True)
+    began, child, longest = time.time(), started(words, out), 0.0
+    while child.poll() is None:
+        time.sleep(0.2)
+        longest = max(longest, time.time() - max(newest(out), began))
+    said = child.communicate()[1]
+    if child.returncode:
+        raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
+    return {"seconds": round(time.time() - began), "unsaved_s": round(longest, 1), "bits": digest(name, out)}
+
+
+def digest(name: str, out: Path) -> str:
+    """Hash of a run's result."""
+    return hashlib.sha256((out / RESULT[name]).read_bytes()).hexdigest()
+
+
+def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], kills: int) -> None:
+    """Start a run or go on with it, end it at a random moment, and count what went wrong."""
+    number, chosen = SIGNALS[found["kills"] % len(SIGNALS)], random.Random(found["kills"] + 1000 * len(found["bits"]))
+    child, begun = started(words, out), time.time()
+    try:
+        said = child.communicate(timeout=chosen.uniform(1.0, 600.0 / kills + 5.0))[1]
+    except subprocess.TimeoutExpired:
+        found["lost"] += time.time() - max(newest(out), begun) > MINUTE
+        child.send_signal(number)
+        said = child.communicate()[1]
+        found["kills"] += 1
+        found["half_written"] += len(half_written(out))
+        found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
+    else:
+        settle(name, out, found, child.returncode, said)
+
+
+def settle(name: str, out: Path, found: dict[str, Any], code: int, said: str) -> None:
+    """Keep the bits of a run that came to its end, and begin anew.
+
+    Raises:
+        RuntimeError: it failed before it had made its folder, so no kill can be measured.
+    """
+    if code and not out.exists():
+        raise RuntimeError(f"{name} ended with {code}: {said.strip().splitlines()[-1:]}")
+    found["bits"].append(digest(name, out) if code == 0 else f"exit code {code}")
+    shutil.rmtree(out)
 
 
 def kill_again_and_again(name: str, words: list[str], kills: int, kept: Kept) -> dict[str, Any]:
-    """What `kills` kills of one run do, each signal in turn, and how long the run takes when left alone."""
+    """What `kills` kills of one run do, each signal in turn, beside a run that is left alone."""
     found, straight, broken = kept.read(f"kills_{name}"), *(kept.folder / f"{name}_{one}" for one in ("left", "killed"))
     if found.get("words") != words:
-        for out in (straight, broken):
-            shutil.rmtree(out, ignore_errors=True)
-        began, child = time.monotonic(), started(words, straight)
-        said = child.communicate()[1]
-        if child.returncode:
-            raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
-        found = {"words": words, "seconds": round(time.monotonic() - began), "lost": 0, "half_written": 0,
-                 "different": 0, "wrong_ends": 0, "kills": 0, "ended": False}
-        kept.write(f"kills_{name}", found)
-    while found["kills"] < kills and not found["ended"]:
-        number = SIGNALS[found["kills"] % len(SIGNALS)]
-        chosen = random.Random(found["kills"])
-        child, begun = started(words, broken), time.time()
-        try:
-            child.communicate(timeout=chosen.uniform(1.0, 3 * found["seconds"] / kills + 20.0))
-            found["ended"] = True  # by itself
-        except subprocess.TimeoutExpired:
-            found["lost"] += time.time() - max(newest(broken), begun) > MINUTE
-            child.send_signal(number)
+        shutil.rmtree(broken, ignore_errors=True)
+        found = {"words": words, "lost": 0, "half_written": 0, "wrong_ends": 0, "kills": 0, "bits": []}
+    with ThreadPoolExecutor(1) as pool:
+        alone = None if "alone" in found else pool.submit(left_alone, name, words, straight)
+        while found["kills"] < kills:
+            kill_once(name, words, broken, found, kills)
+            kept.write(f"kills_{name}", found)
+            print(f"{name}: {found['kills']} of {kills} kills", flush=True)
+        if broken.exists() or not found["bits"]:
+            child = started(words, broken)
             said = child.communicate()[1]
-            found["kills"] += 1
-            found["half_written"] += len(half_written(broken))
-            found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
-        kept.write(f"kills_{name}", found)
-        print(f"{name}: {found}", flush=True)
-    if "same" not in found:
-        child = started(words, broken)
-        child.communicate()
-        there, here = (out / RESULT[name] for out in (straight, broken))
-        found["same"] = child.returncode == 0 and there.read_bytes() == here.read_bytes()
-        found["different"] = int(not found["same"])
-        kept.write(f"kills_{name}", found)
+            settle(name, broken, found, child.returncode, said)
+        if alone is not None:
+            found["alone"] = alone.result()
+    found["different"] = sum(bits != found["alone"]["bits"] for bits in found["bits"])
+    kept.write(f"kills_{name}", {**found, "device": device_name()})
     print(f"{name}: {found}", flush=True)
     return found
 
@@ -193,11 +249,15 @@ def killed_runs(commands: dict[str, list[str]], kills: int, kept: Kept) -> Figur
     """Kills of all commands, summed."""
     for name, words in commands.items():
         kill_again_and_again(name, words, kills, kept)
-    known = {name: found for name in COMMANDS if "same" in (found := kept.read(f"kills_{name}"))}
+    known = {name: found for name in COMMANDS if "different" in (found := kept.read(f"kills_{name}"))}
     about = {"kills": {name: found["kills"] for name, found in known.items()},
-             "seconds": {name: found["seconds"] for name, found in known.items()}}
-    return {f"kills_{what}": {**figure([float(sum(one[what] for one in known.values()))], "count"), **about}
-            for what in ("lost", "different", "half_written", "wrong_ends")}
+             "seconds": {name: found["alone"]["seconds"] for name, found in known.items()}}
+    device = next(iter(known.values()))["device"]
+    counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in known.values()))], "count", device), **about}
+              for what in ("lost", "different", "half_written", "wrong_ends")}
+    unsaved = [found["alone"]["unsaved_s"] for found in known.values()]
+    longest = figure(unsaved, "s, longest time in which a run saved nothing, its start included", device)
+    return {**counts, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
 
 
 def interrupted(commands: dict[str, list[str]], count: int, seed: int = 0) -> Figures:
@@ -226,6 +286,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--damaged", type=whole(), default=2000, help="damaged files for each reader")
     parser.add_argument("--rooms", nargs="+", choices=tuple(ROOMS), default=list(ROOMS), help="readers of files")
+    parser.add_argument("--jobs", type=whole(), default=len(os.sched_getaffinity(0)), help="processes that read files")
     parser.add_argument("--kills", type=whole(), default=30, help="of each command")
     parser.add_argument("--interrupts", type=whole(), default=20, help="of each command")
     parser.add_argument("--commands", nargs="+", choices=tuple(COMMANDS), default=list(COMMANDS))
@@ -233,10 +294,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--keep", type=Path, default=Path("runs/reliability"), help="folder to go on in")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of reliability.json")
     given = parser.parse_args(arguments)
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; the commands need it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     kept = Kept(given.keep)
     commands = {name: (QUICK if given.quick else COMMANDS)[name] for name in given.commands}
     parts: dict[str, Callable[[], Figures]] = {
-        "files": lambda: damaged_files(given.rooms, given.damaged, kept), "options": mistaken_commands,
+        "files": lambda: damaged_files(given.rooms, given.damaged, given.jobs, kept), "options": mistaken_commands,
         "kills": lambda: killed_runs(commands, given.kills, kept),
         "ctrl_c": lambda: interrupted(commands, given.interrupts)}
     for part in given.parts:

@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from bridge import ros
-from bridge.options import Parser, ends_at_ctrl_c, in_range
+from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
 from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
 
 SLOW = 0.15
@@ -54,7 +54,7 @@ class ChairNode:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = Parser(prog="bridge.chair", description="Publish the odometry of a WHILL Model CR2.")
-    parser.add_argument("--state-topic", default=ros.CHAIR_STATE_TOPIC)
+    parser.add_argument("--state-topic", type=topic_name, default=ros.CHAIR_STATE_TOPIC)
     parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=WHEEL_RADIUS, help="[m], loaded")
     parser.add_argument("--tread", type=in_range(0.01, 5), default=TREAD, help="[m], between the drive wheels")
     return parser.parse_args(arguments)

@@ -17,7 +17,7 @@ from bridge.bases import BASES
 from bridge.commands import endpoints
 from bridge.controller import Controller
 from bridge.diagnosis import Evidence, FrameLog, causes
-from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import SafetyConfig
 from bridge.vehicle_node import NOT_ACTIVE, VehicleNode, add_options, limits
@@ -37,7 +37,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--slew", type=in_range(0, infinite=True), nargs=2, metavar=("V", "OMEGA"),
                         default=(math.inf, math.inf),
                         help="largest change of commands [m/s2, rad/s2]; a stop is not slowed")
-    parser.add_argument("--image-topic", default=ros.IMAGE_TOPIC)
+    parser.add_argument("--image-topic", type=topic_name, default=ros.IMAGE_TOPIC)
     parser.add_argument("--compressed", action="store_true",
                         help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
     parser.add_argument("--crop", type=whole(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),

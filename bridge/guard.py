@@ -16,11 +16,17 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
-from bridge.options import Parser, ends_at_ctrl_c, whole
+from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
+from bridge.vehicle_time import VehicleTime
 
 SILENCE = 0.15
 """[s]; a driving policy node gives a sign of life at least every 50 ms."""
+SIMULATED = 10.0
+"""How many times as long the two may not hear each other in simulated time: processes of a busy computer wait for each
+other, and nobody sits on the vehicle."""
 WATCH_PERIOD = 0.01
+LATE = 0.05
+"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile, and judges nothing."""
 BEAT_PERIOD = 0.05
 REPEATS = 10
 """Zeros sent per stop, 50 ms apart."""
@@ -33,7 +39,9 @@ PATIENCE = 30.0
 class Watchdog:
     """Decides when to send zeros; pure, with injected time."""
 
-    def __init__(self) -> None:
+    def __init__(self, silence: float = SILENCE) -> None:
+        self.silence = silence
+        """Seconds after which a driving node that gave no sign of life is stopped."""
         self.stops = 0
         """How often a node was found silent while it drove."""
         self.zeros = 0
@@ -43,7 +51,7 @@ class Watchdog:
         self._driving: dict[str, float] = {}  # time of the last sign of life of each session that drives
         self._stands = False  # whether the last command on the topic was zero
         self._left = 0
-        self._next = 0.0
+        self._next = self._ticked = 0.0
 
     def heartbeat(self, now: float, session: str, driving: bool) -> None:
         """Take a heartbeat of a policy node."""
@@ -63,8 +71,9 @@ class Watchdog:
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
+        late, self._ticked = now - self._ticked > LATE, now
         for session, alive in list(self._driving.items()):
-            if now - alive > SILENCE:
+            if now - alive > self.silence and not late:
                 del self._driving[session]
                 if not self._stands:
                     self._left, self._next = REPEATS, now
@@ -86,7 +95,11 @@ class GuardNode:
 
         self.node, self.watchdog = node, Watchdog()
         self._follow = options.follow
-        self._missing_since = time.monotonic() + PATIENCE
+        self._followed = time.monotonic() + PATIENCE
+        self.now: Callable[[], float] = time.monotonic
+        if ros.uses_simulated_time(node):
+            self.now, self.watchdog = (vehicle_time := VehicleTime()), Watchdog(SIMULATED * SILENCE)
+            ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
         self._ready = False
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
@@ -98,10 +111,7 @@ class GuardNode:
 
     def finished(self) -> bool:
         """Return whether the one node that this guard follows is gone."""
-        now = time.monotonic()
-        if self._follow in self.watchdog.heard:
-            self._missing_since = now
-        return bool(self._follow) and now - self._missing_since > FORGET
+        return bool(self._follow) and time.monotonic() - self._followed > 2 * FORGET
 
     def _on_command(self, v: float, omega: float) -> None:
         self.watchdog.command(v != 0 or omega != 0)  # not-finite values compare unequal to 0: they count as motion
@@ -109,15 +119,17 @@ class GuardNode:
     def _on_heartbeat(self, message: Any) -> None:
         beat = read_beat(message.data, session=str, driving=bool)
         if beat and self._follow in ("", beat["session"]):
-            self.watchdog.heartbeat(time.monotonic(), beat["session"], beat["driving"])
+            self._followed = time.monotonic()
+            self.watchdog.heartbeat(self.now(), beat["session"], beat["driving"])
 
     def _on_watch(self) -> None:
         stops = self.watchdog.stops
-        if self.watchdog.tick(time.monotonic()):
+        if self.watchdog.tick(self.now()):
             self._on_beat()  # first, so that nobody takes the zero for a stranger's
             self.topic.publish(0.0, 0.0)
         if self.watchdog.stops != stops:
-            self.node.get_logger().error(f"the policy node gave no sign of life for {SILENCE} s: vehicle stopped")
+            self.node.get_logger().error(f"the policy node gave no sign of life for {self.watchdog.silence:g} s: "
+                                         "vehicle stopped")
 
     def _on_beat(self) -> None:
         watchdog = self.watchdog
@@ -155,9 +167,10 @@ class GuardLink:
     RESTART = 2.0
     """Seconds between two starts of a guard that ended."""
 
-    def __init__(self, session: str, topic: str, start: Callable[[], Any] | None) -> None:
+    def __init__(self, session: str, topic: str, start: Callable[[], Any] | None, simulated: bool = False) -> None:
         """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
         self.session, self.topic = session, topic
+        self._stale = self.STALE * (SIMULATED if simulated else 1.0)
         self.zeros = self.stops = 0
         self._start, self._process = start, None
         self._started = -self.RESTART
@@ -178,7 +191,7 @@ class GuardLink:
         if not beat:
             return
         ours = beat["topic"] == self.topic and self.session in beat["hears"]
-        if not ours and now - self._trusted < self.STALE:
+        if not ours and now - self._trusted < self._stale:
             return  # a second guard, such as that of an earlier node that was killed
         if ours:
             self._trusted = now
@@ -189,7 +202,7 @@ class GuardLink:
         """Return why nobody would stop the vehicle if this process died; empty where a guard would."""
         if self._process is not None and self._process.poll() is not None:
             return f"the guard ended with code {self._process.returncode}"
-        if self._heard is None or now - self._heard > self.STALE:
+        if self._heard is None or now - self._heard > self._stale:
             return "no guard is running"
         if self._beat["topic"] != self.topic:
             return f"the guard follows {self._beat['topic']}, not {self.topic}"
@@ -207,7 +220,7 @@ class GuardLink:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = Parser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
-    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
     parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",

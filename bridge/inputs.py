@@ -6,7 +6,6 @@ stop that was latched before the bridge started is known as soon as its publishe
 
 import argparse
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -78,13 +77,13 @@ class SafetyInputs:
         block(ENABLE, self.options.enable == "require" and self._enable.read(now) is not True)
         block(DEAD_MAN, self.options.dead_man_button >= 0 and self._button.read(now) is not True)
 
-    def subscribe(self, node: Any, changed: Callable[[float], None]) -> None:
-        """Listen on the graph; `changed` is called with the time after each message."""
+    def subscribe(self, node: Any, clock: Callable[[], float], changed: Callable[[float], None]) -> None:
+        """Listen on the graph; `changed` is called with the time of `clock` after each message."""
         from std_msgs.msg import Bool
 
         def listen(topic: str, take: Callable[[float, bool], None]) -> None:
             def heard(message: Any) -> None:
-                now = time.monotonic()
+                now = clock()
                 take(now, message.data)
                 changed(now)
 
@@ -100,7 +99,7 @@ class SafetyInputs:
             from sensor_msgs.msg import Joy
 
             def on_joy(message: Any) -> None:
-                now = time.monotonic()
+                now = clock()
                 self.on_joy(now, list(message.buttons))
                 changed(now)
 

@@ -24,10 +24,11 @@ from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
 from bridge.fitted_reach import simulate_reach
-from bridge.options import Parser, ends_at_ctrl_c, in_range, whole
+from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
 from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.vehicle_node import VehicleNode, add_options, limits
+from bridge.vehicle_time import VehicleTime
 
 NAME = "bridge.manoeuvre"
 BACK = "bring the vehicle back to its start, then arm"
@@ -47,7 +48,7 @@ class Player:
         self.table, self.repeat = table, repeat
         self.clock: Callable[[float], float] = lambda now: now
         """Seconds of the clock that the table counts in, from the steady time; simulated time may be another one. What
-        stops the vehicle is always timed by the steady clock."""
+        stops the vehicle is timed by the clock of `now`."""
         self.supervisor = Supervisor(safety)
         self.driven = 0
         """Replicates driven to their end."""
@@ -103,7 +104,8 @@ class ManoeuvreNode(VehicleNode):
     """Connects a player to the ROS graph, and records each replicate."""
 
     def __init__(self, node: Any, player: Player, options: argparse.Namespace) -> None:
-        super().__init__(node, player, options)
+        simulated = VehicleTime() if ros.uses_simulated_time(node) else None
+        super().__init__(node, player, options, simulated or time.monotonic)
         self.player = player
         self._recorder = RecordNode(node, None, options) if options.dataset else None
         self.trials: list[Path] = []
@@ -113,9 +115,9 @@ class ManoeuvreNode(VehicleNode):
         self.failure = ""
         """Why the drive ended early, such as a full disk."""
         self._simulated = 0.0
-        if ros.uses_simulated_time(node):
+        if simulated is not None:
             player.clock = lambda _: self._simulated
-            ros.subscribe_clock(node, self._on_clock)
+            ros.subscribe_clock(node, lambda seconds: self._on_clock(simulated, seconds))
         ros.steady_timer(node, PERIOD / 2, self._on_progress)
         self.start()
 
@@ -126,10 +128,11 @@ class ManoeuvreNode(VehicleNode):
             self._over_since = time.monotonic()
         return bool(self.failure) or time.monotonic() - self._over_since > 1.0
 
-    def _on_clock(self, seconds: float) -> None:
+    def _on_clock(self, vehicle_time: VehicleTime, seconds: float) -> None:
         """Take the simulated time, and send the row that is due."""
+        vehicle_time.on_clock()
         self._simulated = seconds
-        self._on_input(time.monotonic())
+        self._on_input(self.now())
         self._on_progress()
 
     def details(self) -> dict[str, Any]:
@@ -247,7 +250,7 @@ def main(arguments: list[str] | None = None) -> int:
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
-        print(f"{NAME}: {error}", file=sys.stderr)
+        print(f"{NAME}: {said(error)}", file=sys.stderr)
         return 2
     print(f"{NAME}: {place}", file=sys.stderr)
     if options.check:

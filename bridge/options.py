@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 
 def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
@@ -28,7 +29,16 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
 
 
 class Parser(argparse.ArgumentParser):
-    """An `argparse.ArgumentParser` whose complaint is one line, without the usage."""
+    """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse an empty word, which as a path would be the folder that the command is called in."""
+        words = sys.argv[1:] if args is None else list(args)
+        for before, word in zip(["", *words], words, strict=False):
+            if not word.strip() or word.startswith("--") and word.endswith("="):
+                self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable. "
+                           "Give a value")
+        return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and end with code 2."""
@@ -57,6 +67,24 @@ def in_range(
         return value
 
     return read
+
+
+TOPIC = re.compile(r"(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+def topic_name(text: str) -> str:
+    """A type for `add_argument`: the name of a topic as ROS allows it, relative or absolute."""
+    if text and not TOPIC.fullmatch(text):  # a default may be none
+        raise argparse.ArgumentTypeError(f"{text!r} is no name of a topic. Letters, digits, '_' and '/' make one, like "
+                                         "whill/odom")
+    return text
+
+
+def said(error: BaseException) -> str:
+    """Return what went wrong with a file or an option, without the number of the system's error."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}. Choose another place"
+    return str(error)
 
 
 def result_file(text: str) -> Path:

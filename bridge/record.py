@@ -24,7 +24,7 @@ from typing import IO, Any
 from bridge import ros
 from bridge.commands import CommandListener
 from bridge.mcap_file import McapWriter, mend
-from bridge.options import Parser, ends_at_ctrl_c, in_range
+from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
 from bridge.streams import DEPTH, Stream
 
 COLUMNS = {
@@ -415,7 +415,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
     parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
                         help="end after so long; 0: at Ctrl-C or SIGTERM")
-    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     add_dataset_options(parser)
     options = parser.parse_args(arguments)
     if (options.trial is None) != options.recover:
@@ -425,9 +425,11 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 
 def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     """Declare the topics that are recorded, and what dataset.toml says of the vehicle."""
-    parser.add_argument("--odometry-topic", default=ros.ODOMETRY_TOPIC, help="the vehicle's own odometry")
-    parser.add_argument("--ground-truth-topic", default=ros.GROUND_TRUTH_TOPIC, help="an outside measurement")
-    parser.add_argument("--imu-topic", default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
+    parser.add_argument("--odometry-topic", type=topic_name, default=ros.ODOMETRY_TOPIC,
+                        help="the vehicle's own odometry")
+    parser.add_argument("--ground-truth-topic", type=topic_name, default=ros.GROUND_TRUTH_TOPIC,
+                        help="an outside measurement")
+    parser.add_argument("--imu-topic", type=topic_name, default=ros.IMU_TOPIC, help="sensor_msgs/Imu, for its yaw rate")
     parser.add_argument("--time", choices=("receipt", "stamp"), default="receipt",
                         help="what `t` is: when a message came, or its own stamp, for sensors that share one clock")
     parser.add_argument("--mcap", action="store_true",
@@ -461,7 +463,7 @@ def main_recover(dataset: Path) -> int:
     try:
         found = recover(dataset)
     except (ValueError, OSError) as error:
-        print(f"bridge.record: {error}", file=sys.stderr)
+        print(f"bridge.record: {said(error)}", file=sys.stderr)
         return 2
     for folder in found:
         print(f"bridge.record: {folder}: recovered", file=sys.stderr)
@@ -484,7 +486,7 @@ def main(arguments: list[str] | None = None) -> int:
         writer = TrialWriter(options.dataset, options.trial)
         write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
-        print(f"bridge.record: {error}", file=sys.stderr)
+        print(f"bridge.record: {said(error)}", file=sys.stderr)
         return 2
     failed = False
     try:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,8 +19,9 @@ from bridge import inputs, ros
 from bridge.bases import BASES
 from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
 from bridge.guard import BEAT_PERIOD, GuardLink
-from bridge.options import in_range, whole
+from bridge.options import in_range, topic_name, whole
 from bridge.safety import Command, State, Supervisor
+from bridge.vehicle_time import VehicleTime
 from bridge.whill import ChairGate, ChairState
 
 WATCH_PERIOD = 0.01
@@ -51,32 +53,40 @@ class Decider(Protocol):
 class VehicleNode:
     """Connects one decider to the ROS graph."""
 
-    def __init__(self, node: Any, decider: Decider, options: argparse.Namespace) -> None:
-        """Join the graph; call `start` when the rest of the node is made. `options` has those of `add_options`."""
+    def __init__(self, node: Any, decider: Decider, options: argparse.Namespace,
+                 now: Callable[[], float] = time.monotonic) -> None:
+        """Join the graph; call `start` when the rest of the node is made.
+
+        Args:
+            node: of the graph.
+            decider: whose commands are sent.
+            options: those of `add_options`.
+            now: seconds in which all limits count: the steady clock, or a `VehicleTime`.
+        """
         from std_msgs.msg import Empty, String
 
-        self.node, self.decider, self.options = node, decider, options
+        self.node, self.decider, self.options, self.now = node, decider, options, now
         self.supervisor = decider.supervisor
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
-                               self._start_guard if options.guard == "own" else None)
+                               self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))
         self._inputs = inputs.SafetyInputs(self.supervisor, options)
         self._ear = Ear()
         self._string = String
         self._status = node.create_publisher(String, ros.STATUS_TOPIC, ros.reliable())
         self._heartbeat = node.create_publisher(String, ros.HEARTBEAT_TOPIC, ros.reliable())
         self._said_driving = False
-        self._started = time.monotonic()
+        self._started = now()
         self._looked = self._said = -math.inf
-        self._clock_offset = time.time() - self._started
+        self._clock_offset = time.time() - time.monotonic()
         self._reported: tuple[str, ...] = ()
-        self._others = Commanders(self._started)
+        self._others = Commanders(time.monotonic())
         self._commanders: list[str] = []
         self._listeners: list[Endpoint] = []
         self._guard_stops = 0
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
         ros.subscribe_own(node, String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
-        self._inputs.subscribe(node, self._on_input)
+        self._inputs.subscribe(node, now, self._on_input)
         self._chair = ChairGate(self.supervisor) if options.whill_state else None
         if self._chair is not None:
             node.create_subscription(ros.chair_state_type(), options.whill_state, self._on_chair, ros.best_effort(10))
@@ -113,7 +123,7 @@ class VehicleNode:
 
     def _on_active_change(self, active: bool) -> None:
         self.supervisor.block(NOT_ACTIVE, not active)
-        self._publish(self.decider.on_tick(time.monotonic()))
+        self._publish(self.decider.on_tick(self.now()))
 
     def _watch_clock(self) -> Any:
         """Report jumps of the node's clock to the supervisor."""
@@ -128,13 +138,14 @@ class VehicleNode:
         """Start a guard that outlives this process, its terminal included, by some seconds."""
         arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
                      "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
+        simulated = str(isinstance(self.now, VehicleTime)).lower()  # the guard counts in the same time
         return subprocess.Popen([sys.executable, "-m", "bridge.guard", *arguments, "--ros-args", "-r",
-                                 f"__ns:={self.node.get_namespace()}"], start_new_session=True,
+                                 f"__ns:={self.node.get_namespace()}", "-p", f"use_sim_time:={simulated}"],
+                                start_new_session=True,
                                 cwd=Path(__file__).resolve().parents[1])  # so that -m finds this very package
 
     def _on_watch(self) -> None:
-        now = time.monotonic()
-        offset = time.time() - now
+        now, offset = self.now(), time.time() - time.monotonic()
         if abs(offset - self._clock_offset) > CLOCK_STEP:
             self.supervisor.clock_jump()
         self._clock_offset = offset
@@ -146,10 +157,10 @@ class VehicleNode:
             self.supervisor.foreign_command(now)
         self._publish(self.decider.on_tick(now))
         if self.has_time(now):
-            self._keep_house(now)
+            self._keep_house(time.monotonic())
 
     def _keep_house(self, now: float) -> None:
-        """Look at the graph and report, where it is time."""
+        """Look at the graph and report, where it is time: by the steady clock, since a graph does not wait."""
         if now - self._looked >= LOOK_PERIOD:
             self._looked = now
             self._on_look()
@@ -158,10 +169,10 @@ class VehicleNode:
 
     def _on_command(self, v: float, omega: float) -> None:
         if self._ear.heard(v, omega):
-            self.supervisor.foreign_command(time.monotonic())
+            self.supervisor.foreign_command(self.now())
 
     def _on_guard(self, message: Any) -> None:
-        now = time.monotonic()
+        now = self.now()
         self.guard.heard(now, message.data)
         self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
@@ -172,7 +183,7 @@ class VehicleNode:
         self._publish(self.decider.on_tick(now))
 
     def _on_chair(self, state: Any) -> None:
-        now = time.monotonic()
+        now = self.now()
         if self._chair is not None:
             self._chair.take(now, ChairState.of(state))
         self._publish(self.decider.on_tick(now))
@@ -234,13 +245,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the base, the command topic, the guard and the stops from outside."""
     parser.add_argument("--base", choices=sorted(BASES), default="whill",
                         help="what is below the command topic: its range, and whether it needs zeros held after a stop")
-    parser.add_argument("--whill-state", default="", metavar="TOPIC",
+    parser.add_argument("--whill-state", type=topic_name, default="", metavar="TOPIC",
                         help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
                              f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
     parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: those of policy and base")
     parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
-    parser.add_argument("--command-topic", default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
     parser.add_argument("--guard", choices=("own", "other"), default="own",

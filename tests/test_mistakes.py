@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import runpy
 import shlex
 import shutil
@@ -68,6 +69,7 @@ def mistakes(tmp_path_factory):
     (folder / "notes").mkdir()
     (folder / "notes" / "diary.txt").write_text("mine")
     (folder / "empty").mkdir()
+    os.mkfifo(folder / "pipe")
     (folder / "training").mkdir()
     (folder / "training" / "run.json").write_text('{"kind": "whill_mjx.train", "identity": {"seed": 0}}')
     (folder / "model.txt").write_text("")
@@ -87,9 +89,17 @@ def mistakes(tmp_path_factory):
     ("fit", "data --physics-dt 1e-9", "--physics-dt 1e-09: must be at least 0.0001"),
     ("fit", "data --spread 0", "--spread 0.0: must be above 0"),
     ("fit", "data --method newton", "--method"),
+    ("fit", "data --out ''", "--out: an empty word"),
+    ("fit", "data --out data", "--out data: holds dataset.toml of something else"),
+    ("fit", "data --out data/trials/new", "--out data/trials/new: lies among the trials of"),
+    ("fit", "''", "the command line: an empty word"),
+    ("fit", "data --out=", "--out: an empty word"),
+    ("fit", "data --train ' '", "--train: an empty word"),
     ("fit", "nowhere", "nowhere"),
     ("fit", "file", "file"),
     ("fit", "empty", "empty: no dataset.toml"),
+    ("fit", "pipe", "pipe: a pipe or a device"),
+    ("convert", "pipe --out new", "pipe"),
     ("fit", "data --parameters body.nope", "body.nope"),
     ("fit", "data --effects nope", "no effect 'nope'"),
     ("fit", "data --profile nope", "profile of 'nope'"),
@@ -255,6 +265,7 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
     ("drive", "nowhere --signal-age nan", "--signal-age"), ("drive", "nowhere --dead-man-button -7", "--dead-man"),
     ("drive", "nowhere --base tank", "--base"), ("drive", "nowhere --results empty", "--results"),
     ("drive", "nowhere --results no/where.json", "--results"), ("drive", "nowhere --nope", "nope"),
+    ("drive", "''", "an empty word"), ("drive", "nowhere --results ''", "--results: an empty word"),
     ("record", "", "dataset"), ("record", "new", "trial"), ("record", "new t --seconds -1", "--seconds"),
     ("record", "new t --seconds nan", "--seconds"), ("record", "new t --wheel-radius 0", "--wheel-radius"),
     ("record", "new t --track inf", "--track"), ("record", "new t --wheelbase nan", "--wheelbase"),
@@ -269,7 +280,10 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
     ("simulate", "--simulator os:nope", "nope"), ("simulate", "nowhere", "nowhere"),
     ("simulate", "--results empty", "--results"),
     ("chair", "--wheel-radius nan", "--wheel-radius"), ("chair", "--tread 0", "--tread"), ("chair", "x", "x"),
-    ("guard", "--realtime -1", "--realtime"), ("guard", "--command-type Tw", "--command-type"),
+    ("guard", "--command-topic ///", "--command-topic"), ("drive", "nowhere --image-topic 1a", "--image-topic"),
+    ("record", "new t --imu-topic 'a b'", "--imu-topic"), ("chair", "--state-topic a/", "--state-topic"),
+    ("record", "file t", "file/trials: Not a directory"), ("guard", "--realtime -1", "--realtime"),
+    ("guard", "--command-type Tw", "--command-type"),
 ])  # fmt: skip
 def test_a_mistake_in_the_bridge_ends_with_one_line(command, words, told, mistakes, monkeypatch, capsys):
     monkeypatch.chdir(mistakes)

@@ -44,7 +44,10 @@ def main(options: Import) -> None:
     check_place("--out", picture)
     with refusing():
         grid = read_map(options.file, options.cell, options.scale)
-        made = make_map_scene(grid, Reach(passing=options.width / 2))
+        try:
+            made = make_map_scene(grid, Reach(passing=options.width / 2))
+        except ValueError as error:
+            raise ValueError(f"{options.file}: {error}") from None
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
     steps, places = len(wall_segments(grid)), made.places
     print(f"{options.file}: {size[0]:.1f} x {size[1]:.1f} m in cells of {grid.resolution:g} m")

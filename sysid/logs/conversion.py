@@ -113,9 +113,10 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     Raises:
         ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
     """
-    if not config.source.exists():
-        raise FileNotFoundError(f"{config.source}: does not exist. Give a ROS bag, a CSV file, a folder of them, or a "
-                                "measured set.")
+    if not config.source.is_dir() and not config.source.is_file():
+        what = "a pipe or a device" if config.source.exists() else "does not exist"
+        raise FileNotFoundError(f"{config.source}: {what}. Give a ROS bag, a CSV file, a folder of them, or a measured "
+                                "set.")
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}

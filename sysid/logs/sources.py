@@ -23,7 +23,9 @@ def about(path: Path) -> str:
     """One or two sentences on a path: what it is and what to do with it."""
     if not path.exists():
         return "no such folder or file. Correct the path."
-    return _about_folder(path) if path.is_dir() else _about_file(path)
+    if path.is_dir():
+        return _about_folder(path)
+    return _about_file(path) if path.is_file() else "a pipe or a device, not a file. Give the name of a file or folder."
 
 
 def refuse_recording(path: str | Path, needed: str) -> None:

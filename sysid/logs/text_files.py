@@ -100,7 +100,8 @@ def join_drives(
             columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
             drives.append(_join(name, source, tables, columns, geometry))
         except ValueError as error:
-            refused.append(error)
+            at = "" if str(source) in str(error) else f"{source}: "
+            refused.append(ValueError(f"{at}{error}"))
     if not drives and refused:
         raise refused[0]
     return drives, [f"left out: {error}" for error in refused]

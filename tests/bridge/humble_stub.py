@@ -137,6 +137,9 @@ class Node:
     def get_clock(self):
         return self.clock
 
+    def get_parameter(self, name):
+        return types.SimpleNamespace(name=name, value=False)  # of a node without parameters, use_sim_time alone
+
     def get_logger(self):
         log = self.logged.append
         return types.SimpleNamespace(info=log, warning=log, error=log)

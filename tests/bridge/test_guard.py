@@ -128,3 +128,16 @@ def test_guard_that_ended_is_started_again_after_a_pause():
 @pytest.mark.parametrize("text", ["", "nonsense", "[]", "{}", '{"session": 3, "driving": true}', '{"session": "a"}'])
 def test_damaged_heartbeat_is_no_heartbeat(text):
     assert read_beat(text, session=str, driving=bool) == {}
+
+
+@pytest.mark.quick
+def test_a_guard_that_comes_late_itself_first_reads_what_has_arrived():
+    watchdog = Watchdog()
+    watchdog.tick(0.0)
+    watchdog.heartbeat(0.01, "a", driving=True)
+    watchdog.command(True)
+    assert not watchdog.tick(1.0)  # it had no processor, and has not read yet
+    watchdog.heartbeat(1.005, "a", driving=True)
+    assert not watchdog.tick(1.01) and watchdog.stops == 0
+    assert not watchdog.tick(1.04) and not watchdog.tick(1.08) and not watchdog.tick(1.12) and not watchdog.tick(1.15)
+    assert watchdog.tick(1.16) and watchdog.stops == 1

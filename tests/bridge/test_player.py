@@ -8,6 +8,7 @@ import pytest
 from bridge.command_table import make_table
 from bridge.manoeuvre import BACK, FINISHED, Player
 from bridge.safety import SafetyConfig
+from bridge.vehicle_time import VehicleTime
 
 pytestmark = pytest.mark.quick
 
@@ -120,13 +121,21 @@ def test_in_simulated_time_the_table_follows_the_clock():
     assert np.all(np.diff(times) < 0.02)
 
 
-def test_simulated_time_that_stands_stops_the_vehicle_as_a_silent_camera_would():
+def test_a_simulation_that_waits_for_its_driver_stops_no_manoeuvre():
     drive = simulated(1.0)
+    steady = [drive.now]
+    vehicle = VehicleTime(lambda: steady[0])
     drive.player.supervisor.arm()
-    drive.run(2)
-    stands = drive.player.clock(drive.now)
-    drive.player.clock = lambda _: stands
-    drive.run(0.2)
-    assert drive.player.aborted == 0
-    drive.run(0.2)
-    assert drive.player.aborted == 1 and drive.sent[-1][1:] == (0, 0)
+
+    def run(seconds, clock_runs):
+        for _ in range(round(seconds / 0.01)):
+            steady[0] += 0.01
+            if clock_runs:
+                vehicle.on_clock()
+            drive.player.on_tick(vehicle())
+
+    run(1.0, clock_runs=True)
+    run(30.0, clock_runs=False)
+    assert drive.player.elapsed is not None and drive.player.aborted == 0
+    run(4.0, clock_runs=True)
+    assert drive.player.finished and drive.player.aborted == 0

@@ -214,3 +214,8 @@ def test_a_folder_without_a_report_ends_with_one_line(tmp_path, monkeypatch, con
     monkeypatch.setattr("sys.argv", ["report", str(tmp_path)])
     with pytest.raises(SystemExit, match=f"error: .*{message}"):
         report_module.cli()
+
+
+@pytest.mark.quick
+def test_bars_of_zeros_are_drawn():
+    assert "<rect" in bar_chart(["a", "b"], {"share": [0.0, 0.0]}, "share", log_y=False)

@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from types import FrameType
@@ -204,6 +204,7 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
     """The options of the command line; what tyro finds wrong in them becomes one line."""
     import tyro
 
+    check_words(sys.argv[1:] if args is None else args)
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
     with redirect_stderr(io.StringIO()) as complaint:
         try:
@@ -214,6 +215,19 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
     lines = [line.strip(FRAME) for line in complaint.getvalue().splitlines()]
     text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
     raise OptionError(f"{text.rstrip('.')}. See --help.")
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Refuse an empty word: as a path it would be the folder that the command is called in.
+
+    Raises:
+        OptionError: the option before it.
+    """
+    for before, word in zip(["", *words], words, strict=False):
+        name, _, value = word.partition("=")
+        if not word.strip() or name.startswith("--") and "=" in word and not value.strip():
+            option = before if before.startswith("--") else name.strip() or "the command line"
+            raise OptionError(f"{option}: an empty word, as of a shell variable that is not set. Give a value.")
 
 
 def one_line(error: BaseException) -> str:

@@ -138,6 +138,9 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
     if out.exists() and not out.is_dir():
         raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
     check_place("--out", out, least_free)
+    for place in (out.absolute(), *out.absolute().parents):
+        if place.name == "trials" and (place.parent / "dataset.toml").exists():
+            raise FolderRefused(f"--out {out}: lies among the trials of {place.parent}. Choose another place.")
     found = read_identity(out, kind)
     if found is None:
         taken = [name for name in dict.fromkeys((*outputs, *RESULTS)) if (out / name).exists()]

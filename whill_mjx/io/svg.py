@@ -92,6 +92,7 @@ def bar_chart(
     inner_width, inner_height = width - LEFT - RIGHT, height - TOP - bottom + 20
     low, high = (float(np.log10(known.min())) - 0.15, float(np.log10(known.max())) + 0.1) if log_y else (
         min(0.0, float(known.min())), float(known.max()) * 1.05)
+    high = high if high > low else low + 1.0  # all bars are 0
 
     def down(value: float) -> float:
         return TOP + (high - value) / (high - low) * inner_height
