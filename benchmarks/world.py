@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +41,8 @@ CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
 class Options:
     """Options of the benchmark."""
 
+    parts: tuple[str, ...] = ("maps", "contact")
+    """Of maps (wrong pixels) and contact (penetration)."""
     maps: Path = Path("../shared/data/maps")
     """Folder of the real maps."""
     poses: int = 1000
@@ -132,22 +135,36 @@ def deepest(kind: str, tries: int) -> float:
     return float(jnp.max(jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=1000))(keys)))
 
 
+def wrong_pixels(options: Options) -> dict[str, Any]:
+    """The largest share of the four maps."""
+    shares = []
+    for name in MAPS:
+        shares.append(wrong_share(options.maps / f"{name}.yaml", options.poses))
+        print(f"{name}: {100 * shares[-1]:.3f} % of the horizon's pixels are wrong", flush=True)
+    return {"wrong_horizon_pixels": figure([max(shares)], "share")}
+
+
+def penetration(options: Options) -> dict[str, Any]:
+    """The largest depth of the four kinds of thing."""
+    depths = []
+    for kind in ("wall", "corner", "person", "field"):
+        depths.append(deepest(kind, options.tries))
+        print(f"{kind}: {1000 * depths[-1]:.2f} mm deep at most in {options.tries} tries", flush=True)
+    return {"penetration_cm": figure([100 * max(depths)], "cm")}
+
+
+PARTS = {"maps": wrong_pixels, "contact": penetration}
+
+
 def main(options: Options) -> None:
     """Measure and record."""
-    figures = {}
-    for name in MAPS:
-        share = wrong_share(options.maps / f"{name}.yaml", options.poses)
-        print(f"{name}: {100 * share:.3f} % of the horizon's pixels are wrong", flush=True)
-        figures[name] = share
-    worst = {}
-    for kind in ("wall", "corner", "person", "field"):
-        worst[kind] = deepest(kind, options.tries)
-        print(f"{kind}: {1000 * worst[kind]:.2f} mm deep at most in {options.tries} tries", flush=True)
-    path = record("environment", CLAIM, {
-        "wrong_horizon_pixels": figure([max(figures.values())], "share"),
-        "penetration_cm": figure([100 * max(worst.values())], "cm"),
-    })  # fmt: skip
-    print(f"worst map {max(figures.values()):.5f}, deepest {100 * max(worst.values()):.3f} cm -> {path}")
+    for part in options.parts:
+        if part not in PARTS:
+            raise command_line.OptionError(f"--parts: unknown part {part!r} (known: {', '.join(PARTS)}). Correct it.")
+    for part in options.parts:
+        figures = PARTS[part](options)
+        path = record("environment", CLAIM, figures)
+        print(*(f"{name}: {one['value']:.5f} {one['unit']} -> {path}" for name, one in figures.items()), flush=True)
 
 
 if __name__ == "__main__":
