@@ -165,8 +165,9 @@ def soak(options: Options) -> dict[str, Any]:
         state, time_step = batch.step(state, actions)
         vehicle = state.env.vehicle
         x, y, _ = jax.vmap(functools.partial(reference_pose, env.model))(vehicle.qpos)
-        walkers = state.env.scene.people.position
-        leaves = (vehicle.qpos, vehicle.qvel, time_step.reward, time_step.obs["goal"], walkers)
+        people = state.env.scene.people
+        assert people is not None
+        leaves = (vehicle.qpos, vehicle.qvel, time_step.reward, time_step.obs["goal"], people.position)
         row = jnp.concatenate([leaf.reshape(batch.count, -1) for leaf in leaves], 1)
         broken = ~jnp.isfinite(row).all(1) | (time_step.metrics["diverged"] > 0.5)
         ends = jnp.stack([time_step.metrics[name].sum() for name in COUNTED])
@@ -175,7 +176,8 @@ def soak(options: Options) -> dict[str, Any]:
     length = max(1, round(options.soak / batch.count / BLOCKS))
     roll = jax.jit(lambda carry: jax.lax.scan(one_step, carry, jnp.arange(length)))
     state = jax.jit(batch.reset)(jax.random.key(0))[0]
-    broken, escaped, ends = 0, 0, []
+    broken, escaped = 0, 0
+    ends: list[np.ndarray] = []
     for block in range(BLOCKS):
         (state, *_), seen = roll((state, jnp.zeros((batch.count, 2)), jax.random.key(block)))
         one, other, counts = (np.asarray(leaf, np.int64).sum(0) for leaf in seen)

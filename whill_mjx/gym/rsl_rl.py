@@ -109,7 +109,7 @@ class RslRlVecEnv:
         ends = {name: step.metrics[name].sum() for name in ("success", "collision")}
         return strong((state, (self._groups(obs), step.reward, step.terminated.astype(jnp.int32), ends)))
 
-    def _groups(self, obs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    def _groups(self, obs: Any) -> dict[str, jax.Array]:
         seen, all_of_it = joined(self.batch.env, obs)
         return {"policy": seen} if all_of_it is None else {"policy": seen, "critic": all_of_it}
 

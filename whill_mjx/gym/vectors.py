@@ -37,12 +37,13 @@ def make_endless(
     return env, params, steps
 
 
-def joined(env: Env, obs: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-    """Observations (..., D) of the policy, and those of the critic: the same and the privileged ones, if there are any.
+def joined(env: Env, obs: Any) -> tuple[jax.Array, jax.Array | None]:
+    """Of observations by name: those (..., D) of the policy, and those of the critic: the same and the privileged ones, if there are any.
 
     Sensors come in the order of their names.
     """
-    seen, hidden = [], []
+    seen: list[jax.Array] = []
+    hidden: list[jax.Array] = []
     for name, sensor in env.sensors:
         (hidden if isinstance(sensor, Privileged) else seen).append(obs[name])
     vector = jnp.concatenate(seen, -1)
