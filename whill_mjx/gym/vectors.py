@@ -38,9 +38,9 @@ def make_endless(
 
 
 def joined(env: Env, obs: Any) -> tuple[jax.Array, jax.Array | None]:
-    """Of observations by name: those (..., D) of the policy, and those of the critic: the same and the privileged ones, if there are any.
+    """Observations (..., D) of the policy, from those by name, and of the critic: the same and the privileged ones.
 
-    Sensors come in the order of their names.
+    The critic's are None without a privileged sensor. Sensors come in the order of their names.
     """
     seen: list[jax.Array] = []
     hidden: list[jax.Array] = []
