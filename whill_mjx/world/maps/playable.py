@@ -19,7 +19,7 @@ from whill_mjx.world.maps.nav2 import load_map
 from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
 from whill_mjx.world.maps.surfaces import CLOUDS, MESHES, load_surfaces
-from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.maps.walls import SHOWN, map_walls
 from whill_mjx.world.scene import MapWalls, Marker, Scene, default_looks, no_boxes
 
 BLUE = (0.04, 0.16, 0.90)
@@ -61,7 +61,7 @@ def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap
                      f"{', '.join(dict.fromkeys((*CLOUDS, *MESHES)))}). Give one of them, or made:SEED.")
 
 
-def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, seed: int = 0) -> MapScene:
+def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN, seed: int = 0) -> MapScene:
     """Walls and places of a grid.
 
     Args:

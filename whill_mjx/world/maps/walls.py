@@ -15,6 +15,8 @@ import numpy as np
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.scene import Boxes, MapWalls, Scene
 
+SHOWN = 40
+"""Walls that an image shows at most: in four real maps, 0.05 % of the columns of 64 see others."""
 SQUARE, NEAR = 0.5, 1.2
 """Edge of the squares that have lists of their walls, and how near a wall has to be: a wheelchair and a step [m]."""
 THICKNESS = 0.002
@@ -112,7 +114,7 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     return dataclasses.replace(scene, boxes=boxes)
 
 
-def map_walls(segments: np.ndarray, keep: int = 64, height: float = 2.2) -> MapWalls:
+def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2) -> MapWalls:
     """Walls (S, 2, 2) [m] of a map, of which an image shows `keep` at most, with the lists of those within reach.
 
     A list holds every wall within `NEAR` of any place in its square; the lists are as long as the longest of them.
