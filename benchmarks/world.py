@@ -34,6 +34,8 @@ MOST = 2000
 SPEED, YAW_RATE, PERIOD = 1.67, 1.0, 0.1
 HALF = 0.4925, 0.277
 """Half length and width of a WHILL Model CR [m]."""
+SHRINK = 0.02
+"""Distance of the rectangles inside a vehicle that look for what it stands over [m]."""
 CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
 
 
@@ -94,6 +96,11 @@ def obstacles(kind: str) -> Obstacles:
     return Obstacles(no_boxes(1), nothing, distance_field(GridMap(cells, 0.05, (0.0, 0.0, 0.0))))
 
 
+def shrunk(vehicle: Footprint, by: jax.Array) -> Footprint:
+    """The rectangle whose border lies `by` [m] inside the vehicle's."""
+    return dataclasses.replace(vehicle, half_length=vehicle.half_length - by, half_width=vehicle.half_width - by)
+
+
 def deepest(kind: str, tries: int) -> float:
     """Largest depth [m] of all poses up to where the vehicle stops, over random steps at full speed."""
     things = obstacles(kind)
@@ -121,15 +128,16 @@ def deepest(kind: str, tries: int) -> float:
             def smaller(low_high, _):
                 low, high = low_high
                 shrink = (low + high) / 2
-                inner = dataclasses.replace(pose, half_length=half[0] - shrink, half_width=half[1] - shrink)
-                hit = touches(inner, things)
+                hit = touches(shrunk(pose, shrink), things)
                 return (jnp.where(hit, shrink, low), jnp.where(hit, high, shrink)), None
 
             (low, _), _ = jax.lax.scan(smaller, (jnp.zeros(()), jnp.asarray(0.2)), None, length=9)
             return low
 
         worst = jnp.max(jax.lax.map(depth, jnp.linspace(0.1, 1.0, 10)))
-        return jnp.where(touches(before, things), 0.0, worst)
+        # A thing that lies within the vehicle at first touches no border: only rectangles inside it find it.
+        nested = jax.vmap(lambda shrink: touches(shrunk(before, shrink), things))
+        return jnp.where(nested(jnp.arange(0.0, HALF[1], SHRINK)).any(), 0.0, worst)
 
     keys = jax.random.split(jax.random.key(1), tries)
     return float(jnp.max(jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=1000))(keys)))
