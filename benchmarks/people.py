@@ -2,7 +2,8 @@
 
 The recordings are those of ../shared/data/pedestrians: a corridor with one direction and one with two. Simulated people
 enter at the recorded times and places, and walk to where the recorded ones left. The law and its time gap are the
-same in both. Speed and spread of each recording are fitted to every other block of 10 s; figures are of the others.
+same in both. Each half of a recording, every other block of 10 s, is simulated with the speed and spread that fit the
+other half best; figures are of both halves together.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ DENSITIES = np.arange(0.5, 2.01, 0.25)
 """Borders of the bins of density [1/m2]."""
 BLOCK = 10.0
 """Duration of the blocks of time that are fitted and compared in turn [s]."""
+SPEEDS, SPREADS = np.arange(-0.08, 0.081, 0.04), np.arange(-0.06, 0.061, 0.06)
+"""What is tried around them [m/s]."""
 LEAST = 50
 """Moments that a bin must have in both."""
 
@@ -49,14 +52,10 @@ class Options:
 
     recordings: Path = Path("../shared/data/pedestrians/juelich_pedpy")
     """Folder of the recordings."""
-    fitted: bool = False
-    """Compare the blocks that were fitted; records nothing."""
-    fit: bool = False
-    """Compare speeds around those in use on the even blocks, and print them."""
 
 
 class Recording(NamedTuple):
-    """A corridor along x whose walls are at two y, and what its people were fitted to."""
+    """A corridor along x whose walls are at two y, and where the fit of its people's speeds begins."""
 
     file: str
     scale: float
@@ -215,51 +214,49 @@ def of_blocks(tracks: list[Track], odd: bool) -> list[Track]:
     return pieces
 
 
-def search(folder: Path) -> None:
-    """Print what fits the even blocks best."""
-    for name, recording in RECORDINGS.items():
-        tracks = read(folder, recording)
-        run, recorded = simulator(tracks, recording.walls), moving(of_blocks(tracks, False))[:, 4]
-        for speed in recording.speed + np.array([-0.04, 0.0, 0.04]):
-            for spread in recording.spread + np.array([-0.03, 0.0, 0.03]):
-                off = largest_gap(recorded, moving(of_blocks(run(speed, spread, GAP), False))[:, 4])
-                print(f"{name}: distance {off:.3f} at speed {speed:.2f}, spread {spread:.2f}", flush=True)
+def crossed(recording: Recording, tracks: list[Track]) -> list[Track]:
+    """Simulated tracks of both halves, each by what fits the other half best."""
+    run = simulator(tracks, recording.walls)
+    recorded = [moving(of_blocks(tracks, odd))[:, 4] for odd in (False, True)]
+    best: list[tuple[float, float, float, list[Track]]] = [(np.inf, 0.0, 0.0, [])] * 2
+    for speed in recording.speed + SPEEDS:
+        for spread in recording.spread + SPREADS:
+            simulated = run(speed, spread, GAP)
+            for odd in (False, True):
+                off = largest_gap(recorded[odd], moving(of_blocks(simulated, odd))[:, 4])
+                if off < best[odd][0]:
+                    best[odd] = off, speed, spread, of_blocks(simulated, not odd)
+    for (off, speed, spread, _), half in zip(best, ("even", "odd"), strict=True):
+        print(f"{recording.file}: {half} blocks are {off:.3f} apart at speed {speed:.2f}, spread {spread:.2f} m/s")
+    return [*best[False][3], *best[True][3]]
 
 
 def main(options: Options) -> None:
     """Compare and record."""
-    if options.fit:
-        search(options.recordings)
-        return
-    distance: dict[str, float] = {}
-    flow: dict[str, float] = {}
-    headway: dict[str, float] = {}
-    own: dict[str, float] = {}
+    found: dict[str, list[float]] = {"speed": [], "flow": [], "within": [], "headway": []}
     figures = {}
     for name, recording in RECORDINGS.items():
         tracks = read(options.recordings, recording)
-        simulated = simulator(tracks, recording.walls)(recording.speed, recording.spread, GAP)
-        recorded, simulated = (of_blocks(one, not options.fitted) for one in (tracks, simulated))
-        distance[name] = largest_gap(moving(recorded)[:, 4], moving(simulated)[:, 4])
+        simulated = crossed(recording, tracks)
+        recorded = [piece for odd in (False, True) for piece in of_blocks(tracks, odd)]
+        found["speed"].append(largest_gap(moving(recorded)[:, 4], moving(simulated)[:, 4]))
         errors = flow_errors(flows(recorded, recording.walls), flows(simulated, recording.walls))
-        flow |= {f"{name}, {bin} per m2": error for bin, error in errors.items()}
+        found["flow"] += map(abs, errors.values())
         times = headways(recorded), headways(simulated)
-        headway[name] = largest_gap(*times)
+        found["headway"].append(largest_gap(*times))
         parts = [moving(of_blocks(tracks, odd))[:, 4] for odd in (False, True)]
-        own[name] = largest_gap(*parts)
+        found["within"].append(largest_gap(*parts))
         flow_line = ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items())
-        print(f"{name}: {len(tracks)} people; speeds {distance[name]:.3f} apart (the recording's own two parts "
-              f"{own[name]:.3f}); headway median "
-              f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, {headway[name]:.3f} "
-              f"apart; flow {flow_line}", flush=True)  # fmt: skip
+        print(f"{name}: {len(tracks)} people; speeds {found['speed'][-1]:.3f} apart (the recording's own two halves "
+              f"{found['within'][-1]:.3f}); headway median "
+              f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, "
+              f"{found['headway'][-1]:.3f} apart; flow {flow_line}", flush=True)  # fmt: skip
         figures[f"people_headway_ratio_{name}"] = figure([float(np.median(times[1]) / np.median(times[0]))], "ratio")
-    if options.fitted:
-        return
     path = record("environment", CLAIM, {
-        "people_speed_distance": figure([max(distance.values())], "-"),
-        "people_flow_error": figure([max(map(abs, flow.values()))], "share"),
-        "people_speed_distance_within": figure([max(own.values())], "-"),
-        "people_headway_distance": figure([max(headway.values())], "-"),
+        "people_speed_distance": figure([max(found["speed"])], "-"),
+        "people_flow_error": figure([max(found["flow"])], "share"),
+        "people_speed_distance_within": figure([max(found["within"])], "-"),
+        "people_headway_distance": figure([max(found["headway"])], "-"),
         **figures,
     })  # fmt: skip
     print(f"-> {path}")

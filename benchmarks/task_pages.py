@@ -177,6 +177,7 @@ def worlds(task: Task, out: Path) -> None:
     from whill_mjx.env import make_env, reset_state
     from whill_mjx.look import top_view
     from whill_mjx.vehicle.kinematics import camera_pose
+    from whill_mjx.world.maps.walls import shown
     from whill_mjx.world.render import Quality, pinhole, render
 
     env, params = make_env(task, height=120, width=120)
@@ -186,16 +187,17 @@ def worlds(task: Task, out: Path) -> None:
         state = reset_state(env, params, key)
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
         lens = pinhole(env.model.spec.camera.fov_y, 240, 240)
-        seen = render(position, rotation, lens, state.scene, 240, 240, Quality(antialias=True, shadows=True))
+        scene = shown(state.scene, position, rotation, lens, 240)
+        seen = render(position, rotation, lens, scene, 240, 240, Quality(antialias=True, shadows=True))
         return seen, top_view(env, state), state.scene.marker.position[:2]
 
-    shown: list[np.ndarray] = []  # their goal is in the view from above
+    chosen: list[np.ndarray] = []  # their goal is in the view from above
     others: list[np.ndarray] = []
     for seed in range(50):
         seen, above, goal = (np.asarray(one) for one in draw(jax.random.key(seed)))
         column = np.hstack([seen, above, np.full((240, 8, 3), 255, np.uint8)])
-        (shown if 1.0 < goal[0] < 6.5 and abs(goal[1]) < 2.0 else others).append(column)
-    sheet = np.hstack([*shown, *others][:3])[:, :-8, ::-1]
+        (chosen if 1.0 < goal[0] < 6.5 and abs(goal[1]) < 2.0 else others).append(column)
+    sheet = np.hstack([*chosen, *others][:3])[:, :-8, ::-1]
     cv2.imwrite(str(out), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}")
 

@@ -22,6 +22,7 @@ from whill_mjx.tasks.starts import draw_start
 from whill_mjx.tasks.tasks import Task, make_task
 from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.ground import on_ground
 from whill_mjx.vehicle.kinematics import body_twist, camera_pose, reference_pose
 from whill_mjx.vehicle.model import VehicleModel, build_model
 from whill_mjx.vehicle.presets import preset_params
@@ -258,7 +259,7 @@ def reset_state(env: Env, params: VehicleParams, key: jax.Array) -> State:
     start = world.start
     if env.exploring_starts:
         start = draw_start(env.exploring_starts, env.task, env.model.spec, world, jax.random.fold_in(world_key, 0))
-    vehicle = place(env.model, params, start[0], start[1], start[2])
+    vehicle = place(env.model, on_ground(params, scene.ground), start[0], start[1], start[2])
     state = State(
         vehicle=vehicle,
         scene=scene,
@@ -312,7 +313,7 @@ def _control_period(
 ) -> tuple[State, Outcome]:
     """One control period, its reward and whether it ended the episode; an `unreadable` action () ends it."""
     task = env.task
-    vehicle = drive(env.model, params, state.vehicle, command)
+    vehicle = drive(env.model, on_ground(params, state.scene.ground), state.vehicle, command)
     vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
     scene, vehicle, collided = _stopped(env, state, vehicle)
     state = dataclasses.replace(state, scene=scene)

@@ -140,6 +140,12 @@ def check_kind(name: str, table: Mapping[str, Any], kinds: tuple[str, ...]) -> s
         PolicyFileError: of another kind or schema.
     """
     schema, kind = table.get("schema"), table.get("kind")
+    if schema == SCHEMA and kind == AGENT_KIND and AGENT_KIND not in kinds:
+        seen = parse_observation(Fields(name, table))
+        what = ", ".join(sorted(seen)) if isinstance(seen, dict) else f"one observation of shape {list(seen)}"
+        raise PolicyFileError(f"{name}: the policy is an agent that reads {what}; here a vehicle is driven by the "
+                              "camera image alone. Train with that observation, or run it with whill_mjx.evaluate or "
+                              "dreamer.policy.")
     if schema != SCHEMA or isinstance(schema, bool) or kind not in kinds:
         wanted = " or ".join(repr(known) for known in kinds)
         raise PolicyFileError(f"{name}: schema {show(schema)} of kind {show(kind)}; this bridge reads schema {SCHEMA} "

@@ -26,8 +26,10 @@ from whill_mjx.world.maps import (
     load_footprints,
     make_map_scene,
     map_scene_sampler,
+    read_map,
     shown,
 )
+from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
 from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
 from whill_mjx.world.render import camera_rotation, pinhole, render_frame
@@ -248,3 +250,27 @@ def test_the_command_writes_a_picture_and_the_walls(tmp_path):
     for words, message in ((["no.yaml"], "does not exist"), (["town.txt"], "unknown kind of map")):
         done = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 2 and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_floor_plans_of_a_seed_are_rooms_that_hang_together():
+    for seed in range(3):
+        made = make_map_scene(read_map(f"made:{seed}"))
+        free = np.sum(made.grid.cells == FREE)
+        assert np.array_equal(made.grid.cells, read_map(f"made:{seed}").cells)
+        assert made.space.sum() > 0.99 * free  # every room has a door
+        assert len(made.walls.segments) > 40
+    assert not np.array_equal(read_map("made:0").cells, read_map("made:1").cells)
+
+
+def test_maps_side_by_side_keep_their_walls_places_and_ways():
+    made = [make_map_scene(read_map(f"made:{seed}"), Reach(farthest=6.0)) for seed in (0, 1)]
+    group = side_by_side(made)
+    first = len(made[0].walls.segments)
+    np.testing.assert_allclose(group.walls.segments[first:] - group.shifts[1], made[1].walls.segments, atol=1e-4)
+    gap = group.walls.segments[first:, :, 0].min() - group.walls.segments[:first, :, 0].max()
+    assert gap == pytest.approx(GAP, abs=1e-3)
+    ways = group.ways(1.5, 10.0)
+    listed = ways.near[-1][ways.near[-1] >= 0]
+    places = ways.points.reshape(-1, 2)[listed]
+    assert len(listed) and np.all(np.hypot(*(places - ways.start[-1]).T) <= 10.0 + 1e-3)
+    assert side_by_side(made[:1]).walls is made[0].walls

@@ -10,6 +10,7 @@ from flax import struct
 
 from whill_mjx.env import Env, State
 from whill_mjx.vehicle.dynamics import place
+from whill_mjx.vehicle.ground import on_ground
 from whill_mjx.vehicle.kinematics import quaternion_from_angles, reference_pose, rotation_from_quaternion
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.scene import Scene
@@ -49,9 +50,10 @@ def begin_under(condition: Condition, env: Env, params: VehicleParams, state: St
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     x, y = x + condition.start_x, y + condition.start_y
     scene = _lit(condition, _with_obstacles(condition, state.scene, env.task.walls))
+    params, yaw = on_ground(params, scene.ground), yaw + jnp.deg2rad(condition.start_yaw_deg)
     return dataclasses.replace(
         state,
-        vehicle=place(env.model, params, x, y, yaw + jnp.deg2rad(condition.start_yaw_deg)),
+        vehicle=place(env.model, params, x, y, yaw),
         scene=scene,
         goal_distance=jnp.linalg.norm(env.task.goal(scene) - jnp.stack([x, y])),
     )

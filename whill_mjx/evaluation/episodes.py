@@ -18,6 +18,7 @@ from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.rollouts import CHANNELS, Rollout, View, rollout
 from whill_mjx.look import top_view
 from whill_mjx.vehicle.dynamics import place
+from whill_mjx.vehicle.ground import on_ground
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.randomize import randomize_params
 
@@ -139,7 +140,7 @@ class Course:
 
         def view(params: VehicleParams, key: jax.Array, scene: Any, row: jax.Array) -> jax.Array:
             state = reset_state(self.env, params, key)
-            vehicle = place(self.env.model, params, row[0], row[1], row[2])
+            vehicle = place(self.env.model, on_ground(params, state.scene.ground), row[0], row[1], row[2])
             return top_view(self.env, dataclasses.replace(state, scene=scene, vehicle=vehicle))
 
         if "views" not in self._compiled:

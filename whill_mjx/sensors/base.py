@@ -64,6 +64,8 @@ class Sensor:
     """By which `make_env(observations=...)` finds a sensor of this package."""
     visual: ClassVar[bool] = False
     """Whether it looks through the vehicle's camera, which evaluations move."""
+    noisy: ClassVar[bool] = False
+    """Whether `measure` has put the noise into its value itself."""
     mirrored: ClassVar[Callable[..., jax.Array] | None] = None
     """(value (..., *shape)) -> value in the world mirrored left to right; None: learners do not mirror."""
 
@@ -91,7 +93,7 @@ class Sensor:
         return ()
 
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
-        """Memory, and what is measured now, without noise."""
+        """Memory, and what is measured now; without noise, unless the sensor is `noisy`."""
         raise NotImplementedError(f"{type(self).__name__}.measure is missing; return (memory, value).")
 
     @property
@@ -142,7 +144,7 @@ def _finished(sensor: Sensor, reading: Reading, value: jax.Array, key: jax.Array
     if value.shape != reading.shape:
         raise ValueError(f"{type(sensor).__name__}: measured {value.shape}, but its reading says {reading.shape}. "
                          "Both must agree.")
-    if not sensor.noise:
+    if not sensor.noise or sensor.noisy:
         return value.astype(reading.dtype)
     value = value.astype(jnp.float32) + sensor.noise * jax.random.normal(key, value.shape)
     if np.issubdtype(reading.dtype, np.integer):

@@ -25,6 +25,7 @@ class Lidar(Sensor):
     """
 
     name: ClassVar[str] = "lidar"
+    noisy: ClassVar[bool] = True
 
     rays: int = 360
     fov: float = 2.0 * math.pi

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -14,8 +13,9 @@ from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import Task, World
-from whill_mjx.world.maps import MapScene, Reach, make_map_scene, map_scene_sampler, read_map
-from whill_mjx.world.maps.ways import Ways, draw_ways, people_near
+from whill_mjx.world.maps import Reach, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.world.maps.several import MapGroup, side_by_side
+from whill_mjx.world.maps.ways import Ways, people_near
 from whill_mjx.world.people.crowd import Crowd, People
 
 
@@ -33,7 +33,8 @@ class MapGoal(Task):
     goal_radius: float = 0.5
     smoothness_gain: float = 0.1
     map: str = ""
-    """nav2 map (.yaml), OpenStreetMap (.osm) or CityGML (.gml)."""
+    """nav2 map (.yaml), OpenStreetMap (.osm), CityGML (.gml), point cloud, mesh, or made:SEED for a floor plan of ours;
+    several with commas between them are drawn from in turn."""
     nearest: float = 3.0
     """Shortest way to a goal [m]."""
     farthest: float = 12.0
@@ -55,16 +56,16 @@ class MapGoal(Task):
 
 
 @lru_cache(maxsize=8)
-def _made(path: str, nearest: float, farthest: float) -> MapScene:
-    return make_map_scene(read_map(Path(path)), Reach(nearest=nearest, farthest=farthest))
+def _made(paths: str, nearest: float, farthest: float) -> MapGroup:
+    reach = Reach(nearest=nearest, farthest=farthest)
+    return side_by_side([make_map_scene(read_map(path.strip()), reach) for path in paths.split(",")])
 
 
 @lru_cache(maxsize=8)
-def _sampler(path: str, nearest: float, farthest: float) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
-    return map_scene_sampler(_made(path, nearest, farthest))
+def _sampler(paths: str, nearest: float, farthest: float) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
+    return map_scene_sampler(_made(paths, nearest, farthest))
 
 
 @lru_cache(maxsize=8)
-def _ways(path: str, nearest: float, farthest: float, within: float) -> Ways:
-    made = _made(path, nearest, farthest)
-    return draw_ways(made.grid, made.space, made.places.start, Crowd().clear, within)
+def _ways(paths: str, nearest: float, farthest: float, within: float) -> Ways:
+    return _made(paths, nearest, farthest).ways(Crowd().clear, within)

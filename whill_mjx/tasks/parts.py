@@ -58,7 +58,7 @@ def room(half: float, height: float = 2.0) -> Boxes:
     ])
 
 
-def make_marker(x: Any, y: Any, size: float, height: float, yaw: Any = None) -> Marker:
+def make_marker(x: Any, y: Any, size: float, height: Any, yaw: Any = None) -> Marker:
     """Blue square of edge `size`, its centre `height` above the ground; it faces -x at yaw 0."""
     position = jnp.stack([jnp.asarray(value, float) for value in (x, y, height)])
     yaw = jnp.zeros(()) if yaw is None else jnp.asarray(yaw, float)

@@ -10,13 +10,14 @@ in the direction of the ground's normal there, so no kerb or step can be climbed
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.vehicle.types import World
+from whill_mjx.vehicle.types import VehicleParams, World
 
 
 @struct.dataclass
@@ -67,6 +68,11 @@ def axes_along(normal: jax.Array) -> jax.Array:
         normal[0] * forward[1] - normal[1] * forward[0],
     ])  # fmt: skip
     return jnp.stack([forward, left, normal])
+
+
+def on_ground(params: VehicleParams, ground: tuple) -> VehicleParams:
+    """Parameters of a vehicle in a room with these surfaces, behind the effects of its own."""
+    return dataclasses.replace(params, effects=(*params.effects, *ground)) if ground else params
 
 
 def plane_under(

@@ -46,19 +46,20 @@ class Obstacles:
     boxes: Boxes
     stadiums: Stadiums
     field: DistanceField | None = None
+    walls: Stadiums | None = None  # of radius 0, whose contact costs far less
 
 
 def obstacles_of(scene: Scene, x, y) -> Obstacles:
     """Everything near (x, y) that a vehicle can run into: boxes, the walls of a map, cylinders, capsules and people."""
-    boxes, parts = scene.boxes, []
+    boxes, walls, parts = scene.boxes, None, []
     if scene.walls is not None:
         fixed = boxes.mask.shape[0] - scene.walls.keep  # the rest are pictures of walls
         boxes = jax.tree.map(lambda leaf: leaf[:fixed], boxes)
-        parts.append(near_walls(scene.walls, x, y))
+        walls = near_walls(scene.walls, x, y)
     if scene.solids is not None and scene.solids.rounds is not None:
         parts.append(from_above(scene.solids.rounds))
     none = Stadiums(jnp.zeros((0, 2)), jnp.zeros((0, 2)), jnp.zeros(0), jnp.zeros(0), jnp.zeros(0, bool))
-    return Obstacles(boxes, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), none, *parts))
+    return Obstacles(boxes, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), none, *parts), walls=walls)
 
 
 def near_walls(walls, x, y) -> Stadiums:
@@ -83,18 +84,8 @@ def distances(vehicle: Footprint, stadiums: Stadiums) -> jax.Array:
 
     Two disjoint convex shapes without round parts are closest at a corner of one of them.
     """
-    c, s = jnp.cos(vehicle.yaw), jnp.sin(vehicle.yaw)
-
-    def own(points):
-        dx, dy = points[:, 0] - vehicle.x, points[:, 1] - vehicle.y
-        return jnp.stack([dx * c + dy * s, dy * c - dx * s], -1)
-
-    start, end = own(stadiums.start), own(stadiums.end)
-    middle, reach = (start + end) / 2, (end - start) / 2
+    start, end, crosses = _in_frame(vehicle, stadiums)
     a, b = vehicle.half_length, vehicle.half_width
-    crosses = (jnp.abs(middle[:, 0]) <= a + jnp.abs(reach[:, 0])) & (jnp.abs(middle[:, 1]) <= b + jnp.abs(reach[:, 1]))
-    turned = jnp.abs(middle[:, 0] * reach[:, 1] - middle[:, 1] * reach[:, 0])
-    crosses &= turned <= a * jnp.abs(reach[:, 1]) + b * jnp.abs(reach[:, 0])
 
     def to_rectangle(points):
         out = jnp.maximum(jnp.abs(points) - jnp.stack([a, b]), 0.0)
@@ -111,6 +102,22 @@ def distances(vehicle: Footprint, stadiums: Stadiums) -> jax.Array:
     return jnp.where(crosses, 0.0, apart) - stadiums.radius
 
 
+def _in_frame(vehicle: Footprint, stadiums: Stadiums) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Both ends (M, 2) [m] of each axis in the vehicle's frame, and whether the axis meets the rectangle (M,)."""
+    c, s = jnp.cos(vehicle.yaw), jnp.sin(vehicle.yaw)
+
+    def own(points):
+        dx, dy = points[:, 0] - vehicle.x, points[:, 1] - vehicle.y
+        return jnp.stack([dx * c + dy * s, dy * c - dx * s], -1)
+
+    start, end = own(stadiums.start), own(stadiums.end)
+    middle, reach = (start + end) / 2, (end - start) / 2
+    a, b = vehicle.half_length, vehicle.half_width
+    crosses = (jnp.abs(middle[:, 0]) <= a + jnp.abs(reach[:, 0])) & (jnp.abs(middle[:, 1]) <= b + jnp.abs(reach[:, 1]))
+    turned = jnp.abs(middle[:, 0] * reach[:, 1] - middle[:, 1] * reach[:, 0])
+    return start, end, crosses & (turned <= a * jnp.abs(reach[:, 1]) + b * jnp.abs(reach[:, 0]))
+
+
 def touches(vehicle: Footprint, obstacles: Obstacles) -> jax.Array:
     """() bool: does the vehicle touch anything?"""
     hit = jnp.any(overlaps(vehicle, obstacles.boxes))
@@ -118,6 +125,9 @@ def touches(vehicle: Footprint, obstacles: Obstacles) -> jax.Array:
     if stadiums.mask.shape[0]:
         met = (distances(vehicle, stadiums) <= 0.0) & stadiums.mask & (stadiums.low < vehicle.height)
         hit |= jnp.any(met)
+    walls = obstacles.walls
+    if walls is not None:
+        hit |= jnp.any(_in_frame(vehicle, walls)[2] & walls.mask & (walls.low < vehicle.height))
     if obstacles.field is not None:
         hit |= jnp.any(distance_at(obstacles.field, border(vehicle)) <= 0.0)
     return hit
@@ -174,10 +184,10 @@ def free_distance(vehicle: Footprint, scene: Scene) -> jax.Array:
     Inf without any; of a map, walls within reach count (`near_walls`).
     """
     obstacles = obstacles_of(scene, vehicle.x, vehicle.y)
-    stadiums = obstacles.stadiums
-    to_boxes = clearance(vehicle, obstacles.boxes)
-    if not stadiums.mask.shape[0]:
-        return to_boxes
-    there = stadiums.mask & (stadiums.low < vehicle.height)
-    apart = jnp.where(there, jnp.maximum(distances(vehicle, stadiums), 0.0), jnp.inf)
-    return jnp.minimum(to_boxes, jnp.min(apart))
+    least = clearance(vehicle, obstacles.boxes)
+    for stadiums in (obstacles.stadiums, obstacles.walls):
+        if stadiums is not None and stadiums.mask.shape[0]:
+            there = stadiums.mask & (stadiums.low < vehicle.height)
+            apart = jnp.where(there, jnp.maximum(distances(vehicle, stadiums), 0.0), jnp.inf)
+            least = jnp.minimum(least, jnp.min(apart))
+    return least

@@ -78,7 +78,9 @@ def first_hits(
     if boxes.mask.shape[0]:
         nearest = jnp.minimum(nearest, _to_boxes(boxes, x, y, angle, height))
     if scene.solids is not None and scene.solids.rounds is not None:
-        nearest = jnp.minimum(nearest, _to_rounds(scene.solids.rounds, x, y, angle, height))
+        origin = jnp.stack([x, y, jnp.full(x.shape, height)], -1)
+        way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(angle.shape)], -1)
+        nearest = jnp.minimum(nearest, round_hits(scene.solids.rounds, origin, way).min(-1, initial=jnp.inf))
     if field is not None:
         nearest = jnp.minimum(nearest, trace(field, x, y, angle, farthest))
     return nearest
@@ -101,10 +103,12 @@ def _to_boxes(boxes: Boxes, x, y, angle, height) -> jax.Array:
     return jnp.min(jnp.where((enter <= leave) & cut, enter, jnp.inf), -1, initial=jnp.inf)
 
 
-def _to_rounds(rounds: Rounds, x, y, angle, height) -> jax.Array:
-    """(R,) m to the first cylinder or capsule: the quadratic of its mantle, and its ends."""
-    out = jnp.stack([x, y, jnp.full(x.shape, height)], -1)[:, None] - rounds.centre  # (R, K, 3)
-    way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(angle.shape)], -1)[:, None]
+def round_hits(rounds: Rounds, origin: jax.Array, way: jax.Array) -> jax.Array:
+    """(R, K) m from places (R, 3) along unit vectors (R, 3) to each cylinder or capsule, inf where a ray misses it.
+
+    By the quadratic of the mantle, and the ends.
+    """
+    out, way = origin[:, None] - rounds.centre, way[:, None]  # (R, K, 3), (R, 1, 3)
     along = jnp.sum(out * rounds.axis, -1)
     slope = jnp.sum(way * rounds.axis, -1)
     square, half = rounds.radius**2, rounds.half
@@ -130,7 +134,7 @@ def _to_rounds(rounds: Rounds, x, y, angle, height) -> jax.Array:
     aside = jnp.sum(out**2, -1) - along**2
     inside = jnp.where(rounds.capsule, aside + beyond**2 <= square, (aside <= square) & (beyond == 0.0))
     nearest = jnp.where(inside, 0.0, jnp.minimum(jnp.minimum(hits[0], hits[1]), hits[2]))
-    return jnp.min(jnp.where(rounds.mask, nearest, jnp.inf), -1, initial=jnp.inf)
+    return jnp.where(rounds.mask, nearest, jnp.inf)
 
 
 def trace(field: DistanceField, x, y, angle, farthest) -> jax.Array:

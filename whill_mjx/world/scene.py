@@ -94,6 +94,7 @@ class Scene:
     walls: MapWalls | None = struct.field(pytree_node=False, default=None)  # of a map: seen and hit
     ghosts: Boxes | None = None  # upright boxes that are seen, but nothing collides with them
     hidden: jax.Array | None = None  # (P,) bool: boxes that are hit but not seen, for something else shows them
+    ground: tuple = ()  # surfaces on it (`whill_mjx.effects.base.Surface`) that lift the vehicle; `solids` show them
     people: People | None = None  # who walk; `solids` has their shapes, behind all other rounds
     rich: Any = None  # materials, lights and film of `whill_mjx.world.rich`; they replace colours, looks and finish
 

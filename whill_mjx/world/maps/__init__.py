@@ -8,9 +8,11 @@ grid        occupancy grid, borders of the free space
 straight    long straight walls from the borders of cells
 field       distance to the nearest thing
 walls       which walls rays meet and a camera sees
+made        floor plans of a seed
 places      starts and goals with a way between them
 ways        where people walk
 playable    all that as the world of an episode
+several     maps side by side in one world
 """
 
 from whill_mjx.world.maps.field import DistanceField, distance_at, distance_field, map_clearance

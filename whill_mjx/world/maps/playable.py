@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,12 @@ import numpy as np
 
 from whill_mjx.world.maps.footprints import load_footprints
 from whill_mjx.world.maps.grid import GridMap
+from whill_mjx.world.maps.made import made_plan
 from whill_mjx.world.maps.nav2 import load_map
 from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
 from whill_mjx.world.maps.surfaces import CLOUDS, MESHES, load_surfaces
-from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.maps.walls import SHOWN, map_walls
 from whill_mjx.world.scene import MapWalls, Marker, Scene, default_looks, no_boxes
 
 BLUE = (0.04, 0.16, 0.90)
@@ -42,8 +44,12 @@ class MapScene:
 def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap:
     """Occupancy grid of a map of any known kind, by the ending of its name.
 
-    Footprints, point clouds and meshes get cells of `cell` [m]; `scale` is metres per unit of the last two.
+    "made:7" is the floor plan of seed 7. Footprints, point clouds and meshes get cells of `cell` [m]; `scale` is metres
+    per unit of the last two.
     """
+    made, _, seed = str(path).partition("made:")
+    if not made and seed.isdecimal():
+        return made_plan(int(seed))
     ending = Path(path).suffix.lower()
     if ending in (*CLOUDS, *MESHES):
         return load_surfaces(path, cell, scale)
@@ -52,10 +58,10 @@ def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap
     if ending in (".yaml", ".yml"):
         return load_map(path)
     raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml, "
-                     f"{', '.join(dict.fromkeys((*CLOUDS, *MESHES)))}). Give one of them.")
+                     f"{', '.join(dict.fromkeys((*CLOUDS, *MESHES)))}). Give one of them, or made:SEED.")
 
 
-def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, seed: int = 0) -> MapScene:
+def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN, seed: int = 0) -> MapScene:
     """Walls and places of a grid.
 
     Args:
@@ -80,8 +86,11 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = 64, se
     return MapScene(grid, space, map_walls(straight_walls(grid, space), keep), places)
 
 
-def map_scene_sampler(made: MapScene) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:
-    """Function of a key that draws the scene and the start (3,) [m, m, rad] of an episode; pure, of one instance."""
+def map_scene_sampler(made: Any) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:
+    """Function of a key that draws the scene and the start (3,) [m, m, rad] of an episode; pure, of one instance.
+
+    `made` is a `MapScene`, or a group of them (`whill_mjx.world.maps.several`).
+    """
     starts, goals = made.places.start.astype(np.float32), made.places.goal.astype(np.float32)
 
     def sample(key: jax.Array) -> tuple[Scene, jax.Array]:

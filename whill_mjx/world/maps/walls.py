@@ -15,6 +15,12 @@ import numpy as np
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.scene import Boxes, MapWalls, Scene
 
+CLOSE = 1e-3
+"""Depth at which a wall beside the camera is cut off [m]."""
+UNROLL = 16
+"""Walls tested in one round of a loop."""
+SHOWN = 40
+"""Walls that an image shows at most: in four real maps, 0.05 % of the columns of 64 see others."""
 SQUARE, NEAR = 0.5, 1.2
 """Edge of the squares that have lists of their walls, and how near a wall has to be: a wheelchair and a step [m]."""
 THICKNESS = 0.002
@@ -37,6 +43,63 @@ def cast(segments: jax.Array, x, y, angles: jax.Array) -> tuple[jax.Array, jax.A
     distance = jnp.where(met, distance, jnp.inf)
     index = jnp.argmin(distance, -1)
     return jnp.min(distance, -1), index
+
+
+def first_walls(segments: jax.Array, x: jax.Array, y: jax.Array, angles: jax.Array) -> jax.Array:
+    """Index (R,) int32 of the wall that each ray from a place x, y meets first, for the columns of an image.
+
+    A processor takes the walls in rounds, of which XLA makes one loop, with bearings as slopes: less than half a turn
+    may lie between the rays. Of two walls that are equally far to 1 in 1,000 it may take either.
+    """
+
+    def in_rounds(segments, x, y, angles):
+        facing = jnp.arctan2(jnp.sin(angles).sum(), jnp.cos(angles).sum())
+        slopes = jnp.tan(angles - facing)
+        bits = max(1, (segments.shape[0] - 1).bit_length())
+        table = _by_slope(segments, x, y, facing)
+        rounds = max(2, -(-segments.shape[0] // UNROLL))  # XLA unrolls a loop of one round
+        unseen = jnp.array([jnp.inf, -jnp.inf, 0.0, 0.0, 0.0])
+        rest = jnp.broadcast_to(unseen, (rounds * UNROLL - segments.shape[0], 5))
+        table = jax.lax.optimization_barrier(jnp.concatenate([table, rest]))
+
+        def one_round(number, key):
+            part = jax.lax.dynamic_slice(table, (number * UNROLL, 0), (UNROLL, 5))
+            for row in range(UNROLL):
+                low, high, slope, near, change = part[row]
+                word = jax.lax.bitcast_convert_type(near + change * (slopes - slope), jnp.int32)
+                word = (word & ~((1 << bits) - 1)) | (number * UNROLL + row)
+                key = jnp.maximum(key, jnp.where((slopes >= low) & (slopes <= high), word, 0))
+            return key
+
+        key = jax.lax.fori_loop(0, rounds, one_round, jnp.zeros(angles.shape, jnp.int32))
+        return key & ((1 << bits) - 1)
+
+    def at_once(segments, x, y, angles):
+        return cast(segments, x, y, angles)[1].astype(jnp.int32)
+
+    return jax.lax.platform_dependent(segments, x, y, angles, cpu=in_rounds, default=at_once)
+
+
+def _by_slope(segments: jax.Array, x: jax.Array, y: jax.Array, facing: jax.Array) -> jax.Array:
+    """Walls (S, 5) as a place sees them that looks along `facing`: where slopes begin and end, and inverse depth.
+
+    The inverse depth is even in the slope, the bearing's tangent: `near + change * (its slope - slope)`.
+    """
+    off = segments - jnp.stack([x, y])
+    c, s = jnp.cos(facing), jnp.sin(facing)
+    deep, aside = off[..., 0] * c + off[..., 1] * s, off[..., 1] * c - off[..., 0] * s  # (S, 2)
+    rise = deep[:, 1] - deep[:, 0]
+    share = jnp.clip((CLOSE - deep[:, 0]) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise), 0.0, 1.0)
+    cut = (aside[:, 0] + share * (aside[:, 1] - aside[:, 0]))[:, None]  # where a wall passes beside the place
+    behind = deep < CLOSE
+    near = 1.0 / jnp.where(behind, CLOSE, deep)
+    slope = jnp.where(behind, cut, aside) * near
+    seen = ~behind.all(1)
+    low, high = jnp.where(seen, slope.min(1), jnp.inf), jnp.where(seen, slope.max(1), -jnp.inf)
+    width = slope[:, 1] - slope[:, 0]
+    edge = jnp.abs(width) < 1e-9  # it is seen end on
+    change = jnp.where(edge, 0.0, (near[:, 1] - near[:, 0]) / jnp.where(edge, 1.0, width))
+    return jnp.stack([low, high, slope[:, 0], near[:, 0], change], -1)
 
 
 def most_seen(index: jax.Array, keep: int) -> tuple[jax.Array, jax.Array]:
@@ -104,7 +167,7 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     if walls is None:
         return scene
     segments = jnp.asarray(walls.segments)
-    _, index = cast(segments, position[0], position[1], column_angles(rotation, intrinsics, width))
+    index = first_walls(segments, position[0], position[1], column_angles(rotation, intrinsics, width))
     index, mask = most_seen(index, walls.keep)
     fixed = scene.boxes.mask.shape[0] - walls.keep
     drawn = wall_boxes(segments, index, mask, walls.height, scene.boxes.colour[fixed])
@@ -112,7 +175,7 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     return dataclasses.replace(scene, boxes=boxes)
 
 
-def map_walls(segments: np.ndarray, keep: int = 64, height: float = 2.2) -> MapWalls:
+def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2) -> MapWalls:
     """Walls (S, 2, 2) [m] of a map, of which an image shows `keep` at most, with the lists of those within reach.
 
     A list holds every wall within `NEAR` of any place in its square; the lists are as long as the longest of them.

@@ -70,7 +70,9 @@ def walk_around(
     mover = mover_of(before, after, duration)
     walked = walk(people, near_in(scene_without_people(scene)), mover, duration)
     first = body.ends_of(body.own_rounds(solids, people))
-    last = body.skeleton(walked)
+    # The barriers keep XLA from computing the walk and the contacts again for each thing that needs them.
+    walked = jax.lax.optimization_barrier(walked)
+    last = jax.lax.optimization_barrier(body.skeleton(walked))
     radius = people.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
     turn = duration * mover.yaw_rate
 
@@ -111,6 +113,7 @@ def walk_around(
     collided = ran_into.any()
     share = jnp.min(jnp.where(ran_into, high, 1.0), initial=1.0)
     kept = jnp.where(touched, jnp.minimum(low, share), share)  # (N,) how far each person gets
+    kept, touched, ran_into = jax.lax.optimization_barrier((kept, touched, ran_into))
     people_after = _between(people, walked, kept, touched & ~ran_into)
     start, end = (a + kept[:, None, None] * (b - a) for a, b in zip(first, last, strict=True))
     solids_after = body.moved(solids, people_after, start, end)
