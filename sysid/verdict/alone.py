@@ -4,7 +4,7 @@ The noise is then only what the base model leaves of the drives themselves, so n
 Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
 be a lucky correlate of something else. It is named where it predicts blocks of drives that were held back: the 95 %
 interval of its gain there lies above 0. Effects are added one after the other as long as that holds. Of effects that
-are not separated the simplest is named.
+predict these blocks as well as the best, the one with the fewest parameters is named.
 
 Where there is no odometry either, nothing shows whether wheels fell short of the command or the vehicle of its wheels,
 while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
@@ -23,6 +23,7 @@ from sysid.missing.days import Wander
 from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
+from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.found import LARGEST, Search, Thresholds, missing
 from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
@@ -51,16 +52,18 @@ def search_alone(
         return _said(asked, found, NOTHING)
     against, unseen = "what stands out in a linear scan does not hold in a refit", False
     for _ in range(thresholds.rounds):
-        likely = [one for one in candidates_of(asked, found, found.final, far) if one.p < thresholds.alpha]
-        standing = [one for one in likely if held_back(asked, one.refit)[0] > 0]
+        candidates = candidates_of(asked, found, found.final, far)
+        likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
+        standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
         if not standing:
             if likely:
-                against = (f"{likely[0].hypothesis.effect} stands out, but does not predict blocks of drives that were "
-                           "held back")
+                first = likely[0][0].hypothesis.effect
+                against = f"{first} stands out, but does not predict blocks of drives that were held back"
             break
-        members = class_of(asked, standing[0], found.rounds[-1])
-        taken_on = min((one for one in standing if one.hypothesis.effect in members),
-                       key=lambda one: (len(one.hypothesis.axes), -one.gain))
+        best, most = max(standing, key=lambda one: float(one[1].sum()))
+        as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
+        taken_on = min(as_good, key=lambda one: len(one.hypothesis.axes))
+        members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
         mine = taken_on.hypothesis.effect
         unseen = not wheels and not card_of(mine).shown_by_pose
         if unseen:
@@ -68,7 +71,7 @@ def search_alone(
             break
         found.accepted.append(replace(taken_on, own=True))
         taken = {one.hypothesis.effect for one in found.accepted}
-        found.classes.append([mine, *(name for name in members if name not in taken)][:LARGEST])
+        found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
         found.final, found.share = taken_on.refit, taken_on.share
     if found.accepted:
         found.verdict = "named"

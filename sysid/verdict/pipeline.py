@@ -85,7 +85,9 @@ def find_missing(
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, usual.wander.p_excess))
+        # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
+        p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
+        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}

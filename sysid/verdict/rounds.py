@@ -258,7 +258,7 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
         one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
         if (one.p >= thresholds.alpha or asked.explained(fit) - asked.explained(other) < thresholds.step
                 or disagreement(fit, fit.parts[-1], asked.evidence.groups, refitter.precision) > thresholds.differ
-                or held_back(asked, fit)[0] <= 0):
+                or interval_of_sum(held_back(asked, fit))[0] <= 0):
             return
         members.append(replace(one, own=True))
     members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
@@ -268,9 +268,9 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
     found.together = max(pairs.p_family, *(one.p for one in members))
 
 
-def held_back(asked: Asked, fit: Refit) -> tuple[float, float]:
-    """95 % interval of what the last effect of a joint fit gains in manoeuvres that it was not fitted to."""
-    return interval_of_sum(foretold(fit, fit.parts[-1], asked.evidence.groups, asked.refitter.precision))
+def held_back(asked: Asked, fit: Refit) -> np.ndarray:
+    """(G,) what the last effect of a joint fit gains in each manoeuvre, fitted to the others."""
+    return foretold(fit, fit.parts[-1], asked.evidence.groups, asked.refitter.precision)
 
 
 def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> list[str]:

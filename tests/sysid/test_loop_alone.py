@@ -102,30 +102,36 @@ def test_an_effect_of_the_wheels_has_a_name_only_where_the_wheels_were_seen(plac
     assert ("log their speeds" in found.reason) == (result == "unexplained")
 
 
-def test_of_effects_that_are_not_told_apart_the_simplest_is_named(monkeypatch):
+@pytest.mark.parametrize(("gains", "result"), [
+    ([(9.0, 11.0, 10.0), (8.0, 11.0, 10.0), (2.0, 2.0, 2.0)], "command_delay"),  # as good, and simpler
+    ([(9.0, 11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "acceleration_limit"),  # surely better
+    ([(9.0, -11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "command_delay"),  # wrong about a block
+])
+def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(monkeypatch, gains, result):
     def candidate(effect, axes, gain):
         one = Hypothesis(effect, tuple(Axis(f"{effect}.{i}", 1.0) for i in range(axes)))
-        return Candidate(one, gain, 1e-4, 1.0, asked.base)
+        return Candidate(one, gain, 1e-4, 1.0, replace(base, cost=gain))
 
     evidence = drives(np.zeros(4))
     linear = Linear(evidence)
     base = linear.fit((), None)
     asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(rounds=1), base,
                   SimpleNamespace(p_family=0.0), np.eye(4))
-    ramp, delay, other = (candidate(*each) for each in (
-        ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0)))
+    listed = [candidate(*each) for each in (
+        ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0))]
+    told = dict(zip((60.0, 50.0, 20.0), gains, strict=True))
 
-    def listed(asked, found, *_):
-        found.rounds.append([ramp, delay, other])
-        return found.rounds[-1]
+    def candidates_of(asked, found, *_):
+        found.rounds.append(listed)
+        return listed
 
     monkeypatch.setattr(alone, "begin", lambda *_: (asked, None))
-    monkeypatch.setattr(alone, "candidates_of", listed)
-    monkeypatch.setattr(alone, "held_back", lambda *_: (1.0, 2.0))
-    monkeypatch.setattr(alone, "class_of", lambda *_: ["acceleration_limit", "command_delay"])
+    monkeypatch.setattr(alone, "candidates_of", candidates_of)
+    monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
+    monkeypatch.setattr(alone, "class_of", lambda asked, best, _: [best.hypothesis.effect])
     found = search_alone(evidence, EFFECTS, linear, asked.wander, asked.thresholds)
-    assert named(found) == ("named", ["command_delay"])
-    assert found.classes == [["command_delay", "acceleration_limit"]]
+    assert named(found) == ("named", [result])
+    assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():
