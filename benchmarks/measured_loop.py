@@ -8,10 +8,11 @@ names none. Each rung is scored on steps that were never fitted, with all parame
 of the named effect alone: the rest is gained by base parameters that moved beside it. `laws` (`measured_laws`): what
 each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
-asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one, and what is held out
-of them is predicted by the reference vehicle with that change alone. `floors` asks the same of gyro and wheels without
-a model, and of halves of one run how often that is false. `mrclam` (five nearly ideal robots): verdicts with
-the base model's delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
+asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one. Each third of a run
+is then predicted by the reference vehicle with what a floor sets fitted to the other two, and by that vehicle itself.
+`floors` asks the same of gyro and wheels without a model, and of halves of one run how often that is false. `mrclam`
+(five nearly ideal robots): verdicts with the base model's delay held at 0; one with an effect of another class, or
+larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
 """
@@ -36,7 +37,7 @@ from benchmarks.measured_laws import ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
-from sysid.logs.lost_pose import without_lost
+from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.pose_lag import pose_lag
@@ -348,7 +349,7 @@ def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> Flo
 def asphalt_vehicle(settings: Benchmark) -> Prepared:
     """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
     config = change_config(settings)
-    asphalt = drive_log(settings, ("asphalt",))
+    asphalt = run_log(settings, RUNS[0])
     reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
                               start=floor_start(asphalt))
     return prepare(reference, asphalt.spec, config)
@@ -367,18 +368,21 @@ def floor_start(log: Log) -> Any:
     return set_values(start, [PARAMETER], jnp.array([0.0 if lag is None else lag.delay]))
 
 
-def one_change(settings: Benchmark, name: str, log: Log, ready: Callable[[], Prepared]) -> dict[str, Any]:
-    """What changed from the reference to a log, with held-out errors of the reference vehicle, and of it on the other
-    floor: only the members of that change moved."""
+def one_change(settings: Benchmark, name: str, run: str, ready: Callable[[], Prepared]) -> dict[str, Any]:
+    """What changed from the reference to a run, with the errors of the reference vehicle, and of it on the other floor,
+    in each third of the run that was held back."""
     done = kept(settings, name)
     if done is not None:
         return done
-    result = find_missing(log, config=change_config(settings), reference=ready(),
+    result = find_missing(run_log(settings, run), config=change_config(settings), reference=ready(),
                           progress=lambda _, text: print(f"  {name}: {text}", flush=True))
-    found, held = verdict_of(result), log.held_out
-    found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
-    found["before"] = errors(held, replay(result, result.reference.params, held))
-    found["after"] = errors(held, replay(result, on_other_floor(result), held))
+    found = {**verdict_of(result), "ideal": {}, "before": {}, "after": {}}
+    for third in range(3):
+        fold = replace(result, log=run_log(settings, run, third))
+        held = fold.log.held_out
+        found["ideal"] |= errors(held, [ideal_replay(trial) for trial in held])
+        for which, vehicle in (("before", result.reference.params), ("after", on_other_floor(fold))):
+            found[which] |= errors(held, replay(result, vehicle, held))
     return keep(settings, name, found)
 
 
@@ -388,7 +392,7 @@ def change(settings: Benchmark) -> None:
     figures: dict[str, Any] = {}
     named = 0
     for name in ("warthog_gravel", "warthog_sand_1", "warthog_sand_2"):
-        loop = one_change(settings, f"from_asphalt_to_{name}", run_log(settings, name), ready)
+        loop = one_change(settings, f"from_asphalt_to_{name}", name, ready)
         report([loop])
         trials, short = list(loop["before"]), name.removeprefix("warthog_")
         for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
@@ -404,10 +408,16 @@ def change(settings: Benchmark) -> None:
     record("measured", CLAIM, figures, replacing="changed_")
 
 
-def run_log(settings: Benchmark, run: str) -> Log:
-    """Steps of one run, its last third held out."""
+def run_log(settings: Benchmark, run: str, held_out: int | None = None) -> Log:
+    """Steps of one run, one of its thirds held out or none. Training ones whose outside pose was lost keep their gyro
+    and wheels, which show the floor."""
     log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", (run,), chained=True)
-    return thin(without_lost(split(log, (f"{run}:0-0.667",), (f"{run}:0.667-1",))), settings.windows)
+    third, gone = 3 * np.arange(len(log.trials)) // len(log.trials), lost(log)
+    trials = tuple(
+        replace(trial, held_out=bool(k == held_out),
+                ground_truth=None if trial.name in gone and k != held_out else trial.ground_truth)
+        for trial, k in zip(log.trials, third, strict=True))
+    return thin(replace(log, trials=trials), settings.windows)
 
 
 def is_false(loop: dict[str, Any], fastest: float) -> bool:
