@@ -33,7 +33,7 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
-from benchmarks.measured_laws import ablate, make_bench
+from benchmarks.measured_laws import STARTS, ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
@@ -68,8 +68,6 @@ MANY = 10**6  # steps: all
 TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
 SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
 DEAD = {"command_dead_zone"}
-FLOOR_MODEL = ("turn_efficiency", "turn_lag", "pose_delay")
-"""What the base model of `change` has besides the physical preset."""
 LAWS = {"motor_line", "turn_lag", "turn_efficiency_speed", "turning_slip", "side_slip"}
 LONGEST, LARGEST = 0.3, 0.1
 """Delay [s] and share of the speed beyond which a verdict on a nearly ideal robot is false."""
@@ -91,6 +89,8 @@ class Benchmark:
     """Windows of 15 s of each robot of mrclam."""
     rounds: Annotated[int, COUNT] = 3
     """Loops at most, one after the other."""
+    floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "pose_delay")
+    """Effects that the base model of `change` has besides the physical preset."""
     physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
     quick: bool = False
@@ -351,7 +351,7 @@ def asphalt_vehicle(settings: Benchmark) -> Prepared:
     config = change_config(settings)
     asphalt = run_log(settings, RUNS[0])
     reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
-                              start=floor_start(asphalt))
+                              start=floor_start(settings, asphalt))
     return prepare(reference, asphalt.spec, config)
 
 
@@ -360,12 +360,14 @@ def change_config(settings: Benchmark) -> LoopConfig:
     return LoopConfig(physics_dt=settings.physics_dt, quick=settings.quick, held=(PARAMETER,))
 
 
-def floor_start(log: Log) -> Any:
+def floor_start(settings: Benchmark, log: Log) -> Any:
     """The base model with what turns a skid-steered robot, how late, and how late its outside pose is."""
-    start = with_effects(preset_params(log.spec, "physical"), FLOOR_MODEL)
+    start = with_effects(preset_params(log.spec, "physical"), settings.floor_model)
+    begun = {f"{law}.{field}": value for law in settings.floor_model for field, value in STARTS.get(law, {}).items()}
     trials = log.training
     lag = pose_lag(trials, [part.tolist() for part in np.array_split(np.arange(len(trials)), 8)], yaw_rates(log))
-    return set_values(start, [PARAMETER], jnp.array([0.0 if lag is None else lag.delay]))
+    begun[PARAMETER] = 0.0 if lag is None else lag.delay
+    return set_values(start, list(begun), jnp.array(list(begun.values())))
 
 
 def one_change(settings: Benchmark, name: str, run: str, ready: Callable[[], Prepared]) -> dict[str, Any]:
