@@ -62,13 +62,15 @@ def search_alone(
             break
         best, most = max(standing, key=lambda one: float(one[1].sum()))
         as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
-        taken_on = min(as_good, key=lambda one: len(one.hypothesis.axes))
-        members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
-        mine = taken_on.hypothesis.effect
-        unseen = not wheels and not card_of(mine).shown_by_pose
+        shown = [one for one in as_good if wheels or card_of(one.hypothesis.effect).shown_by_pose]
+        unseen = not shown
         if unseen:
-            against = f"{mine} stands out, but without odometry nothing shows what the wheels did: log their speeds"
+            first = best.hypothesis.effect
+            against = f"{first} stands out, but without odometry nothing shows what the wheels did: log their speeds"
             break
+        taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
+        mine = taken_on.hypothesis.effect
+        members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
         found.accepted.append(replace(taken_on, own=True))
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
