@@ -89,7 +89,7 @@ class Benchmark:
     """Windows of 15 s of each robot of mrclam."""
     rounds: Annotated[int, COUNT] = 3
     """Loops at most, one after the other."""
-    floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "pose_delay")
+    floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "acceleration_limit", "pose_delay")
     """Effects that the base model of `change` has besides the physical preset."""
     physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
