@@ -852,8 +852,8 @@ CLAIMS = (
         MEASURED,
         "DRIVE: another floor than asphalt",
         "measured",
-        "Each third of a run is predicted by the vehicle of the asphalt run, and by that vehicle with what a floor "
-        "sets fitted to the other two thirds: position error [m] after 6 s, and gains with their 95 % intervals. "
+        "Each third of a run is predicted by the vehicle of the asphalt run, and by that vehicle with what "
+        "changed fitted to the other two thirds: position error [m] after 6 s, and gains with their 95 % intervals. "
         "Gyro and wheels named the change in all three runs.",
         ("run", "as on asphalt", "on its floor", "gain, position", "gain, yaw"),
         tuple(_changed(run) for run in ("gravel", "sand_1", "sand_2")),

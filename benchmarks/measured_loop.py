@@ -9,7 +9,7 @@ of the named effect alone: the rest is gained by base parameters that moved besi
 each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
 asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one. Each third of a run
-is then predicted by the reference vehicle with what a floor sets fitted to the other two, and by that vehicle itself.
+is then predicted by the reference vehicle with what changed fitted to the other two, and by that vehicle itself.
 `floors` asks the same of gyro and wheels without a model, and of halves of one run how often that is false. `mrclam`
 (five nearly ideal robots): verdicts with the base model's delay held at 0; one with an effect of another class, or
 larger than such a robot has, is false.
@@ -42,17 +42,22 @@ from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.pose_lag import pose_lag
 from sysid.logs.records import Log, Prediction, Trial
-from sysid.missing.catalogue import PARAMETER
+from sysid.missing.catalogue import PARAMETER, base_values
+from sysid.missing.days import no_wander
+from sysid.missing.drives import make_drives
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
+from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.floor import floor_change
 from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
-from sysid.verdict.preparation import prepare, reference_for
+from sysid.verdict.preparation import reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, on_other_floor, refit_poses
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE
+from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -347,12 +352,15 @@ def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> Flo
 
 
 def asphalt_vehicle(settings: Benchmark) -> Prepared:
-    """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
-    config = change_config(settings)
-    asphalt = run_log(settings, RUNS[0])
+    """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs; without effects
+    to look for."""
+    config, asphalt = change_config(settings), run_log(settings, RUNS[0])
     reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
                               start=floor_start(settings, asphalt))
-    return prepare(reference, asphalt.spec, config)
+    plant, vehicle = vehicle_plant(asphalt.spec, VehicleConfig(physics_dt=config.physics_dt)), reference.params
+    names = tuple(base_values(vehicle))
+    drives = make_drives(plant, vehicle, names, asphalt.training, reference.width, gyro=reference.gyro)
+    return Prepared(reference, plant, (), vehicle, names, drives.paths, no_wander(()))
 
 
 def change_config(settings: Benchmark) -> LoopConfig:
@@ -376,15 +384,19 @@ def one_change(settings: Benchmark, name: str, run: str, ready: Callable[[], Pre
     done = kept(settings, name)
     if done is not None:
         return done
-    result = find_missing(run_log(settings, run), config=change_config(settings), reference=ready(),
-                          progress=lambda _, text: print(f"  {name}: {text}", flush=True))
-    found = {**verdict_of(result), "ideal": {}, "before": {}, "after": {}}
+    vehicle = ready()
+    floor = floor_change(vehicle.reference, run_log(settings, run).training, Thresholds().alpha)
+    assert floor is not None
+    found: dict[str, Any] = {"verdict": "named" if floor.named else "none", "reason": floor.said(), "p_value": floor.p,
+                             "effects": [], "floor": floor.report(), "ideal": {}, "before": {}, "after": {}}
     for third in range(3):
-        fold = replace(result, log=run_log(settings, run, third))
-        held = fold.log.held_out
+        log: Any = run_log(settings, run, third)
+        none: Any = None
+        fold = Result(log, (), change_config(settings), vehicle, none, none, {}, floor=floor)
+        held = log.held_out
         found["ideal"] |= errors(held, [ideal_replay(trial) for trial in held])
-        for which, vehicle in (("before", result.reference.params), ("after", on_other_floor(fold))):
-            found[which] |= errors(held, replay(result, vehicle, held))
+        for which, params in (("before", vehicle.reference.params), ("after", on_other_floor(fold))):
+            found[which] |= errors(held, replay(fold, params, held))
     return keep(settings, name, found)
 
 

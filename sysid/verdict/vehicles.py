@@ -20,9 +20,6 @@ from sysid.replay.models import measured_effects, with_effects
 from sysid.verdict.result import Result
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 
-FLOOR = ("turn_efficiency", "turn_lag", "yaw_scrub", "rolling_resistance", "slip_traction")
-"""Effects that a floor sets: how wheels turn the vehicle, roll and grip. No single one changes from floor to floor."""
-
 
 def vehicle_before(result: Result) -> Any:
     """The base model with its parameters refitted within their spread."""
@@ -66,12 +63,13 @@ def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
 
 
 def on_other_floor(result: Result) -> Any:
-    """The reference vehicle on the floor of these drives: what a floor sets is fitted together (`FLOOR`), all else is
-    kept. The reference vehicle itself where the floor is the same."""
+    """The reference vehicle on the floor of these drives: of all its parameters those alone are fitted that say what
+    changed. The reference vehicle itself where the floor is the same."""
     vehicle, change = result.reference.params, result.floor
     if change is None or not change.named:
         return vehicle
-    names = [name for name in result.reference.space.names if name.partition(".")[0] in FLOOR]
+    have = describe(vehicle)
+    names = list(dict.fromkeys(one.quantity.parameter for one in change.members if one.quantity.parameter in have))
     return _to_poses(result, vehicle, names, 12) if names else vehicle
 
 

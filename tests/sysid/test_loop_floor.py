@@ -7,7 +7,7 @@ import pytest
 
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
-from sysid.logs.floor import BLOCKS, FloorChange, in_blocks, last_change, over_days, sums_of
+from sysid.logs.floor import BLOCKS, QUANTITIES, FloorChange, Member, in_blocks, last_change, over_days, sums_of
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, Start, Trial
 from sysid.missing.days import Leftover, Reference
 from sysid.missing.reference import BLOCK
@@ -96,11 +96,11 @@ def test_blocks_of_one_run_know_that_they_are():
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_another_floor_moves_what_a_floor_sets_and_nothing_else(named, monkeypatch):
+def test_another_floor_moves_what_changed_and_nothing_else(named, monkeypatch):
     fitted = []
     monkeypatch.setattr(vehicles, "_to_poses", lambda result, vehicle, names, _: fitted.append(names) or "moved")
-    space = SimpleNamespace(names=("body.com_x", "turn_lag.time_constant", "gyro_bias.bias", "yaw_scrub.torque"))
-    reference = SimpleNamespace(params="as it was", space=space)
-    result = SimpleNamespace(reference=reference, floor=FloorChange((), 0.0, 5, named))
+    monkeypatch.setattr(vehicles, "describe", lambda vehicle: ("turn_lag.time_constant", "yaw_scrub.torque"))
+    members = tuple(Member(quantity, 1.0, 2.0, (1.5, 2.5), 9.0) for quantity in QUANTITIES[:2])
+    result = SimpleNamespace(reference=SimpleNamespace(params="as it was"), floor=FloorChange(members, 0.0, 5, named))
     assert vehicles.on_other_floor(result) == ("moved" if named else "as it was")
-    assert fitted == ([["turn_lag.time_constant", "yaw_scrub.torque"]] if named else [])
+    assert fitted == ([["turn_lag.time_constant"]] if named else [])  # it has no turn efficiency
