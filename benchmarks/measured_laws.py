@@ -32,6 +32,7 @@ STARTS = {
     "pose_delay": {"delay": 0.3}, "motor_line": {"no_load_speed": 5.0, "droop": 0.002},
     "turn_lag": {"time_constant": 0.3}, "turn_efficiency_speed": {"per_speed": 0.01},
     "turning_slip": {"per_yaw_rate": 0.02}, "side_slip": {"per_yaw_rate": 0.05},
+    "acceleration_limit": {"linear": 3.0, "angular": 3.0},
 }  # fmt: skip
 """Where the fit of each law starts, off the end of its range."""
 ITERATIONS = 12

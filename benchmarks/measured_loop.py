@@ -8,10 +8,11 @@ names none. Each rung is scored on steps that were never fitted, with all parame
 of the named effect alone: the rest is gained by base parameters that moved beside it. `laws` (`measured_laws`): what
 each law of skid-steered robots adds to the base, named or not. `peers` (`measured_peers`) says
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
-asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one, and what is held out
-of them is predicted by the reference vehicle with that change alone. `floors` asks the same of gyro and wheels without
-a model, and of halves of one run how often that is false. `mrclam` (five nearly ideal robots): verdicts with
-the base model's delay held at 0; one with an effect of another class, or larger than such a robot has, is false.
+asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one. Each third of a run
+is then predicted by the reference vehicle with what changed fitted to the other two, and by that vehicle itself.
+`floors` asks the same of gyro and wheels without a model, and of halves of one run how often that is false. `mrclam`
+(five nearly ideal robots): verdicts with the base model's delay held at 0; one with an effect of another class, or
+larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
 """
@@ -32,26 +33,31 @@ import numpy as np
 from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
-from benchmarks.measured_laws import ablate, make_bench
+from benchmarks.measured_laws import STARTS, ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
-from sysid.logs.lost_pose import without_lost
+from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.pose_lag import pose_lag
 from sysid.logs.records import Log, Prediction, Trial
-from sysid.missing.catalogue import PARAMETER
+from sysid.missing.catalogue import PARAMETER, base_values
+from sysid.missing.days import no_wander
+from sysid.missing.drives import make_drives
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
+from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.floor import floor_change
 from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
-from sysid.verdict.preparation import prepare, reference_for
+from sysid.verdict.preparation import reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, on_other_floor, refit_poses
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE
+from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -67,8 +73,6 @@ MANY = 10**6  # steps: all
 TIMES = {"command_delay", "pose_delay", "sensor_delay", "clock_offset", "actuator_lag", "odometry_lag"}
 SCALES = {"command_scale", "odometry_scale", "track_width", "turn_efficiency", "wheel_radius_difference"}
 DEAD = {"command_dead_zone"}
-FLOOR_MODEL = ("turn_efficiency", "turn_lag", "pose_delay")
-"""What the base model of `change` has besides the physical preset."""
 LAWS = {"motor_line", "turn_lag", "turn_efficiency_speed", "turning_slip", "side_slip"}
 LONGEST, LARGEST = 0.3, 0.1
 """Delay [s] and share of the speed beyond which a verdict on a nearly ideal robot is false."""
@@ -90,6 +94,8 @@ class Benchmark:
     """Windows of 15 s of each robot of mrclam."""
     rounds: Annotated[int, COUNT] = 3
     """Loops at most, one after the other."""
+    floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "acceleration_limit", "pose_delay")
+    """Effects that the base model of `change` has besides the physical preset."""
     physics_dt: Annotated[float, NOT_NEGATIVE] = 0.01
     """Physics step [s]."""
     quick: bool = False
@@ -346,12 +352,15 @@ def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> Flo
 
 
 def asphalt_vehicle(settings: Benchmark) -> Prepared:
-    """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs."""
-    config = change_config(settings)
-    asphalt = drive_log(settings, ("asphalt",))
+    """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs; without effects
+    to look for."""
+    config, asphalt = change_config(settings), run_log(settings, RUNS[0])
     reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
-                              start=floor_start(asphalt))
-    return prepare(reference, asphalt.spec, config)
+                              start=floor_start(settings, asphalt))
+    plant, vehicle = vehicle_plant(asphalt.spec, VehicleConfig(physics_dt=config.physics_dt)), reference.params
+    names = tuple(base_values(vehicle))
+    drives = make_drives(plant, vehicle, names, asphalt.training, reference.width, gyro=reference.gyro)
+    return Prepared(reference, plant, (), vehicle, names, drives.paths, no_wander(()))
 
 
 def change_config(settings: Benchmark) -> LoopConfig:
@@ -359,26 +368,35 @@ def change_config(settings: Benchmark) -> LoopConfig:
     return LoopConfig(physics_dt=settings.physics_dt, quick=settings.quick, held=(PARAMETER,))
 
 
-def floor_start(log: Log) -> Any:
+def floor_start(settings: Benchmark, log: Log) -> Any:
     """The base model with what turns a skid-steered robot, how late, and how late its outside pose is."""
-    start = with_effects(preset_params(log.spec, "physical"), FLOOR_MODEL)
+    start = with_effects(preset_params(log.spec, "physical"), settings.floor_model)
+    begun = {f"{law}.{field}": value for law in settings.floor_model for field, value in STARTS.get(law, {}).items()}
     trials = log.training
     lag = pose_lag(trials, [part.tolist() for part in np.array_split(np.arange(len(trials)), 8)], yaw_rates(log))
-    return set_values(start, [PARAMETER], jnp.array([0.0 if lag is None else lag.delay]))
+    begun[PARAMETER] = 0.0 if lag is None else lag.delay
+    return set_values(start, list(begun), jnp.array(list(begun.values())))
 
 
-def one_change(settings: Benchmark, name: str, log: Log, ready: Callable[[], Prepared]) -> dict[str, Any]:
-    """What changed from the reference to a log, with held-out errors of the reference vehicle, and of it on the other
-    floor: only the members of that change moved."""
+def one_change(settings: Benchmark, name: str, run: str, ready: Callable[[], Prepared]) -> dict[str, Any]:
+    """What changed from the reference to a run, with the errors of the reference vehicle, and of it on the other floor,
+    in each third of the run that was held back."""
     done = kept(settings, name)
     if done is not None:
         return done
-    result = find_missing(log, config=change_config(settings), reference=ready(),
-                          progress=lambda _, text: print(f"  {name}: {text}", flush=True))
-    found, held = verdict_of(result), log.held_out
-    found["ideal"] = errors(held, [ideal_replay(trial) for trial in held])
-    found["before"] = errors(held, replay(result, result.reference.params, held))
-    found["after"] = errors(held, replay(result, on_other_floor(result), held))
+    vehicle = ready()
+    floor = floor_change(vehicle.reference, run_log(settings, run).training, Thresholds().alpha)
+    assert floor is not None
+    found: dict[str, Any] = {"verdict": "named" if floor.named else "none", "reason": floor.said(), "p_value": floor.p,
+                             "effects": [], "floor": floor.report(), "ideal": {}, "before": {}, "after": {}}
+    for third in range(3):
+        log: Any = run_log(settings, run, third)
+        none: Any = None
+        fold = Result(log, (), change_config(settings), vehicle, none, none, {}, floor=floor)
+        held = log.held_out
+        found["ideal"] |= errors(held, [ideal_replay(trial) for trial in held])
+        for which, params in (("before", vehicle.reference.params), ("after", on_other_floor(fold))):
+            found[which] |= errors(held, replay(fold, params, held))
     return keep(settings, name, found)
 
 
@@ -388,7 +406,7 @@ def change(settings: Benchmark) -> None:
     figures: dict[str, Any] = {}
     named = 0
     for name in ("warthog_gravel", "warthog_sand_1", "warthog_sand_2"):
-        loop = one_change(settings, f"from_asphalt_to_{name}", run_log(settings, name), ready)
+        loop = one_change(settings, f"from_asphalt_to_{name}", name, ready)
         report([loop])
         trials, short = list(loop["before"]), name.removeprefix("warthog_")
         for column, (metric, unit) in enumerate((("position", "m"), ("yaw", "rad"))):
@@ -404,10 +422,16 @@ def change(settings: Benchmark) -> None:
     record("measured", CLAIM, figures, replacing="changed_")
 
 
-def run_log(settings: Benchmark, run: str) -> Log:
-    """Steps of one run, its last third held out."""
+def run_log(settings: Benchmark, run: str, held_out: int | None = None) -> Log:
+    """Steps of one run, one of its thirds held out or none. Training ones whose outside pose was lost keep their gyro
+    and wheels, which show the floor."""
     log = load_drive(settings.shared / "data" / "measured" / "drive_norlab", (run,), chained=True)
-    return thin(without_lost(split(log, (f"{run}:0-0.667",), (f"{run}:0.667-1",))), settings.windows)
+    third, gone = 3 * np.arange(len(log.trials)) // len(log.trials), lost(log)
+    trials = tuple(
+        replace(trial, held_out=bool(k == held_out),
+                ground_truth=None if trial.name in gone and k != held_out else trial.ground_truth)
+        for trial, k in zip(log.trials, third, strict=True))
+    return thin(replace(log, trials=trials), settings.windows)
 
 
 def is_false(loop: dict[str, Any], fastest: float) -> bool:

@@ -68,8 +68,9 @@ class Benchmark:
     """Factor on all disturbances and sensor noise, of the reference days too; each needs a `work` of its own."""
     sensor_noise: tuple[float, ...] = ()
     """Factors on the disturbances and the sensor noise of further logs alone, whose reference days keep the usual ones:
-    `noisy_nulls` with nothing in them, and `seeds` of each effect at four times that size."""
-    noisy_nulls: int = 40
+    `noisy_nulls` with nothing in them, `seeds` of each effect and `noisy_pairs` of two at four times that size."""
+    noisy_nulls: Annotated[int, NOT_NEGATIVE] = 40
+    noisy_pairs: Annotated[int, NOT_NEGATIVE] = 0
     vehicle: Literal["chair", "scooter", "robot"] = "chair"
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
@@ -175,8 +176,9 @@ def plant(settings: Benchmark) -> None:
     if settings.scales:
         judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
     if settings.sensor_noise:
-        judge(contact.noisy_jobs(work, settings.sensor_noise, settings.noisy_nulls, settings.seeds, part, driven,
-                                 settings.only))
+        usual = contact.scaled_jobs(work, (4.0,), settings.seeds, "1/1", driven, settings.only)
+        usual += contact.pair_jobs(work, settings.noisy_pairs, "1/1", driven)
+        judge(contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part))
     if settings.left_out:
         judge(contact.left_out_jobs(work, part))
     if settings.pairs:

@@ -131,7 +131,9 @@ def of_noisy(cases: Sequence[Case]) -> dict[str, Any]:
                       for one in nulls for each in one["noise_levels"].values()]
             found[f"noise_factor_coverage{tag}"] = figure(
                 [float(np.mean(inside))], f"share of {len(inside)} 95 % intervals of {len(nulls)} logs")
-        found.update(of_singles([(next(iter(truth)), one) for truth, one in mine if truth], f"_4x{tag}"))
+        found.update(of_singles([(next(iter(truth)), one) for truth, one in mine if len(truth) == 1], f"_4x{tag}"))
+        pairs = of_pairs([(truth, one) for truth, one in mine if len(truth) == 2])
+        found.update({name + tag: one for name, one in pairs.items()})
     return found
 
 

@@ -6,11 +6,18 @@ Within the vehicle every physics step would carry their memory.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax
+from flax import struct
 
+from whill_mjx.effects.base import Effect
 from whill_mjx.effects.command_delay import CommandDelay
+from whill_mjx.vehicle.types import Motion
+
+LONG = 1e6
+"""A time after which every effect on commands has come to what it makes of a constant command [s]."""
 
 
 def without(params: Any, name: str) -> tuple[Any, Any]:
@@ -34,3 +41,23 @@ def delayed(params: Any, command: jax.Array, dt: float) -> tuple[Any, jax.Array]
         return params, command
     kept = replace(params, effects=tuple(effect for effect in effects if effect is not first))
     return kept, first.ahead(command.reshape(-1, 2), dt).reshape(command.shape)
+
+
+@struct.dataclass
+class Reached(Effect):
+    """An effect on commands as it is where each command has been in force for ever."""
+
+    effect: Any
+
+    def command(self, memory: Any, command: jax.Array, motion: Motion) -> tuple[Any, jax.Array]:
+        """What the effect makes of a constant command (2,) in the end."""
+        held: Any = SimpleNamespace(dt=LONG, track=getattr(motion, "track", None))
+        return self.effect.command(memory, command, held)
+
+
+def reached(params: Any) -> Any:
+    """The vehicle with all effects on commands as they are in the end; memories are those of the vehicle itself."""
+    effects = getattr(params, "effects", ())
+    if not any(hasattr(effect, "command") for effect in effects):
+        return params
+    return replace(params, effects=tuple(Reached(one) if hasattr(one, "command") else one for one in effects))

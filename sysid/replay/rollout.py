@@ -23,7 +23,7 @@ import numpy as np
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
 from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.delays import delayed, without
+from sysid.replay.delays import delayed, reached, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
@@ -325,7 +325,12 @@ def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
 
 def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int) -> Any:
     """State after driving so that the odometry reports `speeds` (2,): where the vehicle falls short of its command, as
-    a skid-steered one does, the command, which is held for a few steps, is raised until it does not."""
+    a skid-steered one does, the command, which is held for a few steps, is raised until it does not.
+
+    Effects on commands have reached what they make of it at once: a lag or a limit that began at rest would last longer
+    than this, and the vehicle would begin its drive with a command on the way from 0.
+    """
+    params = reached(params)
 
     def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
         state, command = carry

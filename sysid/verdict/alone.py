@@ -2,8 +2,9 @@
 
 The noise is then only what the base model leaves of the drives themselves, so nothing shows whether that is too much.
 Simulated nulls deal it out anew to other drives: an effect that stands out of them is real in these drives, but it may
-be a lucky correlate of something else. It is named where blocks of drives speak for it: they agree on its size, and
-the gain of each is foretold by the others. Of effects that are not separated the simplest is.
+be a lucky correlate of something else. It is named where it predicts blocks of drives that were held back: the 95 %
+interval of its gain there lies above 0. Effects are added one after the other as long as that holds. Of effects that
+predict these blocks as well as the best, the one with the fewest parameters is named.
 
 Where there is no odometry either, nothing shows whether wheels fell short of the command or the vehicle of its wheels,
 while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
@@ -13,13 +14,18 @@ acceleration and drag bend to the same few speeds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-
-import numpy as np
+from dataclasses import replace
 
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
-from sysid.verdict.agreement import disagreement, foretold
-from sysid.verdict.found import Search, Thresholds
+from sysid.missing.catalogue import Hypothesis
+from sysid.missing.days import Wander
+from sysid.missing.evidence import Evidence
+from sysid.missing.refit import Refitter
+from sysid.search.result import Progress
+from sysid.verdict.agreement import interval_of_sum
+from sysid.verdict.found import LARGEST, Search, Thresholds, missing
+from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
 UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
@@ -30,60 +36,55 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def judged(
-    found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds,
-    wheels: bool = True,
+def search_alone(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
+    wheels: bool = True, draws: int = 1000, seed: int = 0, progress: Progress | None = None,
 ) -> Search:
-    """The search with a verdict that needs no noise level.
+    """The verdict on drives that stand alone: effects are added one after the other, as long as they make the rest of
+    the drives better predicted.
 
     Args:
-        groups: blocks of trials.
-        precision: (P, P) of the base parameters, in unit coordinates.
         wheels: whether any trial has an odometry.
     """
-    if found.verdict == "named":
-        simplest(found)
-        against = doubts(found, groups, precision, thresholds) + ([] if wheels else of_wheels(found))
-        if against:
-            found.verdict, found.reason = "unexplained", f"{'; '.join(against)}; {UNTOLD}"
-        else:
-            found.reason = f"stands out of what the base model leaves, and blocks of drives agree on it; {UNTOLD}"
-    else:
-        found.reason = f"{found.reason}; {UNTOLD}"
+    asked, far = begin(evidence, hypotheses, refitter, wander, thresholds, draws, seed, progress)
+    found = Search("none", asked.base, asked.base, asked.scan)
+    if asked.scan.p_family >= thresholds.alpha:
+        return _said(asked, found, NOTHING)
+    against, unseen = "what stands out in a linear scan does not hold in a refit", False
+    for _ in range(thresholds.rounds):
+        candidates = candidates_of(asked, found, found.final, far)
+        likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
+        standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
+        if not standing:
+            if likely:
+                first = likely[0][0].hypothesis.effect
+                against = f"{first} stands out, but does not predict blocks of drives that were held back"
+            break
+        best, most = max(standing, key=lambda one: float(one[1].sum()))
+        as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
+        shown = [one for one in as_good if wheels or card_of(one.hypothesis.effect).shown_by_pose]
+        unseen = not shown
+        if unseen:
+            first = best.hypothesis.effect
+            against = f"{first} stands out, but without odometry nothing shows what the wheels did: log their speeds"
+            break
+        taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
+        mine = taken_on.hypothesis.effect
+        members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
+        found.accepted.append(replace(taken_on, own=True))
+        taken = {one.hypothesis.effect for one in found.accepted}
+        found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
+        found.final, found.share = taken_on.refit, taken_on.share
+    if found.accepted:
+        found.verdict = "named"
+        return _said(asked, found, "predicts blocks of drives that were held back")
+    if unseen or missing(found.p_value, 1.0, thresholds):
+        found.verdict = "unexplained"
+    return _said(asked, found, against)
+
+
+def _said(asked: Asked, found: Search, reason: str) -> Search:
+    """The search with its reason, and what exceeds the noise before and after."""
+    found.excess = asked.excess(asked.base), asked.excess(found.final)
+    found.reason = f"{reason}; {UNTOLD}"
     return found
-
-
-def of_wheels(found: Search) -> list[str]:
-    """What speaks against each named effect that an outside pose alone does not show, in words."""
-    return [f"{one.effect} stands out, but without odometry nothing shows what the wheels did: log their speeds"
-            for one in found.final.hypotheses if not card_of(one.effect).shown_by_pose]
-
-
-def simplest(found: Search) -> None:
-    """Of effects that the drives do not separate, name the one with the fewest parameters: by how much better another
-    one fits means nothing where the noise is not known."""
-    if len(found.accepted) != 1:
-        return
-    best, members = found.accepted[0], found.classes[0]
-    near = [one for one in found.rounds[0] if one.hypothesis.effect in members]
-    chosen = min([best, *near], key=lambda one: (len(one.hypothesis.axes), -one.gain))
-    if len(chosen.hypothesis.axes) < len(best.hypothesis.axes):
-        mine = chosen.hypothesis.effect
-        found.accepted, found.final, found.share = [chosen], chosen.refit, chosen.share
-        found.classes = [[mine, *(name for name in members if name != mine)]]
-
-
-def doubts(
-    found: Search, groups: Sequence[Sequence[int]], precision: np.ndarray, thresholds: Thresholds
-) -> list[str]:
-    """What speaks against each named effect, in words."""
-    fit, out = found.final, []
-    for one, part in zip(fit.hypotheses, fit.parts, strict=True):
-        differ = disagreement(fit, part, groups, precision)
-        gains = foretold(fit, part, groups, precision)
-        lost = float(-gains[gains < 0].sum())
-        if differ > thresholds.differ:
-            out.append(f"{one.effect} stands out, but blocks of drives differ by {differ:.0%} on its size")
-        elif gains.sum() <= 0 or lost > thresholds.loss * (gains.sum() + lost):
-            out.append(f"{one.effect} stands out, but is wrong about blocks of drives that were held back")
-    return out

@@ -132,17 +132,6 @@ class Search:
         return max(self.scan.p_family, refitted)
 
 
-def excess_of(fit: Refit, count: float) -> float:
-    """Squared white residual of a fit over its number of values, less 1."""
-    return float(np.square(fit.residual).sum()) / count - 1
-
-
-def explained_share(base: Refit, count: float, thresholds: Thresholds, fit: Refit) -> float:
-    """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
-    before = excess_of(base, count)
-    return float(np.clip((before - excess_of(fit, count)) / max(before, thresholds.excess), 0.0, 1.0))
-
-
 def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
     """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
     both = max(search_p, excess_p) < thresholds.alpha

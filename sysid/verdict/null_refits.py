@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -30,14 +29,12 @@ from sysid.verdict.found import (
     Scan,
     Search,
     Thresholds,
-    excess_of,
-    explained_share,
     family,
     missing,
     tail,
 )
 from sysid.verdict.pairs import scan_again
-from sysid.verdict.rounds import pair_round, refitted
+from sysid.verdict.rounds import Asked, pair_round, refitted
 from sysid.verdict.scan import best, drawn_away
 
 TOGETHER, ACCELERATED = 16, 100
@@ -56,31 +53,28 @@ def run(
         scan: of the drives in question: its linear nulls are what the first look at each day is held against.
         pairs: likewise of pairs of effects; None where pairs do not decide.
     """
-    reference, measured = refitter.reference, float((refitter.drives.mask > 0).sum())
+    reference = refitter.reference
     rng = np.random.default_rng((seed, 1))
     factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
     similar = imitation(evidence, hypotheses)
     p, alarms = np.ones(count), 0
     for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
         around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
+        day = Asked(around, hypotheses, one, wander, thresholds, base, scan, similar)
         looked = best(Solver(around), hypotheses, wander)
         p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
         if p[n] < thresholds.alpha:
-            candidates = refitted(one, base, around, hypotheses, wander, scan, [looked], thresholds, similar,
-                                  lambda _: 0.0, lambda _: None)
-            p[n] = max(p[n], min((each.p for each in candidates), default=0.0))
-        p_excess = wander.p_excess(excess_of(base, measured))
+            p[n] = max(p[n], min((each.p for each in refitted(day, base, [looked])), default=0.0))
         # An effect that stays significant in a refit may be named; without one, the rule of the verdict holds.
-        alarm = p[n] < thresholds.alpha or missing(p[n], p_excess, thresholds)
+        alarm = p[n] < thresholds.alpha or missing(p[n], day.p_left(base), thresholds)
         if not alarm and pairs is not None:
             again = scan_again(pairs, around, hypotheses, wander)
             if again.p_family < thresholds.alpha:
-                day = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
-                             pairs=again)
-                pair_round(day, around, hypotheses, one, wander, similar, thresholds,
-                           partial(explained_share, base, measured, thresholds), set())
-                alarm = bool(day.accepted)
-                p[n] = min(p[n], day.p_value) if alarm else p[n]
+                found = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
+                               pairs=again)
+                pair_round(day, found, set())
+                alarm = bool(found.accepted)
+                p[n] = min(p[n], found.p_value) if alarm else p[n]
         alarms += bool(alarm)
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")

@@ -19,7 +19,7 @@ from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
-from sysid.verdict.alone import judged, stands_alone
+from sysid.verdict.alone import search_alone, stands_alone
 from sysid.verdict.floor import floor_change
 from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
@@ -70,19 +70,24 @@ def find_missing(
     def anything(residual: np.ndarray) -> float:
         return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
-    outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
+    alone = stands_alone(log.training, reference.known)
+    if alone:
+        wheels = any(trial.odometry is not None for trial in log.training)
+        outcome = search_alone(evidence, found, refitter, ready.wander, config.thresholds, wheels, draws, config.seed,
+                               progress)
+    else:
+        outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed,
+                         progress)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
         nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
                                 config.refit_nulls, config.seed, progress, outcome.pairs)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
-    alone = stands_alone(log.training, reference.known)
-    if alone:
-        wheels = any(trial.odometry is not None for trial in log.training)
-        outcome = judged(outcome, evidence.groups, refitter.precision, config.thresholds, wheels)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, usual.wander.p_excess))
+        # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
+        p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
+        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}

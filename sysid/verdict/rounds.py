@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,10 +13,13 @@ from sysid.missing.days import Wander
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
+from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, disagreement, foretold, interval_of_sum
+from sysid.verdict.classes import imitation
 from sysid.verdict.found import Candidate, Scan, Search, Thresholds
-from sysid.verdict.scan import best
+from sysid.verdict.scan import best, run
 
+NOTHING = "nothing stands out of the noise and the day-to-day spread"
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
@@ -23,45 +27,103 @@ Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
 """Gain (H,), worth (H,) and coordinates of every hypothesis."""
 
 
-def refitted(
-    refitter: Refitter, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
-    first: Scan, scans: Sequence[Looked], thresholds: Thresholds, similar: np.ndarray,
-    explained: Callable[[Refit], float], report: Callable[[str], None],
-) -> list[Candidate]:
-    """One round: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and so is
-    what might imitate the best; in order of gain."""
+@dataclass(frozen=True)
+class Asked:
+    """What a search asks of some drives, and the base fit that it begins with."""
+
+    evidence: Evidence
+    """Around the base fit."""
+    hypotheses: Sequence[Hypothesis]
+    refitter: Refitter
+    wander: Wander
+    thresholds: Thresholds
+    base: Refit
+    scan: Scan
+    """Of all hypotheses beside the base."""
+    similar: np.ndarray  # (H, H) |cos| of signatures
+    report: Callable[[str], None] = lambda _: None
+    """Says what was just done."""
+
+    @cached_property
+    def count(self) -> float:
+        """Squared white residual where nothing is missing."""
+        return float((self.refitter.drives.mask > 0).sum()) * self.wander.level
+
+    def excess(self, fit: Refit) -> float:
+        """Squared white residual of a fit over its number of values, less 1."""
+        return float(np.square(fit.residual).sum()) / self.count - 1
+
+    def p_left(self, fit: Refit) -> float:
+        """Probability of so much excess on a day with nothing missing."""
+        return self.wander.p_excess(self.excess(fit))
+
+    def explained(self, fit: Refit) -> float:
+        """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
+        before = self.excess(self.base)
+        return float(np.clip((before - self.excess(fit)) / max(before, self.thresholds.excess), 0.0, 1.0))
+
+
+def begin(
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
+    draws: int, seed: int, progress: Progress | None,
+) -> tuple[Asked, Looked]:
+    """What a search asks, around the base refitted to the drives; and a scan around the reference."""
+    def report(text: str) -> None:
+        if progress is not None:
+            progress(1, text)
+
+    base = refitter.fit((), np.zeros(0))
+    report("base refit")
+    far = best(Solver(evidence), hypotheses, wander)
+    evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
+    scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
+    report("scan")
+    return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
+                 report), far
+
+
+def candidates_of(asked: Asked, found: Search, current: Refit, far: Looked) -> list[Candidate]:
+    """The next round of a search, which is kept."""
+    scan = asked.scan
+    scans = [rescan(asked, current)] if found.rounds else [far, (scan.gain, scan.worth, scan.q)]
+    found.rounds.append(refitted(asked, current, scans, len(found.rounds) + 1))
+    return found.rounds[-1]
+
+
+def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int = 1) -> list[Candidate]:
+    """Round `number`: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and
+    so is what might imitate the best; in order of gain."""
+    refitter, hypotheses = asked.refitter, asked.hypotheses
     taken = {one.effect for one in current.hypotheses}
-    chosen = _starts(hypotheses, scans, first, taken, thresholds)
+    chosen = _starts(hypotheses, scans, asked.scan, taken, asked.thresholds)
     at = Start.at(current)
 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
         return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
 
     fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
-    report("refits")
-    least = current.cost - thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
+    asked.report(f"refits, round {number}")
+    least = current.cost - asked.thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
         again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
         fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
-    report("polish")
-    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken, thresholds)
+    asked.report(f"polish, round {number}")
+    rivals = _rivals(hypotheses, asked.similar, [h for h, _ in chosen], fits, taken, asked.thresholds)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
     fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
-    report("rivals")
-    candidates = [candidate_of(h, fit, current, evidence, hypotheses, wander, first, explained(fit))
-                  for (h, _), fit in zip(chosen, fits, strict=True)]
+    asked.report(f"rivals, round {number}")
+    candidates = [candidate_of(asked, h, fit, current) for (h, _), fit in zip(chosen, fits, strict=True)]
     return sorted(candidates, key=lambda one: -one.gain)
 
 
-def rescan(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], current: Refit, refitter: Refitter, wander: Wander
-) -> Looked:
+def rescan(asked: Asked, current: Refit) -> Looked:
     """Of every hypothesis given what is accepted so far."""
-    return best(Solver(at_fit(evidence, current.residual, current.jacobian, current.u - refitter.reference.u)),
-                hypotheses, wander)
+    moved = current.u - asked.refitter.reference.u
+    return best(Solver(at_fit(asked.evidence, current.residual, current.jacobian, moved)), asked.hypotheses,
+                asked.wander)
 
 
 def _starts(
@@ -146,27 +208,21 @@ def _widest(
     return most, np.array([alone.get(axis.parameter, 0.0) for axis in hypotheses[most].axes])
 
 
-def candidate_of(
-    h: int, fit: Refit, current: Refit, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander,
-    first: Scan, share: float,
-) -> Candidate:
+def candidate_of(asked: Asked, h: int, fit: Refit, current: Refit) -> Candidate:
     """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
-    one = hypotheses[h]
+    one, evidence = asked.hypotheses[h], asked.evidence
     gain = max(current.cost - fit.cost, 0.0)
     q = fit.q[-len(one.axes) :]
     inside = beside(fit.products(evidence.precision), len(q))
     moved = np.abs(q) > 1e-9
-    inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, wander.at(evidence.columns, h, q)))
+    inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, asked.wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])
     whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
     worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
-    return Candidate(one, gain, first.p_of(h, worth), share, fit)
+    return Candidate(one, gain, asked.scan.p_of(h, worth), asked.explained(fit), fit)
 
 
-def pair_round(
-    found: Search, evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander,
-    similar: np.ndarray, thresholds: Thresholds, explained: Callable[[Refit], float], tried: set[str],
-) -> None:
+def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
     """Two effects instead of what was accepted, where only together they explain the drives.
 
     Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
@@ -175,7 +231,7 @@ def pair_round(
     Args:
         tried: effects whose pairs had their chance, with the other one as a further effect.
     """
-    pairs = found.pairs
+    pairs, hypotheses, refitter, thresholds = found.pairs, asked.hypotheses, asked.refitter, asked.thresholds
     assert pairs is not None
     least = float(found.scan.gain.max()) if len(found.scan.gain) else 0.0
     order, seen = [], set()
@@ -195,32 +251,32 @@ def pair_round(
                              POLISH)
     if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
         both, alone = moved_last(both, 0), alone[::-1]
-    if explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
+    if asked.explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
         return
     members = []
     for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
-        h = hypotheses.index(fit.hypotheses[-1])
-        one = candidate_of(h, fit, other, evidence, hypotheses, wander, found.scan, explained(fit))
-        part = slice(len(fit.q) - len(fit.hypotheses[-1].axes), len(fit.q))
-        gains = foretold(fit, part, evidence.groups, refitter.precision)
-        if (one.p >= thresholds.alpha or explained(fit) - explained(other) < thresholds.step
-                or disagreement(fit, part, evidence.groups, refitter.precision) > thresholds.differ
-                or interval_of_sum(gains)[0] <= 0):
+        one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
+        if (one.p >= thresholds.alpha or asked.explained(fit) - asked.explained(other) < thresholds.step
+                or disagreement(fit, fit.parts[-1], asked.evidence.groups, refitter.precision) > thresholds.differ
+                or interval_of_sum(held_back(asked, fit))[0] <= 0):
             return
         members.append(replace(one, own=True))
-    members[0] = replace(members[0], refit=alone[0], share=explained(alone[0]))
+    members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
     found.accepted = members
-    found.classes = [_class_of(one, [one], hypotheses, similar, thresholds) for one in members]
+    found.classes = [class_of(asked, one, [one]) for one in members]
     found.rounds += [[one] for one in members]
     found.together = max(pairs.p_family, *(one.p for one in members))
 
 
-def _class_of(
-    best: Candidate, candidates: Sequence[Candidate], hypotheses: Sequence[Hypothesis], similar: np.ndarray,
-    thresholds: Thresholds,
-) -> list[str]:
+def held_back(asked: Asked, fit: Refit) -> np.ndarray:
+    """(G,) what the last effect of a joint fit gains in each manoeuvre, fitted to the others."""
+    return foretold(fit, fit.parts[-1], asked.evidence.groups, asked.refitter.precision)
+
+
+def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> list[str]:
     """Effects that these drives do not separate from the best: nearly as good a fit, alike signatures, or a
     fit so much better than imitating the best would bring that the truth may lie between the two."""
+    hypotheses, similar, thresholds = asked.hypotheses, asked.similar, asked.thresholds
     mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}
     for other in candidates:

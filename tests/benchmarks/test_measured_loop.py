@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.measured_loop import Benchmark, climb, config_of, drive_log, interval, is_false, keep, of_terrain
+from benchmarks.measured_loop import (
+    Benchmark,
+    climb,
+    config_of,
+    drive_log,
+    interval,
+    is_false,
+    keep,
+    of_terrain,
+    run_log,
+)
 from benchmarks.measured_peers import Steps, all_values, fit_kinematic, motion
 from sysid.replay.models import with_effects
 from whill_mjx.vehicle.presets import preset_params
@@ -84,6 +94,18 @@ def test_no_step_is_both_fitted_and_held_out_and_poses_are_known_to_be_late():
     assert {trial.group for trial in log.held_out} == {"asphalt", "gravel", "sand"}
     assert set(log.fields["yaw_rate"]) >= names[0]
     assert log.fields["pose_stamps"] == "receipt" and any(trial.breaks for trial in log.training)
+
+
+def test_each_third_of_a_run_is_held_back_once_and_lost_poses_leave_the_gyro():
+    if not (SHARED / "data" / "measured" / "drive_norlab").is_dir():
+        pytest.skip(f"measured set drive_norlab is not in {SHARED}; set WHILL_SHARED to the folder that holds data")
+    thirds = [run_log(Benchmark(shared=SHARED), "warthog_gravel", third) for third in range(3)]
+    names = [{trial.name for trial in log.held_out} for log in thirds]
+    assert sum(map(len, names)) == len(set.union(*names)) > 90
+    for log in thirds:
+        assert all(trial.ground_truth is not None for trial in log.held_out)
+        lost = [trial for trial in log.training if trial.ground_truth is None]
+        assert 0 < len(lost) < len(log.training) / 2 and all(trial.gyro is not None for trial in lost)
 
 
 def test_a_peer_of_a_few_numbers_predicts_steps_that_it_was_not_fitted_to():

@@ -84,7 +84,7 @@ def results(tmp_path, monkeypatch):
 def judged(work, label, verdict, truth):
     """Leave one verdict, and what was in its log."""
     for folder, content in (("verdicts", verdict), ("truth", truth)):
-        (work / folder).mkdir()
+        (work / folder).mkdir(exist_ok=True)
         (work / folder / f"{label}.json").write_text(json.dumps(content))
 
 
@@ -125,10 +125,13 @@ def test_logs_noisier_than_their_reference_days_have_figures_of_their_own(tmp_pa
     levels = {"odometry.v": {"factor": 3.9, "interval": [3.5, 4.3], "changed": True},
               "pose.yaw": {"factor": 4.5, "interval": [4.1, 4.9], "changed": True}}
     judged(tmp_path, "noise_4_000", {**NOTHING, "stage": "noisy", "noise": 4.0, "noise_levels": levels}, {})
+    judged(tmp_path, "pair_00_noise_4", {**NOTHING, "stage": "noisy", "noise": 4.0, "noise_levels": levels},
+           {"slope": 0.1, "command_delay": 0.1})
     undeclared_figures.figures(tmp_path)
     after = json.loads(results.read_text())
     assert after["figures"]["false_alarms_sensor_noise_4"]["unit"].startswith("of 1 logs with nothing in them at 4 ")
     assert after["figures"]["noise_factor_coverage_sensor_noise_4"]["value"] == 0.5
+    assert after["figures"]["pair_both_sensor_noise_4"]["value"] == 0.0
     assert after["figures"]["false_alarms"] == recorded["figures"]["false_alarms"]
     assert [row for row in after["confusion"] if row["stage"] != "noisy"] == [
         row for row in recorded["confusion"] if row["stage"] != "noisy"]
@@ -136,12 +139,13 @@ def test_logs_noisier_than_their_reference_days_have_figures_of_their_own(tmp_pa
 
 @pytest.mark.quick
 def test_noisier_logs_of_all_kinds_are_mixed_and_dealt_to_processes(tmp_path):
-    jobs = contact.noisy_jobs(tmp_path, (0.5, 2.0), 40, 1, "1/1")
-    scaled = contact.scaled_jobs(tmp_path, (4.0,), 1, "1/1")
-    assert len(jobs) == 2 * (40 + len(scaled)) == len({job.label for job in jobs})
+    usual = contact.scaled_jobs(tmp_path, (4.0,), 1, "1/1") + contact.pair_jobs(tmp_path, 20, "1/1")
+    jobs = contact.noisy_jobs(usual, (0.5, 2.0), 40, "1/1")
+    assert len(jobs) == 2 * (40 + len(usual)) == len({job.label for job in jobs})
     assert {job.noise for job in jobs} == {0.5, 2.0}
-    assert 0.3 < sum(bool(job.effects) for job in jobs[:50]) / 50 < 0.6
-    parts = [contact.noisy_jobs(tmp_path, (0.5, 2.0), 40, 1, part) for part in ("1/2", "2/2")]
+    assert 0.4 < sum(bool(job.effects) for job in jobs[:50]) / 50 < 0.7
+    assert {len(job.effects) for job in jobs} == {0, 1, 2}
+    parts = [contact.noisy_jobs(usual, (0.5, 2.0), 40, part) for part in ("1/2", "2/2")]
     assert sorted(job.label for part in parts for job in part) == sorted(job.label for job in jobs)
 
 
@@ -286,7 +290,7 @@ def test_how_long_a_loop_takes_is_told_of_the_device_that_it_ran_on(tmp_path, de
     nulls = {"count": 200, "false_alarms": 3}
     (tmp_path / "speed_200.json").write_text(json.dumps({"seconds": 12.0, "nulls": nulls, "device": device}))
     (tmp_path / "speed_0.json").write_text(json.dumps({"seconds": 5.0, "nulls": None, "device": device}))
-    (tmp_path / "speed_200").mkdir()
+    (tmp_path / "speed_200").mkdir(exist_ok=True)
     code = {"sysid sources SHA-256": "1a2b", "jax": "9.9.9"}
     (tmp_path / "speed_200/report.json").write_text(json.dumps({"code": code}))
     found = undeclared_figures.of_speed(tmp_path)

@@ -187,7 +187,7 @@ def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, 
 
 @pytest.mark.parametrize("accepted", [True, False])
 def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(sloping, monkeypatch, accepted):
-    def rounds(found, *_):
+    def rounds(_, found, *__):
         if accepted:
             found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
 

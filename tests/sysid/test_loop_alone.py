@@ -8,16 +8,19 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from linear_drives import EFFECTS, Linear, drives
 
 from sysid.errors.features import BIN, bin_width, make_features
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
-from sysid.missing.joint_fit import Refit
+from sysid.missing.days import no_wander
 from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
-from sysid.verdict.alone import UNTOLD, judged, simplest, stands_alone
+from sysid.verdict import alone
+from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Thresholds
 from sysid.verdict.preparation import days_of
+from sysid.verdict.rounds import NOTHING, Asked
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -66,57 +69,74 @@ def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not(
     assert not stands_alone(again, known=False)
 
 
-def search_with(residual, column, q=1.0):
-    """A search that named one effect with this column (B, n)."""
-    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
-    fit = Refit((one,), np.zeros(0), np.array([q]), 0.0, residual, column[..., None], np.zeros(0))
-    return SimpleNamespace(verdict="named", reason="", final=fit, accepted=[], classes=[])
+def verdict(sizes, wheels=True, **more):
+    """The verdict on linear drives that stand alone."""
+    evidence = drives(sizes, **more)
+    return search_alone(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), wheels, 300)
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_an_effect_is_named_only_where_blocks_of_drives_agree_on_it(shared):
-    rng = np.random.default_rng(0)
-    column = 3 * rng.standard_normal((16, 40))
-    groups = tuple((2 * i, 2 * i + 1) for i in range(8))
-    size = np.ones(16) if shared else np.repeat([3.0, -1.0] * 4, 2)
-    residual = rng.standard_normal((16, 40)) + (size - size.mean())[:, None] * column
-    found = judged(search_with(residual, column), groups, np.zeros((0, 0)), Thresholds())
-    assert found.verdict == ("named" if shared else "unexplained")
-    assert UNTOLD in found.reason
+def named(found):
+    return found.verdict, [one.hypothesis.effect for one in found.accepted]
 
 
-@pytest.mark.parametrize(("effect", "wheels", "verdict"), [
-    ("command_dead_zone", True, "named"), ("command_dead_zone", False, "unexplained"),
-    ("command_delay", False, "named"), ("slope", False, "named")])
-def test_an_effect_of_the_wheels_has_a_name_only_where_the_wheels_were_seen(effect, wheels, verdict):
-    rng = np.random.default_rng(0)
-    column, residual = 3 * rng.standard_normal((16, 40)), rng.standard_normal((16, 40))
-    groups = tuple((2 * i, 2 * i + 1) for i in range(8))
-    given = search_with(residual, column)
-    named = Hypothesis(effect, (Axis(f"{effect}.size", 1.0),))
-    given.final = replace(given.final, hypotheses=(named,))
-    found = judged(given, groups, np.zeros((0, 0)), Thresholds(), wheels)
-    assert found.verdict == verdict
-    assert ("log their speeds" in found.reason) == (verdict == "unexplained")
+def test_effects_are_added_as_long_as_they_predict_blocks_that_were_held_back():
+    found = verdict((0.0, 0.0, 1.0, 0.4))
+    assert named(found) == ("named", ["side_force", "command_scale"])
+    assert [one.hypothesis.effect for one in found.rounds[1]][0] == "command_scale" and len(found.rounds) == 3
+    assert UNTOLD in found.reason and found.excess[1] < found.excess[0]
 
 
-def test_of_effects_that_are_not_told_apart_the_simplest_is_named():
+def test_what_every_block_asks_another_size_of_is_not_named():
+    sizes = np.zeros((6, 1, 4))
+    sizes[..., 2] = np.array([3.0, -1.0, -1.0, -1.0, 3.0, -1.0])[:, None]
+    found = verdict(sizes)
+    assert found.rounds and found.verdict != "named" and not found.accepted
+    assert "does not predict blocks" in found.reason and UNTOLD in found.reason
+
+
+@pytest.mark.parametrize(("place", "wheels", "result"), [
+    (2, True, "named"), (2, False, "unexplained"), (0, False, "named")])
+def test_an_effect_of_the_wheels_has_a_name_only_where_the_wheels_were_seen(place, wheels, result):
+    found = verdict(np.eye(4)[place], wheels)
+    assert found.verdict == result
+    assert ("log their speeds" in found.reason) == (result == "unexplained")
+
+
+@pytest.mark.parametrize(("gains", "result"), [
+    ([(9.0, 11.0, 10.0), (8.0, 11.0, 10.0), (2.0, 2.0, 2.0)], "command_delay"),  # as good, and simpler
+    ([(9.0, 11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "acceleration_limit"),  # surely better
+    ([(9.0, -11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "command_delay"),  # wrong about a block
+])
+def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(monkeypatch, gains, result):
     def candidate(effect, axes, gain):
         one = Hypothesis(effect, tuple(Axis(f"{effect}.{i}", 1.0) for i in range(axes)))
-        return Candidate(one, gain, 1e-4, 1.0, f"refit of {effect}")
+        return Candidate(one, gain, 1e-4, 1.0, replace(base, cost=gain))
 
-    ramp, delay, other = (candidate(*each) for each in (
-        ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0)))
-    found = SimpleNamespace(accepted=[ramp], classes=[["acceleration_limit", "command_delay"]],
-                            rounds=[[ramp, delay, other]], final=ramp.refit, share=1.0)
-    simplest(found)
-    assert found.final == "refit of command_delay" and found.accepted == [delay]
-    assert found.classes == [["command_delay", "acceleration_limit"]]
+    evidence = drives(np.zeros(4))
+    linear = Linear(evidence)
+    base = linear.fit((), None)
+    asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(rounds=1), base,
+                  SimpleNamespace(p_family=0.0), np.eye(4))
+    listed = [candidate(*each) for each in (
+        ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0))]
+    told = dict(zip((60.0, 50.0, 20.0), gains, strict=True))
+
+    def candidates_of(asked, found, *_):
+        found.rounds.append(listed)
+        return listed
+
+    monkeypatch.setattr(alone, "begin", lambda *_: (asked, None))
+    monkeypatch.setattr(alone, "candidates_of", candidates_of)
+    monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
+    monkeypatch.setattr(alone, "class_of", lambda asked, best, _: [best.hypothesis.effect])
+    found = search_alone(evidence, EFFECTS, linear, asked.wander, asked.thresholds)
+    assert named(found) == ("named", [result])
+    assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():
-    found = judged(SimpleNamespace(verdict="none", reason="nothing stands out"), (), np.zeros((0, 0)), Thresholds())
-    assert found.verdict == "none" and found.reason == f"nothing stands out; {UNTOLD}"
+    found = verdict(np.zeros(4))
+    assert found.verdict == "none" and found.reason == f"{NOTHING}; {UNTOLD}"
 
 
 @dataclass

@@ -1,14 +1,17 @@
 """Another floor as one change of several quantities, on drives of a vehicle that is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from sysid.errors.noise import Whitener
 from sysid.errors.space import Space
-from sysid.logs.floor import BLOCKS, in_blocks, last_change, over_days, sums_of
+from sysid.logs.floor import BLOCKS, QUANTITIES, FloorChange, Member, in_blocks, last_change, over_days, sums_of
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, Start, Trial
 from sysid.missing.days import Leftover, Reference
 from sysid.missing.reference import BLOCK
+from sysid.verdict import vehicles
 from sysid.verdict.floor import floor_change
 from sysid.verdict.preparation import days_of
 from whill_mjx.vehicle.specs import HUSKY
@@ -90,3 +93,14 @@ def test_speeds_count_as_reached_when_the_command_has_not_changed_for_a_while():
 def test_blocks_of_one_run_know_that_they_are():
     days = days_of((Log("run", HUSKY, windows(0, 40), ""),))
     assert [day.fields[BLOCK] for day in days] == list(range(1, BLOCKS + 1))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_another_floor_moves_what_changed_and_nothing_else(named, monkeypatch):
+    fitted = []
+    monkeypatch.setattr(vehicles, "_to_poses", lambda result, vehicle, names, _: fitted.append(names) or "moved")
+    monkeypatch.setattr(vehicles, "describe", lambda vehicle: ("turn_lag.time_constant", "yaw_scrub.torque"))
+    members = tuple(Member(quantity, 1.0, 2.0, (1.5, 2.5), 9.0) for quantity in QUANTITIES[:2])
+    result = SimpleNamespace(reference=SimpleNamespace(params="as it was"), floor=FloorChange(members, 0.0, 5, named))
+    assert vehicles.on_other_floor(result) == ("moved" if named else "as it was")
+    assert fitted == ([["turn_lag.time_constant"]] if named else [])  # it has no turn efficiency

@@ -84,8 +84,9 @@ def test_half_of_what_is_left_makes_a_second_effect_unless_another_form_of_the_f
     alone, both = model.fit(1), model.fit(2)
     one = Candidate(effect("second"), alone.cost - both.cost, 0.0, 0.8, both)
     found = SimpleNamespace(accepted=[SimpleNamespace(gain=4 * one.gain)])
-    nothing_else = Thresholds(same=-1.0, own=2.0)
-    assert _own(one, found, 0.5, lambda fit: 0.8, model, GROUPS, nothing_else) is own
+    asked = SimpleNamespace(refitter=model, evidence=SimpleNamespace(groups=GROUPS), explained=lambda fit: 0.8,
+                            thresholds=Thresholds(same=-1.0, own=2.0))
+    assert _own(asked, one, found, 0.5) is own
 
 
 def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():

@@ -17,7 +17,7 @@ from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
 from sysid.pages.loop_page import not_determined
 from sysid.pages.loop_report import in_range, unit_of
-from sysid.verdict import null_refits
+from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.classes import imitation
@@ -72,6 +72,12 @@ def joint_fit(sizes, trials=3, bins=400):
     return fit, groups, gain
 
 
+def asked_of(groups, **more):
+    """What a search asks of the drives of `joint_fit`."""
+    return SimpleNamespace(refitter=SimpleNamespace(precision=np.eye(1)), evidence=SimpleNamespace(groups=groups),
+                           thresholds=Thresholds(), **more)
+
+
 @pytest.mark.quick
 def test_manoeuvres_agree_on_a_real_effect_and_foretell_one_another():
     fit, groups, gain = joint_fit((1.0, 1.0, 1.0, 1.0))
@@ -93,8 +99,7 @@ def test_manoeuvres_disagree_on_an_effect_that_only_one_of_them_asks_for():
 def test_a_small_second_effect_is_one_that_manoeuvres_agree_on(sizes, own):
     fit, groups, gain = joint_fit(sizes)
     one = Candidate(SimpleNamespace(key="second"), gain, 0.0, 0.6, fit)
-    refitter = SimpleNamespace(precision=np.eye(1))
-    assert _own(one, SimpleNamespace(rounds=[[]]), 0.5, None, refitter, groups, Thresholds()) is own
+    assert _own(asked_of(groups), one, SimpleNamespace(rounds=[[]]), 0.5) is own
 
 
 @pytest.mark.quick
@@ -108,8 +113,7 @@ def test_a_second_effect_that_leaves_nothing_is_there_though_manoeuvres_differ_o
     one = Candidate(SimpleNamespace(key="second"), gain, 0.0, share, fit)
     by_itself = Candidate(SimpleNamespace(key="second"), gain, 0.0, alone, fit)
     found = SimpleNamespace(rounds=[[by_itself]], base=fit)
-    refitter = SimpleNamespace(precision=np.eye(1))
-    assert _own(one, found, 0.5, lambda refit: alone, refitter, groups, Thresholds()) is own
+    assert _own(asked_of(groups, explained=lambda refit: alone), one, found, 0.5) is own
 
 
 @pytest.mark.quick
@@ -136,8 +140,10 @@ def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_th
     if search_p < Thresholds().alpha:
         found.accepted, found.classes = [candidate], [["quadratic_drag"]]
     wander = Wander((), (), freedom=10.0, excess=1.0)
-    _decide(found, Thresholds(), wander, lambda refit: refit.cost - 1, lambda residual: 0.0, np.zeros(1, int),
-            lambda refit: 1.0)
+    refitter = SimpleNamespace(drives=SimpleNamespace(repeats=np.zeros(1, int)), precision=np.zeros((0, 0)))
+    asked = SimpleNamespace(thresholds=Thresholds(), wander=wander, refitter=refitter,
+                            excess=lambda refit: refit.cost - 1, evidence=SimpleNamespace(groups=[[0]]))
+    _decide(asked, found, lambda residual: 0.0)
     assert found.verdict == verdict
     if verdict == "none":
         assert not found.accepted and not found.classes and found.final is found.base and found.share == 0
@@ -173,16 +179,17 @@ def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left
     """The last fit before a stand-in is dropped leaves nothing; the fit without it leaves `left`."""
     one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
 
-    def drop(found, *_):
+    def drop(_, found):
         found.accepted[-1] = replace(found.accepted[-1], refit=base_fit(left))
 
     asked = []
     scan = SimpleNamespace(p_family=0.0, gain=None, worth=None, q=None)
-    for name in ("at_fit", "Solver", "imitation", "best", "_class_of"):
-        monkeypatch.setattr(search_module, name, lambda *_: None)
-    monkeypatch.setattr(search_module, "run", lambda *_: scan)
+    for name in ("at_fit", "Solver", "imitation", "best"):
+        monkeypatch.setattr(rounds, name, lambda *_: None)
+    monkeypatch.setattr(search_module, "class_of", lambda *_: None)
+    monkeypatch.setattr(rounds, "run", lambda *_: scan)
     monkeypatch.setattr(search_module, "scan_pairs", lambda *_, **__: scan)
-    monkeypatch.setattr(search_module, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
+    monkeypatch.setattr(rounds, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
     monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
     monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
     monkeypatch.setattr(search_module, "_decide", lambda *_: None)

@@ -166,3 +166,31 @@ def test_a_replay_reads_late_odometry_off_the_path(speeds):
     step = lambda path: np.hypot(*np.diff(path[:, :2], axis=0).T)  # noqa: E731
     np.testing.assert_allclose(step(late[2:]), step(now[:-2]), atol=1e-5)
     np.testing.assert_allclose(late[0, :3], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("effect", [("turn_lag", {"time_constant": 2.0}), ("jerk_limit", {"angular": 0.05}),
+                                    ("acceleration_limit", {"linear": 0.1, "angular": 0.05})])
+def test_a_slow_effect_on_commands_has_been_under_way_for_long_where_a_drive_starts_in_motion(effect):
+    """A window of a longer drive: what lags by seconds does not begin with a command on the way from 0."""
+    import jax
+    import jax.numpy as jnp
+
+    from sysid.replay.models import with_surroundings
+    from sysid.replay.rollout import WARM_UP, path_of
+    from whill_mjx.effects import make_effect
+    from whill_mjx.vehicle.types import VehicleParams
+
+    def moved(params, state, command):
+        v, omega = command
+        turn = 0.01 * jnp.stack([v * jnp.cos(state[2]), v * jnp.sin(state[2]), omega])
+        return jnp.concatenate([state[:3] + turn, command])
+
+    plant = with_surroundings(lambda params, start: start, moved, lambda state: state,
+                              lambda state, start: state.at[:3].set(start[:3]), 0.01)
+    params = VehicleParams(None, (make_effect(effect[0], **effect[1]),))
+    command = jnp.broadcast_to(jnp.array([0.5, 0.4]), (100, 1, 2)).at[50:].set(0.0)
+    start = jnp.array([1.0, 2.0, 0.3, 0.5, 0.4])
+    path = jax.jit(lambda start: path_of(plant, params, command, start, round(WARM_UP / plant.dt)))(start)
+    speeds = path[:, 6:8]
+    np.testing.assert_allclose(speeds[:51], np.broadcast_to([0.5, 0.4], (51, 2)), atol=1e-3)
+    assert 0.3 < speeds[60, 1] < 0.4  # only now it slows down, by the law of the effect
