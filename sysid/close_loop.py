@@ -49,7 +49,7 @@ class Arguments:
     reference: tuple[Path, ...] = ()
     """Folders with drives of the same vehicle on other days."""
     vehicle: Path | None = None
-    """Vehicle file fitted before, taken as the reference instead of drives."""
+    """Vehicle file fitted before, kept as it is. With a reference too, the fit to these drives starts at it."""
     out: Path = Path("runs/close_loop")
     """Folder for the report and the vehicle file."""
     quick: bool = False
@@ -86,8 +86,6 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     from sysid.missing.fit_statistics import load_fitted
     from whill_mjx.vehicle.presets import preset_params
 
-    if arguments.vehicle is not None and arguments.reference:
-        raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to them.")
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
     check_logs(log, references)

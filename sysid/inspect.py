@@ -66,7 +66,7 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
 
     from sysid.pages.report import plain
     from sysid.pages.robot_plot import write_robot
-    from sysid.replay.mjcf_file import load_robot
+    from sysid.replay.robot import load_robot
     from sysid.replay.robot_check import check_robot, describe_robot
 
     robot = load_robot(config.dataset, config.wheels)

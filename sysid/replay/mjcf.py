@@ -27,21 +27,11 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import (
-    SIZES,
-    Entry,
-    Robot,
-    Size,
-    default_paths,
-    drive_entries,
-    load_robot,
-    resolve,
-    sizes_of,
-    turning_inertia,
-    write_mjcf,
-)
 from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+from sysid.replay.robot import Robot, load_robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
+from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
 from sysid.replay.models import Parameters, with_effects
+from sysid.replay.robot import Robot
+from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_sizes import Size
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec

@@ -13,6 +13,7 @@ from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
+QUICK_ROUNDS = 4  # along the floor of a valley
 TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count the same information
 FEATURE_ITERATIONS = 20
 GLOBAL = tuple(BATCH)  # methods that end with their global search

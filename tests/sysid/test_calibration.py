@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.plant.first_day import SMALL, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
+from benchmarks.plant.first_day import SMALL, Day, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.prior import UNKNOWN, bounds_alone
 from sysid.intervals.uncertainty import Estimate
@@ -21,11 +21,12 @@ from sysid.logs.synthetic import write_dataset
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import drive_entries, load_robot
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
+from sysid.replay.robot import load_robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_parameters import drive_entries
 from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
@@ -57,7 +58,7 @@ def commands() -> dict[str, np.ndarray]:
 def uncalibrated(tmp_path_factory) -> Log:
     """A robot of 21 kg on the contact plant."""
     folder = tmp_path_factory.mktemp("uncalibrated") / "log"
-    return load_log(make_uncalibrated(folder, "robot", WRONG, seed=4, replicates=1, manoeuvres=commands()))
+    return load_log(make_uncalibrated(folder, Day("robot", WRONG, seed=4), replicates=1, manoeuvres=commands()))
 
 
 @pytest.mark.quick
@@ -164,7 +165,7 @@ def small_robot(tmp_path_factory):
     folder = tmp_path_factory.mktemp("small")
     tables = {name: table * [1, 0.3, 2.0] for name, table in commands().items()}
     wrong = dataclasses.replace(WRONG, x=0.05, y=-0.02, odometry=0.0)
-    log = make_uncalibrated(folder / "log", "small", wrong, seed=5, replicates=1, manoeuvres=tables)
+    log = make_uncalibrated(folder / "log", Day("small", wrong, seed=5), replicates=1, manoeuvres=tables)
     return load_log(log), write_urdf(folder / "robot.urdf")
 
 

@@ -12,9 +12,10 @@ import pytest
 from sysid import inspect as inspect_module
 from sysid.replay import xacro_text
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import default_paths, load_robot
+from sysid.replay.robot import load_robot
 from sysid.replay.robot_check import check_robot, describe_robot
 from sysid.replay.robot_files import expand_xacro
+from sysid.replay.robot_parameters import default_paths
 
 pytestmark = pytest.mark.quick
 CYLINDER = '<cylinder radius="0.1" length="0.05"/>'

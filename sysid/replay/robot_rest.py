@@ -1,0 +1,61 @@
+"""A robot at rest on its floor: how it settles, and what it stands on beside its wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
+REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
+LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
+
+
+def settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: Sequence[int], radius: float) -> None:
+    """Let the model come to rest on its floor, without a command; ValueError where it does not."""
+    remedy = "Check its contacts, the gains and inertias of its wheels, and its timestep."
+    faults = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    steps = round(SETTLE / host.opt.timestep)
+    fastest = 0.0
+    for step in range(steps):
+        mujoco.mj_step(host, data)
+        if any(data.warning[int(fault)].number for fault in faults) or not np.isfinite(data.qpos).all():
+            raise ValueError(f"{path}: the model explodes while it settles on its floor, after "
+                             f"{(step + 1) * host.opt.timestep:.3f} s (a position, speed or acceleration is not "
+                             f"finite or huge). {remedy}")
+        if step >= 0.8 * steps:  # a wheel that shakes passes through 0
+            rims = np.abs(data.qvel[list(wheels)]) * radius
+            fastest = max(fastest, float(np.linalg.norm(data.qvel[speed : speed + 3])), *map(float, rims))
+    if fastest > REST_SPEED:
+        raise ValueError(f"{path}: after {SETTLE:g} s on its floor, without a command, the model still moves at "
+                         f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
+
+
+def sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int) -> tuple[int, ...]:
+    """Geoms fixed to the vehicle's main body that touch the world at rest."""
+    pairs = [(int(one.geom1), int(one.geom2)) for one in data.contact[: data.ncon]]
+    touching = {geom for pair in pairs for geom in pair if any(host.geom_bodyid[other] == 0 for other in pair)}
+    return tuple(sorted(geom for geom in touching if host.body_weldid[host.geom_bodyid[geom]] == root))
+
+
+def raise_supports(
+    path: Path, host: mujoco.MjModel, data: mujoco.MjData, spec: Any, sliding: Sequence[int], bodies: Sequence[int],
+) -> list[str]:  # fmt: skip
+    """Raise what slides before and behind the axle: at one height with the driven wheels it would share their load as
+    the stiffness of the contacts has it, where a real vehicle has springs or a gap. A note where it was done."""
+    axle = data.xpos[list(bodies)].mean(0)
+    place = (data.geom_xpos[list(sliding)] - axle).reshape(-1, 3)
+    ahead = place @ data.xmat[host.body_rootid[bodies[0]]].reshape(3, 3)[:, 0]
+    if not (ahead > 0).any() or not (ahead < 0).any():
+        return []
+    for geom, distance in zip(sliding, np.abs(ahead), strict=True):
+        up = data.xmat[host.geom_bodyid[geom]].reshape(3, 3).T @ np.array([0.0, 0.0, LEVEL * distance])
+        host.geom_pos[geom] += up
+        host.geom_sameframe[geom] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        spec.geom(host.geom(geom).name).pos = host.geom_pos[geom]
+    return [f"{path.name}: {', '.join(host.geom(one).name for one in sliding)} are raised by up to "
+            f"{1000 * LEVEL * np.abs(ahead).max():.2g} mm: they stand before and behind the axle, at the height of the "
+            "driven wheels"]
