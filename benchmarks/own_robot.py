@@ -25,7 +25,7 @@ from benchmarks.harness import figure, record
 from benchmarks.logs import CLAIM
 from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.first_day import SLOWER, SMALL, Day, Wrong, make_uncalibrated, write_urdf
-from sysid.logs.log import load_log
+from sysid.logs.log import load_log, of_file
 from sysid.missing.fit_statistics import load_fitted
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.loop_report import effects as named_effects
@@ -92,7 +92,8 @@ def judge(config: Benchmark) -> None:
         fit_dataset(out / "day_1", out / "fit", config=settings)
         print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
     loop = LoopConfig(quick=config.quick)
-    _, vehicle = load_fitted(fitted)
+    spec, vehicle = load_fitted(fitted)
+    days = [of_file(day, spec, str(fitted)) for day in days]
     reference = reference_for(days[0], days, loop, start=vehicle.params)
     ready = prepare(reference, days[0].spec, loop)
     print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
@@ -102,7 +103,7 @@ def judge(config: Benchmark) -> None:
         if path.exists():
             continue
         effects = ((name, size_of(name)),) if name in EFFECTS else ()
-        log = load_log(drive(out / f"log_{number}", LOG_SEED + number, 2, effects))
+        log = of_file(load_log(drive(out / f"log_{number}", LOG_SEED + number, 2, effects)), spec, str(fitted))
         began_log = time.perf_counter()
         result = find_missing(log, (), loop, reference=ready)
         found = [[one["name"], *one["class"]] for one in named_effects(result)]

@@ -72,10 +72,14 @@ class HostReplay:
         keys = [tuple(leaf[i].tobytes() for leaf in jax.tree.leaves(given)) for i in range(len(values))]
         first = {key: i for i, key in reversed(list(enumerate(keys)))}
         place = {key: k for k, key in enumerate(first)}
-        inner, states, commands, begin = jax.tree.map(lambda leaf: leaf[list(first.values())], given)
-        motion = self._host.drive({name: leaf[:, 0] for name, leaf in inner.items()}, states, commands,
-                                  self.batch.warm_up, begin[..., :3])
-        motion = motion[[place[key] for key in keys]]
+        drives = list(first.values())
+        driven = []
+        for start in range(0, len(drives), MANY):  # the host keeps all of its states
+            part = drives[start : start + MANY]
+            inner, states, commands, begin = jax.tree.map(lambda leaf, part=part: leaf[part], given)
+            driven.append(self._host.drive({name: leaf[:, 0] for name, leaf in inner.items()}, states, commands,
+                                           self.batch.warm_up, begin[..., :3]))
+        motion = np.concatenate(driven)[[place[key] for key in keys]]
         found: Simulated = _in_blocks(lambda sets, seen: self._after(sets, self.batch, seen),
                                       np.asarray(values, float), motion)
         return found

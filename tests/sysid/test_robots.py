@@ -58,6 +58,23 @@ NAMES = {
 }
 
 
+def test_driven_wheels_are_told_from_casters_with_sides_in_their_names(tmp_path):
+    """Wheel frames that are turned about x, on a chassis without a free joint of its own."""
+    def turned(name, y):
+        frame = joint(name, f"{name}_link", f'0 {y} 0" rpy="-1.5707963 0 0', "continuous", "0 0 1")
+        return link(f"{name}_link", CYLINDER) + frame
+
+    def caster(name, x, y):
+        return (link(f"{name}_1_link")
+                + joint(f"{name}_1_joint", f"{name}_1_link", f"{x} {y} -0.05", "continuous", "0 0 1")
+                + link(f"{name}_2_link", BALL)
+                + joint(f"{name}_2_joint", f"{name}_2_link", "-0.02 0 0", "continuous", "0 1 0", f"{name}_1_link"))
+
+    robot = load_robot(robot_file(tmp_path, turned("wheel_right_joint", -0.2), turned("wheel_left_joint", 0.2),
+                                  caster("caster_front_left", 0.2, 0.1), caster("caster_front_right", 0.2, -0.1)))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["wheel_left_joint", "wheel_right_joint"]
+
+
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
 def test_four_wheels_are_found_by_usual_names_and_make_a_skid_steered_robot(tmp_path, names):
     ahead = ("front_", "wheel_front", "fl_", "fr_", "wheel_1", "wheel_2")
