@@ -198,8 +198,12 @@ def harm_figures(repeats: int, seed: int) -> Iterator[dict[str, Any]]:
                 times = fitted_error(robot, drives) / usual
                 progress(f"robot {number + 1} of {repeats}, {fault.name} at {value:g} {fault.unit}: {times:.2f} times")
                 found.setdefault(f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{size + 1}", []).append(times)
+        fits = {name: [one for one in values if np.isfinite(one)] for name, values in found.items()}
         yield {name: {**figure(values, "times the error of a fit to the healthy log"), "size": sizes[name]}
-               for name, values in found.items()}
+               for name, values in fits.items() if values} | {
+            name.replace("error", "refused"): {**figure([1.0 - np.isfinite(one) for one in values], "share"),
+                                               "size": sizes[name]}
+            for name, values in found.items() if len(fits[name]) < len(values)}
 
 
 def write_hour(path: Path, seconds: float = 3600.0) -> None:
