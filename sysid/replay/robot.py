@@ -215,7 +215,7 @@ def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> t
         mujoco.mj_resetData(host, data)
         settle(path, host, data, speed, turning, radius)
         found = sliding(host, data, root)
-    for geom in found:
+    for geom in sliding(host, data, root, swivelling=True):
         friction = min(draft.stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
         host.geom_friction[geom, 0] = friction
         spec.geom(host.geom(geom).name).friction[0] = friction

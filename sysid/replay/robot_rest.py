@@ -11,6 +11,7 @@ import numpy as np
 
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
+UPRIGHT = 0.9  # cosine of the angle between a hinge and the vertical, at least, of a caster's swivel
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 
 
@@ -34,11 +35,22 @@ def settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: Sequ
                          f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
 
 
-def sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int) -> tuple[int, ...]:
-    """Geoms fixed to the vehicle's main body that touch the world at rest."""
+def sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int, swivelling: bool = False) -> tuple[int, ...]:
+    """Geoms fixed to the vehicle's main body that touch the world at rest; with `swivelling` also those on upright
+    hinges, which turn about the vertical and do not roll."""
     pairs = [(int(one.geom1), int(one.geom2)) for one in data.contact[: data.ncon]]
     touching = {geom for pair in pairs for geom in pair if any(host.geom_bodyid[other] == 0 for other in pair)}
-    return tuple(sorted(geom for geom in touching if host.body_weldid[host.geom_bodyid[geom]] == root))
+    return tuple(sorted(geom for geom in touching if _holds(host, data, int(host.geom_bodyid[geom]), root, swivelling)))
+
+
+def _holds(host: mujoco.MjModel, data: mujoco.MjData, body: int, root: int, swivelling: bool) -> bool:
+    """Whether a body is fixed to another one, or hangs on it by upright hinges alone."""
+    while swivelling and (body := int(host.body_weldid[body])) not in (0, root):
+        joints = range(host.body_jntadr[body], host.body_jntadr[body] + host.body_jntnum[body])
+        if any(abs(data.xaxis[joint, 2]) < UPRIGHT for joint in joints):
+            return False
+        body = int(host.body_parentid[body])
+    return int(host.body_weldid[body]) == root
 
 
 def raise_supports(

@@ -75,6 +75,16 @@ def test_driven_wheels_are_told_from_casters_with_sides_in_their_names(tmp_path)
     assert [robot.host.actuator(one).name for one in robot.actuators] == ["wheel_left_joint", "wheel_right_joint"]
 
 
+def test_a_block_on_a_swivel_slides_as_a_ball_does(tmp_path):
+    swivel = (link("fork", '<box size="0.04 0.02 0.02"/>', 0.2, 1e-3, origin="-0.02 0 -0.04")
+              + joint("swivel", "fork", "-0.25 0 -0.05", "continuous", "0 0 1"))
+    robot = load_robot(robot_file(tmp_path, wheel("left_wheel", 0, 0.2), wheel("right_wheel", 0, -0.2), swivel))
+    assert robot.host.geom("fork").friction[0] == pytest.approx(0.05)
+    assert robot.sliding == ()  # it swings round: no vehicle of the simulator has such a support
+    check = check_robot(robot)
+    assert check.drives_straight and check.speed > 0.98 * check.command[0]
+
+
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
 def test_four_wheels_are_found_by_usual_names_and_make_a_skid_steered_robot(tmp_path, names):
     ahead = ("front_", "wheel_front", "fl_", "fr_", "wheel_1", "wheel_2")
