@@ -30,12 +30,12 @@ from benchmarks.plant.first_day import SMALL_ONES, Day, Wrong, make_uncalibrated
 from sysid.command_line import progress_bar
 from sysid.logs.log import load_log
 from sysid.pages.report import error_rows, summaries
-from sysid.replay.model_files import SUFFIXES
-from sysid.replay.robot import load_robot
 from sysid.replay.robot_check import check_robot
+from sysid.replay.robot_loading import load_robot
 from sysid.search.fitting import expected_steps, fit_log, predict
 from sysid.search.settings import FitConfig
 from whill_mjx.io import command_line
+from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 MANOEUVRES = ("turn", "s_curve", "stop_and_go", "figure_eight")
 FARTHEST = 0.2, 15.0  # m, degrees: the tracked point from where it is believed to be, in `mounts`
@@ -128,7 +128,7 @@ def mounts(config: Benchmark) -> dict[str, dict]:
 
 def files(config: Benchmark) -> dict[str, dict]:
     """How many of a folder's robot files load, settle and drive straight on."""
-    paths = sorted(path for path in config.folder.rglob("*") if path.suffix in SUFFIXES)
+    paths = sorted(path for path in config.folder.rglob("*") if path.suffix in ROBOT_FILES)
     good = 0
     for path in paths:
         try:

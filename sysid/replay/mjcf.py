@@ -28,8 +28,9 @@ import numpy as np
 from flax import struct
 
 from sysid.replay.models import Bounds, Model, Parameters, Twin, make_parameters, with_surroundings
-from sysid.replay.robot import Robot, load_robot
+from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
 from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of

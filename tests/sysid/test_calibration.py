@@ -26,8 +26,8 @@ from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
-from sysid.replay.robot import load_robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import drive_entries
 from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares

@@ -26,7 +26,7 @@ from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
-from sysid.replay.robot import load_robot
+from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import default_paths, resolve, write_mjcf
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig

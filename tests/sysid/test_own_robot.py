@@ -15,7 +15,7 @@ from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
 from sysid.logs.log import load_log, of_file
 from sysid.missing.fit_statistics import load_fitted
-from sysid.replay.robot import load_robot
+from sysid.replay.robot_loading import load_robot
 from whill_mjx.export_mjcf import export, held, replay
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 

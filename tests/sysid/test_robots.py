@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from sysid import inspect as inspect_module
+from sysid.design import load_subject
+from sysid.logs.sources import about
 from sysid.replay import xacro_text
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.robot import load_robot
 from sysid.replay.robot_check import check_robot, describe_robot
 from sysid.replay.robot_files import expand_xacro
+from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import default_paths
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 pytestmark = pytest.mark.quick
 CYLINDER = '<cylinder radius="0.1" length="0.05"/>'
@@ -83,6 +86,17 @@ def test_a_block_on_a_swivel_slides_as_a_ball_does(tmp_path):
     assert robot.sliding == ()  # it swings round: no vehicle of the simulator has such a support
     check = check_robot(robot)
     assert check.drives_straight and check.speed > 0.98 * check.command[0]
+
+
+def test_where_a_vehicle_file_is_needed_a_robot_file_is_told_what_to_do_first(tmp_path):
+    path = robot_file(tmp_path)
+    with pytest.raises(ValueError, match=f"a robot file; needed here is a vehicle file.*--model {path}"):
+        load_vehicle(path)
+    assert about(path).startswith("a robot file. Look at it with python -m sysid.inspect")
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "fit/model.toml").touch()
+    with pytest.raises(ValueError, match="the fit of a model of your own"):
+        load_subject(str(tmp_path / "fit"))
 
 
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
