@@ -24,6 +24,7 @@ from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
 CREEP, SIDE_CREEP = 0.002, 0.005  # m/s, sliding speeds of a stiff tyre along and across
+SAG = 0.01  # of the wheel radius, of hard tyres; with a chair's 5 mm a robot of 6 cm wheelbase tips over when it brakes
 DRIVE = {"drive.kp": "torque_drive.kp", "drive.ki": "torque_drive.ki", "drive.limit": "torque_drive.limit"}
 FRICTION = ".friction"
 
@@ -69,10 +70,12 @@ def vehicle_of(
         "slip_traction.side_slip_speed": SIDE_CREEP, "slip_traction.mu_free": balls, "yaw_scrub.torque": 0.0,
         "rolling_resistance.mu_r": balls * share, "command_delay.delay": 0.0, "odometry_lag.time_constant": 0.0,
         "wheel_radius_difference.common": values["wheels.radius"] / spec.wheel_radius - 1,
+        "suspension.sag": SAG * spec.wheel_radius,
         "wheel_radius_difference.difference": values.get("wheels.difference", 0.0),
         "track_width.error": values.get("wheels.track", spec.track) / spec.track - 1}
     around = {effect.name: effect for effect in params.effects}
-    base = with_effects(preset_params(spec, "physical"), ("wheel_radius_difference", "track_width", *around))
+    own = ("wheel_radius_difference", "track_width", "suspension")
+    base = with_effects(preset_params(spec, "physical"), (*own, *around))
     vehicle = set_values(base, list(found), jnp.asarray(list(found.values()), jnp.result_type(float)))
     shared = {
         **{ours: (name, gain if ours == "drive.kp" else 1.0, 0.0) for ours, name in DRIVE.items()},
