@@ -106,6 +106,8 @@ def fit_log(
     began = time.perf_counter()
     log = of_earlier(log, config)
     given = make_problem(log, config, params, model)
+    if config.quick and given.plant.host is not None:
+        config = replace(config, elsewhere=False)
     model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
     trials = objective.trials
     wanted = profiled(space, config)

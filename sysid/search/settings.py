@@ -13,7 +13,6 @@ from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
-QUICK_ROUNDS = 4  # along the floor of a valley
 TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count the same information
 FEATURE_ITERATIONS = 20
 GLOBAL = tuple(BATCH)  # methods that end with their global search
@@ -41,7 +40,7 @@ class FitConfig:
     """Iterations of the gradient search, after the first one on features."""
     elsewhere: bool = True
     """Whether the gradient search also starts far away along ranges where that costs little, from other delays, and
-    from random points close to its end."""
+    from random points close to its end. A quick fit of a robot file does not: that takes four times as long."""
     seed: Annotated[int, SEED] = 0
     """Seed of both searches."""
     quick: bool = False

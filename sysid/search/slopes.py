@@ -100,14 +100,13 @@ def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:
 
 
 def descend(
-    objective: Residuals, result: FitResult, robust: bool = False, seed: int = 0, progress: Progress | None = None,
-    rounds: int = ROUNDS,
+    objective: Residuals, result: FitResult, robust: bool = False, seed: int = 0, progress: Progress | None = None
 ) -> FitResult:
     """The result with where damped Gauss-Newton steps with averaged slopes lead from its u, as long as costs fall."""
     u, cost, spent, misses = result.u, result.cost, 0, 0
     box, history = BoxStep(move=objective.space.moved), []
     (products,) = step("slopes", lambda: [_products(objective.jacobian(u[None])[1][0])], u)
-    for number in range(rounds):
+    for number in range(ROUNDS):
         before = cost
         covariance = likely_by(products, cost) * SIZES[number % len(SIZES)] ** 2
 

@@ -17,7 +17,7 @@ from sysid.errors.pose_objective import Told
 from sysid.errors.space import Space
 from sysid.search import least_squares, slopes
 from sysid.search.result import FitResult, Progress, Stages
-from sysid.search.settings import QUICK_ROUNDS, FitConfig
+from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
@@ -83,8 +83,7 @@ def gradient_search(
         result = replace(result, starts=given.starts, start_costs=given.start_costs, order=given.order)
         follow = partial(search, objective)
     while deeper:
-        result = slopes.descend(objective, result, config.robust, config.seed, progress,
-                                QUICK_ROUNDS if config.quick else slopes.ROUNDS)
+        result = slopes.descend(objective, result, config.robust, config.seed, progress)
         floor = result.cost
         result = _from_ends(follow, objective, result, iterations, config.robust)
         deeper = result.cost < floor * (1 - WORTH)
