@@ -13,7 +13,7 @@ import numpy as np
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import as_in_gazebo, below_wheels, leave_out_contacts, radius_of
 from sysid.replay.robot_files import read_robot
-from sysid.replay.robot_rest import raise_supports, settle, sliding
+from sysid.replay.robot_rest import NEAR, near_floor, raise_supports, settle, sliding
 from sysid.replay.robot_servos import add_servos, are_motors, drive_gain, integrals, is_stable, regulate, wheel_inertias
 from sysid.replay.wheels import wheel_joints
 from whill_mjx.io.fields import Field, check
@@ -148,19 +148,18 @@ def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> t
     path, spec, host, data = draft.path, draft.spec, draft.host, draft.data
     root = int(host.body_rootid[draft.bodies[0]])
     settle(path, host, data, speed, turning, radius)
-    found = sliding(host, data, root)
     if draft.stated is None:
-        return found
-    if raised := raise_supports(path, host, data, spec, found, draft.bodies):
+        return sliding(host, data, root)
+    supports = near_floor(host, data, root, NEAR * radius)
+    if raised := raise_supports(path, host, data, spec, supports, draft.bodies):
         draft.notes += raised
         mujoco.mj_resetData(host, data)
         settle(path, host, data, speed, turning, radius)
-        found = sliding(host, data, root)
-    for geom in sliding(host, data, root, swivelling=True):
+    for geom in {*supports, *sliding(host, data, root, swivelling=True)}:
         friction = min(draft.stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
         host.geom_friction[geom, 0] = friction
         spec.geom(host.geom(geom).name).friction[0] = friction
-    return found
+    return sliding(host, data, root)
 
 
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:

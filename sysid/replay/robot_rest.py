@@ -12,6 +12,7 @@ import numpy as np
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 UPRIGHT = 0.9  # cosine of the angle between a hinge and the vertical, at least, of a caster's swivel
+NEAR = 0.05  # of the wheel radius above the floor, within which a support may touch it in a drive
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 
 
@@ -41,6 +42,23 @@ def sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int, swivelling: bo
     pairs = [(int(one.geom1), int(one.geom2)) for one in data.contact[: data.ncon]]
     touching = {geom for pair in pairs for geom in pair if any(host.geom_bodyid[other] == 0 for other in pair)}
     return tuple(sorted(geom for geom in touching if _holds(host, data, int(host.geom_bodyid[geom]), root, swivelling)))
+
+
+def near_floor(host: mujoco.MjModel, data: mujoco.MjData, root: int, reach: float) -> tuple[int, ...]:
+    """Geoms fixed to the vehicle's main body that touch the world at rest, or are within `reach` [m] of a level floor:
+    a vehicle on two wheels leans on one of its supports, and on the other one when it brakes."""
+    planes = np.flatnonzero((host.geom_bodyid == 0) & (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    found = set(sliding(host, data, root))
+    for geom in range(host.ngeom) if len(planes) else ():
+        solid = bool(host.geom_contype[geom] | host.geom_conaffinity[geom])
+        if solid and int(host.body_weldid[host.geom_bodyid[geom]]) == root:
+            turn, half = data.geom_xmat[geom].reshape(3, 3)[2], host.geom_aabb[geom, 3:]
+            round_one = int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
+            low = data.geom_xpos[geom, 2] + turn @ host.geom_aabb[geom, :3] - (half[0] if round_one
+                                                                              else np.abs(turn) @ half)
+            if low - data.geom_xpos[planes, 2].max() < reach:
+                found.add(geom)
+    return tuple(sorted(found))
 
 
 def _holds(host: mujoco.MjModel, data: mujoco.MjData, body: int, root: int, swivelling: bool) -> bool:

@@ -159,6 +159,15 @@ def test_balls_before_and_behind_the_axle_leave_the_weight_to_the_wheels(tmp_pat
     assert any("a, b are raised by up to 2 mm" in note for note in robot.notes)
 
 
+def test_a_support_that_hangs_just_above_the_floor_slides_too(tmp_path):
+    """A robot that leans forward comes down on it when it speeds up."""
+    balls = [link(name, BALL, mass) + joint(f"{name}_joint", name, f"{x} 0 {z}")
+             for name, mass, x, z in (("front", 2.0, 0.2, -0.05), ("rear", 0.1, -0.2, -0.047))]
+    robot = load_robot(robot_file(tmp_path, *TWO, *balls))
+    assert robot.host.geom("rear").friction[0] == pytest.approx(0.05)
+    assert any("front, rear are raised" in note for note in robot.notes) and drives(robot)[0]
+
+
 def test_a_ball_slides_with_the_friction_that_is_stated_for_gazebo(tmp_path):
     ball = link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05")
     for stated, friction in (("", 0.05), ("<mu1>0.2</mu1>", 0.2), ('<mu1 value="0.3"/>', 0.3)):
