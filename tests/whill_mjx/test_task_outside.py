@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -15,7 +17,9 @@ import pytest
 
 from whill_mjx.env import make_env, reset_state, step_state
 from whill_mjx.io.command_line import OptionError
+from whill_mjx.io.registry import Registry
 from whill_mjx.learning.setup import find_preset
+from whill_mjx.tasks import tasks
 from whill_mjx.tasks.base import Budget, Task
 from whill_mjx.tasks.corridor import Corridor
 from whill_mjx.tasks.options import named_task, read_fields
@@ -247,3 +251,21 @@ def test_every_task_that_ships_begins_free_and_away_from_its_goal(name):
     free, away = jax.jit(jax.vmap(look))(jax.random.split(jax.random.key(1), 200))
     assert float(free.min()) > 0.05 and np.isfinite(away).all()
     assert name == "follow" or float(away.min()) > task.goal_radius + 0.5  # a person is near at first, and walks away
+
+
+@pytest.mark.quick
+def test_threads_that_look_up_at_the_same_time_all_find_everything():
+    with ThreadPoolExecutor(4) as pool:
+        known = Registry("task", "whill_mjx.tasks", tasks.__file__, slowly(tasks.tasks_in), tasks._as_task, tasks.PARTS)
+        counts = list(pool.map(lambda _: len(known), range(4)))
+    assert {"corridor", "obstacle_course"} <= set(known) and counts == [len(known)] * 4
+
+
+def slowly(found_in):
+    """What is found in a module, after a moment in which other threads go on."""
+
+    def find(module):
+        time.sleep(0.01)
+        return found_in(module).values()
+
+    return find

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -43,7 +44,7 @@ class Registry(Mapping[str, Named]):
         self._what, self._room, self._files, self._apart = what, room, files, apart
         self._found_in, self._checked = found_in, checked
         self._known: dict[str, Named] = {}
-        self._loaded = False
+        self._state, self._lock = "new", threading.RLock()
 
     def __getitem__(self, name: str) -> Named:
         return self._all()[name]
@@ -75,13 +76,16 @@ class Registry(Mapping[str, Named]):
         del self._all()[name]
 
     def _all(self) -> dict[str, Named]:
-        if not self._loaded:
-            self._loaded = True  # first: what is loaded may register a thing
-            try:
-                self._load()
-            except BaseException:
-                self._known, self._loaded = {}, False
-                raise
+        if self._state != "loaded":
+            with self._lock:  # another thread waits until all are there; what is loaded may itself register one
+                if self._state == "new":
+                    self._state = "loading"
+                    try:
+                        self._load()
+                        self._state = "loaded"
+                    except BaseException:
+                        self._known, self._state = {}, "new"
+                        raise
         return self._known
 
     def _load(self) -> None:
