@@ -2,10 +2,12 @@
 
     python -m benchmarks.calibration                     # drives and fits it
     python -m benchmarks.calibration --robot porter --file mjcf      # one of 9 kg, from a file with motors
+    python -m benchmarks.calibration --parts mounts      # markers 0.2 m and 15 degrees off, on three vehicles
     python -m benchmarks.calibration --parts files --folder ROBOTS   # loads and drives each robot file of a folder
 
 `small`: a robot of a kilogram is driven on the contact plant, which shares no code with the model, and fitted as by
-`sysid.fit LOG --model robot.urdf`. `files`: every robot file of a folder is loaded, settled and driven straight on.
+`sysid.fit LOG --model robot.urdf`. `mounts`: the same of a chair, a scooter and a robot of 21 kg, by the default fit.
+`files`: every robot file of a folder is loaded, settled and driven straight on.
 
 Writes benchmarks/results/logs.json.
 """
@@ -22,19 +24,21 @@ import numpy as np
 
 from benchmarks.harness import figure, record
 from benchmarks.logs import CLAIM
+from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.commands import nine
-from benchmarks.plant.first_day import FASTER, SLOWER, SMALL_ONES, Wrong, make_uncalibrated, write_mjcf, write_urdf
+from benchmarks.plant.first_day import SMALL_ONES, Day, Wrong, make_uncalibrated, slowed, write_mjcf, write_urdf
 from sysid.command_line import progress_bar
 from sysid.logs.log import load_log
 from sysid.pages.report import error_rows, summaries
-from sysid.replay.mjcf_file import load_robot
-from sysid.replay.model_files import SUFFIXES
 from sysid.replay.robot_check import check_robot
+from sysid.replay.robot_loading import load_robot
 from sysid.search.fitting import expected_steps, fit_log, predict
 from sysid.search.settings import FitConfig
 from whill_mjx.io import command_line
+from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 MANOEUVRES = ("turn", "s_curve", "stop_and_go", "figure_eight")
+FARTHEST = 0.2, 15.0  # m, degrees: the tracked point from where it is believed to be, in `mounts`
 LENGTH = 12.0  # s of each manoeuvre
 
 
@@ -43,7 +47,7 @@ class Benchmark:
     """What to measure."""
 
     parts: tuple[str, ...] = ("small",)
-    """Of small and files."""
+    """Of small, mounts and files."""
     robot: Literal["small", "porter"] = "small"
     """One of 1.2 kg with quick controllers, or one of 9 kg with slow ones."""
     file: Literal["urdf", "mjcf"] = "urdf"
@@ -59,19 +63,22 @@ class Benchmark:
     """Whether the fit looks for other minima."""
 
 
+def short_drives(seed: int, names: tuple[str, ...] = MANOEUVRES) -> dict[str, np.ndarray]:
+    """Command tables (T, 3) of manoeuvres for a small robot, cut to `LENGTH` and stopped at their end."""
+    tables = slowed({name: table[table[:, 0] < LENGTH] for name, table in nine(seed).items() if name in names})
+    for table in tables.values():
+        table[-5:, 1:] = 0.0
+    return tables
+
+
 def small(config: Benchmark) -> dict[str, dict]:
     """Figures of the small robot."""
     wrong, chair = Wrong(x=0.05, y=-0.02), SMALL_ONES[config.robot]
     write, suffix = (write_urdf, "urdf") if config.file == "urdf" else (write_mjcf, "xml")
-    tables = {}
-    for name, table in nine(config.seed).items():
-        if name in MANOEUVRES:
-            kept = table[table[:, 0] < LENGTH] * [1.0, SLOWER, FASTER]
-            kept[-5:, 1:] = 0.0
-            tables[name] = kept
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        make_uncalibrated(folder / "log", config.robot, wrong, config.seed, config.replicates, tables)
+        make_uncalibrated(folder / "log", Day(config.robot, wrong, config.seed), config.replicates,
+                          short_drives(config.seed))
         log = load_log(folder / "log")
         settings = FitConfig(model=str(write(folder / f"robot.{suffix}", chair)), quick=config.quick,
                              elsewhere=config.elsewhere)
@@ -99,9 +106,29 @@ def small(config: Benchmark) -> dict[str, dict]:
     return {f"{name}{kind}": figure([float(value)], unit) for name, (value, unit) in values.items()}
 
 
+def mounts(config: Benchmark) -> dict[str, dict]:
+    """Errors of the tracked point's place and heading, fitted to built-in kinds of vehicle; the largest counts."""
+    places, turns = [], []
+    for number, vehicle in enumerate(VEHICLES):
+        random = np.random.default_rng([config.seed, number])
+        where, yaw = random.uniform(0, 2 * np.pi), math.radians(random.choice([-1.0, 1.0]) * FARTHEST[1])
+        wrong = Wrong(x=FARTHEST[0] * math.cos(where), y=FARTHEST[0] * math.sin(where), yaw=yaw)
+        tables = {name: table for name, table in nine(config.seed).items() if name in MANOEUVRES}
+        with tempfile.TemporaryDirectory() as temporary:
+            log = load_log(make_uncalibrated(Path(temporary) / "log", Day(vehicle, wrong, config.seed),
+                                             config.replicates, tables))
+        fit = fit_log(log, FitConfig(quick=config.quick, elsewhere=config.elsewhere))
+        found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))
+        places.append(1000 * math.hypot(found["pose_mount.x"] - wrong.x, found["pose_mount.y"] - wrong.y))
+        turns.append(abs(math.degrees(found["pose_mount.yaw"] - wrong.yaw)))
+        print(f"{vehicle}: {places[-1]:.2f} mm, {turns[-1]:.3f} deg, {fit.seconds:.0f} s", flush=True)
+    return {"far_mount_offset_mm": {**figure(places, "mm"), "value": max(places)},
+            "far_mount_offset_deg": {**figure(turns, "deg"), "value": max(turns)}}
+
+
 def files(config: Benchmark) -> dict[str, dict]:
     """How many of a folder's robot files load, settle and drive straight on."""
-    paths = sorted(path for path in config.folder.rglob("*") if path.suffix in SUFFIXES)
+    paths = sorted(path for path in config.folder.rglob("*") if path.suffix in ROBOT_FILES)
     good = 0
     for path in paths:
         try:
@@ -121,7 +148,7 @@ def main(config: Benchmark) -> None:
     """Measure and record."""
     figures: dict[str, dict] = {}
     for part in config.parts:
-        figures |= {"small": small, "files": files}[part](config)
+        figures |= {"small": small, "mounts": mounts, "files": files}[part](config)
     for name, one in figures.items():
         print(f"{name}: {np.round(one['value'], 4)} {one['unit']}")
     print(record("logs", CLAIM, figures))

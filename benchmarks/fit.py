@@ -51,11 +51,11 @@ def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
     log = load_log(settings.shared / "data" / "plant" / "plain")
     for preset in settings.presets:
-        fit = fit_log(log, FitConfig(preset=preset, iterations=settings.iterations))
-        figures, ratio = against_replicates(fit, log, f"plant_{preset}")
-        figures[f"plant_replicate_ratio_{preset}"] = ratio
+        fit = fit_log(log, FitConfig(preset=preset, iterations=settings.iterations, calibrate=settings.calibrate))
+        figures, ratio = against_replicates(fit, log, f"plant_{preset}{settings.tag}")
+        figures[f"plant_replicate_ratio_{preset}{settings.tag}"] = ratio
         if preset == "physical":
-            figures["plant_replicate_ratio"] = ratio
+            figures[f"plant_replicate_ratio{settings.tag}"] = ratio
         record("fit", CLAIM, figures)
         show(figures)
         show_parameters(fit)
@@ -64,8 +64,9 @@ def plant(settings: Benchmark) -> None:
 def chair(settings: Benchmark) -> None:
     """The log that ships with the package."""
     log = load_log(Path(__file__).parents[1] / "sysid" / "data" / "chair")
-    fit = fit_log(log, FitConfig(iterations=settings.iterations))
-    figures, figures["chair_replicate_ratio"] = against_replicates(fit, log, "chair")
+    fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
+    figures, ratio = against_replicates(fit, log, f"chair{settings.tag}")
+    figures[f"chair_replicate_ratio{settings.tag}"] = ratio
     record("fit", CLAIM, figures)
     show(figures)
     show_parameters(fit)
@@ -80,10 +81,11 @@ def contact(settings: Benchmark) -> None:
         with tempfile.TemporaryDirectory() as folder:
             make_log(Path(folder) / "log", seed=seed)
             log = load_log(Path(folder) / "log")
-        fit = fit_log(log, FitConfig(iterations=settings.iterations))
+        fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
         ratios.append(against_replicates(fit, log, "contact")[1]["value"])
         seconds.append(fit.seconds)
-    figures = {"contact_replicate_ratio": figure(ratios, "-"), "seconds_contact": figure(seconds, "s")}
+    figures = {f"contact_replicate_ratio{settings.tag}": figure(ratios, "-"),
+               f"seconds_contact{settings.tag}": figure(seconds, "s")}
     record("fit", CLAIM, figures)
     show(figures)
 

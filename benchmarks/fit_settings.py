@@ -56,6 +56,9 @@ class Benchmark:
     ones are scored."""
     iterations: int = 20
     """Iterations of the gradient search on poses."""
+    calibrate: bool = True
+    """Of plant, chair and contact: fit true wheel sizes and the tracked point too. Without, figures have another name:
+    what do these parameters cost on logs that do not need them?"""
     repeats: int = 3
     """Timed fits."""
     seeds: tuple[int, ...] = (2000, 2001, 2002)
@@ -65,3 +68,8 @@ class Benchmark:
     with twice the step of a fit, which ends with its own."""
     presets: tuple[Literal["paper", "physical"], ...] = ("physical", "paper")
     """Base models."""
+
+    @property
+    def tag(self) -> str:
+        """What the names of figures of fits without calibration end in."""
+        return "" if self.calibrate else "_as_stated"

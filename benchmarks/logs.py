@@ -13,6 +13,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -181,9 +182,12 @@ def fitted_error(robot: Robot, drives: list[Drive]) -> float:
     return float(np.mean([error for error in errors if error is not None]))
 
 
-def harm_figures(repeats: int, seed: int) -> dict[str, Any]:
-    """How many times the error of a fit to a healthy log that of a fit to the same log with a fault is, by size."""
+def harm_figures(repeats: int, seed: int) -> Iterator[dict[str, Any]]:
+    """How many times the error of a fit to a healthy log that of a fit to the same log with a fault is, by size; after
+    each robot those of all so far."""
     found: dict[str, list[float]] = {}
+    sizes = {f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{k + 1}": f"{value:g} {fault.unit}"
+             for fault in FAULTS for k, value in enumerate(fault.sizes)}
     for number in range(repeats):
         random = np.random.default_rng(1000 * seed + number)
         robot = healthy(random, turning=1.0, whole=True)
@@ -194,10 +198,12 @@ def harm_figures(repeats: int, seed: int) -> dict[str, Any]:
                 times = fitted_error(robot, drives) / usual
                 progress(f"robot {number + 1} of {repeats}, {fault.name} at {value:g} {fault.unit}: {times:.2f} times")
                 found.setdefault(f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{size + 1}", []).append(times)
-    sizes = {f"fit_error_{re.sub('[^a-z]+', '_', fault.name)}_{k + 1}": f"{value:g} {fault.unit}"
-             for fault in FAULTS for k, value in enumerate(fault.sizes)}
-    return {name: {**figure(values, "times the error of a fit to the healthy log"), "size": sizes[name]}
-            for name, values in found.items()}
+        fits = {name: [one for one in values if np.isfinite(one)] for name, values in found.items()}
+        yield {name: {**figure(values, "times the error of a fit to the healthy log"), "size": sizes[name]}
+               for name, values in fits.items() if values} | {
+            name.replace("error", "refused"): {**figure([1.0 - np.isfinite(one) for one in values], "share"),
+                                               "size": sizes[name]}
+            for name, values in found.items() if len(fits[name]) < len(values)}
 
 
 def write_hour(path: Path, seconds: float = 3600.0) -> None:
@@ -286,7 +292,10 @@ def main() -> None:
     if "faults" in options.parts:
         figures |= fault_figures(options.count, options.seed, options.dry)
     if "fits" in options.parts:
-        figures |= harm_figures(options.repeats, options.seed)
+        for so_far in harm_figures(options.repeats, options.seed):
+            figures |= so_far
+            if not options.dry:
+                record("logs", CLAIM, figures)
     if "hour" in options.parts:
         figures |= hour_figures(options.repeats)
     for name, one in figures.items():

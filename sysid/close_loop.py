@@ -27,7 +27,7 @@ if starts(__name__):
     listen()
 
 from sysid import command_line
-from sysid.logs.log import check_same_vehicle
+from sysid.logs.log import of_file
 from sysid.logs.records import Log
 from sysid.logs.sources import refuse_recording
 from sysid.missing.catalogue import hypotheses, outside_hypotheses
@@ -49,7 +49,7 @@ class Arguments:
     reference: tuple[Path, ...] = ()
     """Folders with drives of the same vehicle on other days."""
     vehicle: Path | None = None
-    """Vehicle file fitted before, taken as the reference instead of drives."""
+    """Vehicle file fitted before, kept as it is. With a reference too, the fit to these drives starts at it."""
     out: Path = Path("runs/close_loop")
     """Folder for the report and the vehicle file."""
     quick: bool = False
@@ -86,8 +86,6 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     from sysid.missing.fit_statistics import load_fitted
     from whill_mjx.vehicle.presets import preset_params
 
-    if arguments.vehicle is not None and arguments.reference:
-        raise ValueError("--reference and --vehicle are both given. Give the drives, or the vehicle fitted to them.")
     log = load_any(arguments.dataset)
     references = [load_any(path) for path in arguments.reference]
     check_logs(log, references)
@@ -98,7 +96,7 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     if arguments.vehicle is not None:
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")
         spec, vehicle = load_fitted(arguments.vehicle)
-        check_same_vehicle(log, spec, str(arguments.vehicle), "The vehicle file must be of the same vehicle")
+        log, *references = (of_file(one, spec, str(arguments.vehicle)) for one in (log, *references))
     base = preset_params(log.spec, LoopConfig.preset) if vehicle is None else vehicle.params
     known = {one.effect for one in (*hypotheses(log.spec, base), *outside_hypotheses(log.spec, base, ()))}
     for name in arguments.without:

@@ -114,8 +114,12 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
         return spec, params, load_intervals(name) if name.endswith(".toml") else {}, DEFAULT
     from sysid.pages.report import read_report
 
-    report = read_report(Path(name))
     file = str(Path(name) / "vehicle.toml")
+    if not Path(file).exists() and (Path(name) / "model.toml").exists():
+        raise ValueError(f"{name}: the fit of a model of your own, as which no vehicle of the simulator drives "
+                         "(dataset.notes in its report.json say why). Drives are designed for vehicles only; take one "
+                         "of similar size, or those that python -m sysid.inspect DATASET proposes.")
+    report = read_report(Path(name))
     spec, params, _ = load_vehicle(file)
     outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
         ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))

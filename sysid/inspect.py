@@ -66,8 +66,8 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
 
     from sysid.pages.report import plain
     from sysid.pages.robot_plot import write_robot
-    from sysid.replay.mjcf_file import load_robot
     from sysid.replay.robot_check import check_robot, describe_robot
+    from sysid.replay.robot_loading import load_robot
 
     robot = load_robot(config.dataset, config.wheels)
     check = check_robot(robot)
@@ -102,9 +102,9 @@ def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDr
 
 def main(config: InspectConfig) -> dict[str, Any]:
     """Load, look, print and write."""
-    from sysid.replay.model_files import SUFFIXES
+    from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
-    if config.dataset.suffix in SUFFIXES:
+    if config.dataset.suffix in ROBOT_FILES:
         with refusing():
             return inspect_robot(config)
     with refusing():

@@ -135,7 +135,6 @@ def mistakes(tmp_path_factory):
     ("close_loop", "data --vehicle nope", "unknown vehicle 'nope'"),
     ("close_loop", "data --vehicle data", "data: a dataset"),
     ("close_loop", "data --vehicle husky", "husky: wheel_radius is 0.165, but 0.1325"),
-    ("close_loop", "data --vehicle whill_cr --reference data", "--reference and --vehicle are both given"),
     ("close_loop", "data --decision coin", "--decision"),
     ("close_loop", "nowhere", "nowhere"),
     ("close_loop", "data --out file", "--out file: is a file, not a folder"),

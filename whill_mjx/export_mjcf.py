@@ -40,14 +40,16 @@ import numpy as np
 
 from whill_mjx.effects.base import apply_chain
 from whill_mjx.io.folders import new_folder
+from whill_mjx.logs.manoeuvres import Scenario, command_table
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import advance_odometry, forces, mass_distribution, nominal_world, place, substep
-from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.kinematics import reference_pose, rotation_from_quaternion
 from whill_mjx.vehicle.model import ASSET, VehicleModel, build_model, mujoco_model
-from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec
 from whill_mjx.vehicle.types import Odometry, VehicleParams, VehicleState
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
+TIPPED = 0.8  # rad of tilt from which no vehicle comes back on its wheels
 FILES = ("vehicle.xml", "vehicle.toml", "drive.py")
 EXAMPLE = '''"""Drives the vehicle in C MuJoCo for ten seconds; prints where it is and where it thinks it is."""
 
@@ -198,16 +200,26 @@ class Replay:
 
     mujoco: np.ndarray  # (T, 3) x, y [m], yaw [rad] of the reference point
     simulator: np.ndarray  # (T, 3)
+    tilt: np.ndarray
+    """(T,) of the vehicle against the vertical, the larger of both [rad]."""
+
+    @property
+    def upright(self) -> int:
+        """Steps until it tips over; all where it does not."""
+        fallen = np.flatnonzero(self.tilt > TIPPED)
+        return int(fallen[0]) if len(fallen) else len(self.tilt)
 
     @property
     def distance(self) -> float:
-        """Largest distance between the two [m]."""
-        return float(np.linalg.norm((self.mujoco - self.simulator)[:, :2], axis=1).max())
+        """Largest distance between the two while the vehicle stands on its wheels [m]."""
+        apart = (self.mujoco - self.simulator)[: self.upright, :2]
+        return float(np.linalg.norm(apart, axis=1).max(initial=0.0))
 
     @property
     def turn(self) -> float:
-        """Largest difference of the yaw [rad]."""
-        return float(np.abs(np.angle(np.exp(1j * (self.mujoco - self.simulator)[:, 2]))).max())
+        """Largest difference of the yaw meanwhile [rad]."""
+        apart = (self.mujoco - self.simulator)[: self.upright, 2]
+        return float(np.abs(np.angle(np.exp(1j * apart))).max(initial=0.0))
 
 
 def replay(folder: Path, commands: np.ndarray) -> Replay:
@@ -233,16 +245,22 @@ def replay(folder: Path, commands: np.ndarray) -> Replay:
     dt = float(host.opt.timestep)
     model = build_model(spec, VehicleConfig(control_dt=dt, physics_dt=dt))
 
+    def seen(qpos: jax.Array) -> jax.Array:
+        """x, y, yaw and tilt."""
+        upward = rotation_from_quaternion(qpos[3:7])[2, 2]
+        return jnp.stack([*reference_pose(model, qpos), jnp.arccos(jnp.clip(upward, -1.0, 1.0))])
+
     def one(state: VehicleState, command: jax.Array) -> tuple[VehicleState, jax.Array]:
         state = substep(model, params, state, command)
-        return state, jnp.stack(reference_pose(model, state.qpos))
+        return state, seen(state.qpos)
 
     dtype = jnp.result_type(float)
     limits = host.actuator_ctrlrange  # MuJoCo clips what it is given
     clipped = jnp.asarray(np.clip(commands, limits[:, 0], limits[:, 1]), dtype)
     simulated = jax.jit(lambda c: jax.lax.scan(one, place(model, params, 0.0, 0.0, 0.0), c)[1])(clipped)
-    poses = jax.jit(jax.vmap(lambda qpos: jnp.stack(reference_pose(model, qpos))))(jnp.asarray(np.stack(driven), dtype))
-    return Replay(np.asarray(poses, float), np.asarray(simulated, float))
+    ours, theirs = (np.asarray(one, float) for one in (
+        simulated, jax.jit(jax.vmap(seen))(jnp.asarray(np.stack(driven), dtype))))
+    return Replay(theirs[:, :3], ours[:, :3], np.maximum(ours[:, 3], theirs[:, 3]))
 
 
 def held(table: np.ndarray, dt: float) -> np.ndarray:
@@ -296,16 +314,25 @@ class Options:
 
 def main(options: Options) -> None:
     """Export, check and say what was written."""
-    from whill_mjx.logs.manoeuvres import Scenario, command_table
-
     with refusing():
         spec, params, _ = load_vehicle(options.vehicle)
     folder = export(spec, params, options.out, options.physics_dt)
     print(f"wrote {', '.join(str(folder / name) for name in FILES)}")
     if options.check:
-        found = replay(folder, held(command_table("figure_eight", Scenario()), options.physics_dt))
+        found = replay(folder, held(command_table("figure_eight", in_proportion(spec)), options.physics_dt))
         print(f"figure-eight of {len(found.mujoco) * options.physics_dt:.0f} s: C MuJoCo and the simulator at most "
               f"{1e3 * found.distance:.2f} mm and {1e3 * found.turn:.2f} mrad apart")
+        if found.upright < len(found.tilt):
+            print(f"the vehicle tips over {found.upright * options.physics_dt:.1f} s into this drive, and both are "
+                  "compared until then. Its drives speed up and brake too hard for its size: drive it slowly, or give "
+                  "it an acceleration_limit or a lower torque_drive.limit")
+
+
+def in_proportion(spec: VehicleSpec) -> Scenario:
+    """How hard a vehicle of this size is driven: a small one tips over as easily as a large one (Froude number)."""
+    slower = math.sqrt(spec.track / WHILL_CR.track)
+    usual = Scenario()
+    return Scenario(v=min(usual.v * slower, spec.v_max), omega=min(usual.omega / slower, spec.omega_max))
 
 
 def cli() -> None:

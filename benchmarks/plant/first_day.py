@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zlib import crc32
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from benchmarks.plant.base import Effect
 from benchmarks.plant.chair import COULOMB, SLOW, VEHICLES, Chair, Contact, Nominal
 from benchmarks.plant.commands import nine
+from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.effects.sensing import OdometryScale
 from benchmarks.plant.make import Result, write_dataset
 from benchmarks.plant.sensors import odometry, outside_pose
@@ -58,49 +60,84 @@ class Wrong:
     """Tracked heading to the left of the vehicle's [rad]."""
 
 
-def uncalibrated(vehicle: str, wrong: Wrong) -> Chair:
-    """A vehicle of `chair.VEHICLES` or `SMALL_ONES`, with true sizes that differ from its nominal ones."""
-    chair = (VEHICLES | SMALL_ONES)[vehicle]
-    radius = chair.nominal.radius * (1 + wrong.radius)
-    return replace(chair, radius=(radius, radius), track=chair.nominal.track * (1 + wrong.track))
+@dataclass(frozen=True)
+class Day:
+    """One day of a vehicle that nobody has calibrated."""
+
+    vehicle: str
+    """Of `chair.VEHICLES` or `SMALL_ONES`."""
+    wrong: Wrong = Wrong()
+    seed: int = 0
+    """Of command levels, the day, start headings, disturbances and sensor noise."""
+    effects: tuple[tuple[str, float], ...] = ()
+    """Undeclared ones by name, with their sizes in the units of `effects.EFFECTS`."""
+    varies: bool = False
+    """Gains, mass and friction differ from those of other days by a few percent."""
+
+    @property
+    def small(self) -> bool:
+        """Whether it stands on a ball."""
+        return self.vehicle in SMALL_ONES
+
+    @property
+    def chair(self) -> Chair:
+        """The vehicle on this day, with true sizes that differ from its nominal ones."""
+        chair = (VEHICLES | SMALL_ONES)[self.vehicle]
+        if self.varies:
+            chair = chair.on_day(np.random.default_rng([self.seed, 1]))
+        radius = chair.nominal.radius * (1 + self.wrong.radius)
+        chair = replace(chair, radius=(radius, radius), track=chair.nominal.track * (1 + self.wrong.track))
+        for name, size in self.effects:
+            chair = EFFECTS[name].make.change(chair, size)
+        return chair
+
+    @property
+    def noise(self) -> Noise:
+        """Disturbances and sensors; of a small robot on a smooth floor, its markers near the cameras."""
+        nominal = self.chair.nominal
+        noise = Noise().of(self.chair)
+        return replace(noise, yaw_torque=0.2 * noise.yaw_torque * nominal.track / Nominal().track, position=0.001,
+                       yaw=0.002) if self.small else noise  # fmt: skip
+
+    def effects_of(self, number: int) -> list[Effect]:
+        """Fresh effects of one trial, with random numbers of their own."""
+        return [EFFECTS[name].make(size, np.random.default_rng([self.seed, 5, crc32(name.encode()), number]),
+                                   self.chair) for name, size in self.effects]
+
+
+def slowed(tables: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The chair's manoeuvres for a small robot."""
+    return {name: table * [1.0, SLOWER, FASTER] for name, table in tables.items()}
 
 
 def make_uncalibrated(
-    out: Path, vehicle: str, wrong: Wrong, seed: int = 0, replicates: int = 3,
-    manoeuvres: Mapping[str, np.ndarray] | None = None, ground_truth: bool = True,
+    out: Path, day: Day, replicates: int = 3, manoeuvres: Mapping[str, np.ndarray] | None = None,
+    ground_truth: bool = True,
 ) -> Path:  # fmt: skip
     """Drive a dataset and write it; returns its folder.
 
     Args:
         out: folder to write.
-        vehicle: of `chair.VEHICLES` or `SMALL_ONES`.
-        wrong: what is wrong with the believed sizes.
-        seed: of command levels, start headings, disturbances and sensor noise.
+        day: of a vehicle.
         replicates: drives of each manoeuvre.
         manoeuvres: command tables (T, 3) t, v, omega by name; default: the nine of the plant.
         ground_truth: whether the outside pose is written.
     """
-    chair = uncalibrated(vehicle, wrong)
-    small = vehicle in SMALL_ONES
-    plant = SmallPlant(chair, COULOMB) if small else Plant(chair)
-    tables = dict(manoeuvres or nine(seed))
-    if small and manoeuvres is None:
-        tables = {name: table * [1.0, SLOWER, FASTER] for name, table in tables.items()}
-    noise = Noise().of(chair)
-    if small:  # a smooth floor, markers near the cameras
-        noise = replace(noise, yaw_torque=0.2 * noise.yaw_torque * chair.nominal.track / Nominal().track,
-                        position=0.001, yaw=0.002)
+    chair, wrong, noise = day.chair, day.wrong, day.noise
+    plant = SmallPlant(chair, COULOMB) if day.small else Plant(chair)
+    tables = dict(manoeuvres or (slowed(nine(day.seed)) if day.small else nine(day.seed)))
     results: list[Result] = []
     for replicate in range(1, replicates + 1):
         for name, messages in tables.items():
             number = len(results)
-            random, reading, heading = (np.random.default_rng([seed, part, number]) for part in (2, 3, 4))
+            random, reading, heading = (np.random.default_rng([day.seed, part, number]) for part in (2, 3, 4))
             start = (0.0, 0.0, float(heading.uniform(-np.pi, np.pi)))
-            drive = plant.drive(messages, start, [], noise, random)
-            scale: list[Effect] = [OdometryScale(wrong.odometry, random, chair)]
+            effects = day.effects_of(number)
+            drive = plant.drive(messages, start, effects, noise, random)
+            told: list[Effect] = [*effects, OdometryScale(wrong.odometry, random, chair)]
             pose = tracked(outside_pose(drive, replace(noise, position=0.0, yaw=0.0), reading), wrong)
             pose[:, 1:] += reading.standard_normal((len(pose), 3)) * [noise.position, noise.position, noise.yaw]
-            results.append((f"{name}_{replicate}", odometry(drive, scale, noise, reading), pose, None))
+            results.append((f"{name}_{replicate}", odometry(drive, told, noise, reading), pose, None))
     messages_of = {f"{name}_{k}": table for name, table in tables.items() for k in range(1, replicates + 1)}
     write_dataset(out, chair.nominal, messages_of, results, ground_truth)
     return out

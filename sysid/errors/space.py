@@ -196,13 +196,14 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
     Args:
         params: `VehicleParams`; their values are where the search starts.
         spec: its nominal geometry and mass.
-        names: what to search; by default everything but `FIXED`.
+        names: what to search; by default everything but `FIXED` and limits that are not there.
     """
     from whill_mjx.vehicle.parameters import describe, get_values
 
     about = describe(params)
     if names is None:
         names = [name for name in about if name not in FIXED]
+        names = [name for name, value in zip(names, get_values(params, names), strict=True) if np.isfinite(value)]
     unknown = sorted(set(names) - set(about))
     if unknown:
         raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")

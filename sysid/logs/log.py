@@ -197,14 +197,36 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
         raise ValueError(f"{path}: {error}") from None
 
 
-def check_same_vehicle(log: Log, spec: VehicleSpec, place: str, rule: str) -> None:
+def of_file(log: Log, spec: VehicleSpec, place: str) -> Log:
+    """The log of the vehicle of a file: sizes and inertias that no dataset states, such as those of a fitted robot, are
+    the file's. Limits of commands stay the log's.
+
+    Args:
+        place: the file.
+
+    Raises:
+        ValueError: wheels or drive differ.
+    """
+    check_same_vehicle(log, spec, place, "The vehicle file must be of the same vehicle",
+                       ("wheel_radius", "track", "drive"))
+    mine = log.spec
+    spec = replace(spec, v_min=mine.v_min, v_max=mine.v_max, omega_max=mine.omega_max)
+    note = f"the wheelbase is that of {place}, {spec.wheelbase:.4g} m; dataset.toml has {mine.wheelbase:.4g} m"
+    return replace(log, spec=spec, notes=log.notes if spec.wheelbase == mine.wheelbase else (*log.notes, note))
+
+
+def check_same_vehicle(
+    log: Log, spec: VehicleSpec, place: str, rule: str,
+    names: tuple[str, ...] = ("wheel_radius", "track", "wheelbase", "drive"),
+) -> None:  # fmt: skip
     """Raise ValueError where a vehicle of another geometry is given beside a log.
 
     Args:
         place: where it was given.
         rule: the rule that is broken, in words.
+        names: fields of the spec that must agree.
     """
-    for name in ("wheel_radius", "track", "wheelbase", "drive"):
+    for name in names:
         mine, theirs = getattr(log.spec, name), getattr(spec, name)
         if mine != theirs:
             raise ValueError(f"{place}: {name} is {theirs}, but {mine} in {log.name!r}. {rule}; correct dataset.toml "

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from sysid.logs.rosbag import SUFFIXES, find_bags, is_bag
+from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 LEROBOT_INFO = "meta/info.json"
 HEAD = 4000  # bytes of a text that are looked at
@@ -85,6 +86,9 @@ def _about_file(path: Path) -> str:
     if path.suffix in (".csv", ".txt", ".tsv"):
         names = f" with the columns {', '.join(rows[0][:12])}" if rows and not _numbers(rows[0]) else ""
         return f"a text file{names}. Convert it first: python -m sysid.convert {path} --out DATASET"
+    if path.suffix in ROBOT_FILES:
+        return (f"a robot file. Look at it with python -m sysid.inspect {path}, fit it to a dataset with python -m "
+                f"sysid.fit DATASET --model {path}")
     return "a file of a kind that is not known. Give a dataset's folder, or a ROS bag to python -m sysid.convert."
 
 

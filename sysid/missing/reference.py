@@ -18,7 +18,7 @@ from sysid.errors.noise import (
     replicate_groups,
     roughness,
 )
-from sysid.errors.prior import expected_sd
+from sysid.errors.prior import EXPECTED, expected_sd
 from sysid.errors.space import Space, make_space
 from sysid.logs.records import Log, Trial
 from sysid.missing.base_fit import BaseFit
@@ -182,9 +182,14 @@ def replicate_groups_by_day(trials: tuple[Trial, ...], day: np.ndarray) -> list[
 
 
 def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:
-    """(P,) standard deviations in unit coordinates where drives do not show them."""
+    """(P,) standard deviations in unit coordinates where drives do not show them.
+
+    A share of a parameter's value; of sizes and places of sensors, which stay, of what rulers and data sheets err by.
+    """
     value = np.abs(space.to_values(u))
     scale = np.where(value > 0, value, space.high - space.low)
+    sizes = [EXPECTED.get(name, one) for name, one in zip(space.names, scale, strict=True)]
+    scale = np.where(_of_gyro(space), scale, sizes)
     spread = np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)
     return np.where(_of_gyro(space), np.minimum(spread, expected_sd(space)), spread)
 

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+import jax
+import numpy as np
 
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
 from sysid.logs import odometry_frames
 from sysid.logs.measured import load_any
-from sysid.logs.records import Log
+from sysid.logs.metrics import score
+from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.fit_statistics import statistics_of
 from sysid.pages.calibration import calibration_notes
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
-from sysid.replay.models import Model, describe_parameters, get_parameters, save_model
+from sysid.replay.models import Model, Twin, describe_parameters, get_parameters, save_model
+from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
 from sysid.search import starts, thin
-from sysid.search.fitting import Fit, fit_log, predict
+from sysid.search.fitting import Fit, fit_log, of_earlier, predict
 from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
 from sysid.search.studies import without_secrets
+from whill_mjx.vehicle.config import VehicleConfig
 
 
 def make_report(
@@ -109,7 +116,7 @@ def fit_dataset(
 
     config = config or FitConfig()
     config = replace(config, quick=quick or config.quick)
-    log = load_any(path) if log is None else log
+    log = of_earlier(load_any(path) if log is None else log, config)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
@@ -122,9 +129,11 @@ def fit_dataset(
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
     report = make_report(log, config, fit, rows, str(path), source)
-    vehicle = None if fit.model is None or fit.model.vehicle is None else fit.model.vehicle(fit.params, log.spec)
-    if isinstance(vehicle, str):
-        report["dataset"]["notes"].append(f"no vehicle of the simulator is written: {vehicle}")
+    twin = None if fit.model is None or fit.model.vehicle is None else fit.model.vehicle(fit.params, log.spec)
+    if isinstance(twin, str):
+        report["dataset"]["notes"].append(f"no vehicle of the simulator is written: {twin}")
+    elif twin is not None:
+        report["dataset"]["notes"].append(_save_twin(out, twin, fit, log, config, fitted, provenance(report)))
     write_report(out / "report.json", report)
     write_plots(out, trials, initial, fitted, rows)
     series = collect(trials, initial, fitted)
@@ -137,6 +146,47 @@ def fit_dataset(
         save_vehicle(out / "vehicle.toml", log.spec, fit.params, intervals, provenance(report), known.as_table())
     else:
         save_model(out, fit.model, fit.params, intervals, provenance(report))
-        if isinstance(vehicle, tuple):
-            save_vehicle(out / "vehicle.toml", *vehicle, provenance=provenance(report))
     return report
+
+
+def _save_twin(
+    out: Path, twin: Twin, fit: Fit, log: Log, config: FitConfig, fitted: Sequence[Prediction],
+    origin: dict[str, Any],
+) -> str:
+    """Write the vehicle that drives as a fitted model does, with what its own replays leave of the drives.
+
+    Args:
+        fitted: replays of all trials, training ones first, by the model.
+
+    Returns:
+        How far both are from the drives, as a note.
+    """
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
+
+    trials = (*log.training, *log.held_out)
+    plant = replace(vehicle_plant(twin.spec, VehicleConfig(physics_dt=config.physics_dt)), frame=fit.frame)
+    batch, _ = make_batch(trials, plant.dt)
+    simulated = Replay(plant, batch, lambda _: twin.params).simulate(np.zeros((1, 1)))
+    seen = predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+    known = [k for k, name in enumerate(fit.space.names) if name in twin.shared]
+    meaning = [twin.shared[fit.space.names[k]] for k in known]
+    factors = np.array([factor for _, factor, _ in meaning])
+    error = (fit.uncertainty.deviation * fit.space.slope(fit.u))[known] * factors
+    statistics = statistics_of(log.training, seen[: len(log.training)], log.spec.track, [one[0] for one in meaning],
+                               error, fit.uncertainty.covariance[np.ix_(known, known)])
+    intervals = {name: (one.low * factor + offset, one.high * factor + offset)
+                 for one in fit.uncertainty.estimates if one.identifiable and one.name in twin.shared
+                 for name, factor, offset in (twin.shared[one.name],)}
+    save_vehicle(out / "vehicle.toml", twin.spec, twin.params, intervals, origin, statistics.as_table())
+    first = len(log.training) if log.held_out else 0
+    ours, theirs = (np.mean([_distance(trial, replay) for trial, replay in zip(trials[first:], replays[first:],
+                                                                               strict=True)])
+                    for replays in (seen, fitted))
+    return (f"vehicle.toml is the vehicle of the simulator that drives alike: it is {1000 * ours:.2g} mm off in "
+            f"{'held-out' if first else 'training'} drives, the model of your file {1000 * theirs:.2g} mm")
+
+
+def _distance(trial: Trial, replay: Prediction) -> float:
+    """Position error against the outside pose, or else against the odometry [m]."""
+    found = score(trial, replay)
+    return float(found["ground_truth" if trial.ground_truth is not None else "odometry"].trajectory or 0.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from sysid.replay.mjcf_file import Robot
+from sysid.replay.robot import Robot
 
 DRIVEN, FLOOR, REST = "#d95f02", "#1b9e77", "#bbbbbb"
 AROUND = 32  # points of a rim

@@ -27,27 +27,17 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sysid.replay.mjcf_file import (
-    SIZES,
-    Entry,
-    Robot,
-    Size,
-    default_paths,
-    drive_entries,
-    load_robot,
-    resolve,
-    sizes_of,
-    turning_inertia,
-    write_mjcf,
-)
-from sysid.replay.models import Bounds, Model, Parameters, make_parameters, with_surroundings
+from sysid.replay.models import Bounds, Model, Parameters, Twin, make_parameters, with_surroundings
+from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_loading import load_robot
+from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
+from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of
 from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
 from whill_mjx.vehicle.model import import_mjx
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.vehicle.types import VehicleParams
 
 FACTOR = 5.0  # bounds of a parameter of which only the path is given: its value over and times this
 AROUND_ROBOT = ("command_delay", "acceleration_limit", "odometry_lag", "sensor_delay", "odometry_scale", "pose_mount")
@@ -150,7 +140,7 @@ def mjcf_model(
                                   if name in entries}, Path(folder) / "model.xml")
 
     around = AROUND_ROBOT if calibrate else ()
-    def vehicle(params: Parameters, spec: VehicleSpec) -> tuple[VehicleSpec, VehicleParams] | str:
+    def vehicle(params: Parameters, spec: VehicleSpec) -> Twin | str:
         return vehicle_of(robot, entries, params, spec)
 
     return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle).with_effects(effects)

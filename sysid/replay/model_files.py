@@ -10,15 +10,14 @@ from pathlib import Path
 from sysid.replay.models import Model
 from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.specs import VehicleSpec
-
-SUFFIXES = (".xml", ".mjcf", ".urdf", ".xacro")
+from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 
 def steps_mjx(text: str | None) -> bool:
     """Whether `--model TEXT` steps a user's robot by MJX: a robot file, or a Python file that mentions it."""
     path = Path(text.partition(".py:")[0] + ".py" if text and ".py:" in text else text or "")
     if path.suffix != ".py":
-        return path.suffix in SUFFIXES
+        return path.suffix in ROBOT_FILES
     try:
         source = path.read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -43,14 +42,14 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such model. Give an MJCF, URDF or xacro file, or a Python file "
                                 "that defines one.")
-    if path.suffix in SUFFIXES:
+    if path.suffix in ROBOT_FILES:
         from sysid.replay.mjcf import mjcf_model
 
         inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
         return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track,
                           calibrate=not inside)
     if path.suffix != ".py":
-        raise ValueError(f"{path}: a model is {', '.join(SUFFIXES)} or .py. Rename the file or write an adapter.")
+        raise ValueError(f"{path}: a model is {', '.join(ROBOT_FILES)} or .py. Rename the file or write an adapter.")
     loader = importlib.util.spec_from_file_location(path.stem, path)
     assert loader is not None and loader.loader is not None
     module = importlib.util.module_from_spec(loader)

@@ -49,6 +49,17 @@ class Parameters:
 
 
 @dataclass(frozen=True)
+class Twin:
+    """The vehicle of the simulator that drives as a model does."""
+
+    spec: VehicleSpec
+    params: VehicleParams
+    shared: Mapping[str, tuple[str, float, float]]
+    """Parameter of the model -> that of the vehicle with its meaning; the value there is a factor times it plus an
+    offset."""
+
+
+@dataclass(frozen=True)
 class Model:
     """A model that is fitted in place of the simulator's vehicle."""
 
@@ -63,7 +74,7 @@ class Model:
     """What of its file was left out or replaced."""
     around: tuple[str, ...] = ()
     """Effects that it may have around it: a fit adds those that a log shows."""
-    vehicle: Callable[[Parameters, VehicleSpec], tuple[VehicleSpec, VehicleParams] | str] | None = None
+    vehicle: Callable[[Parameters, VehicleSpec], Twin | str] | None = None
     """The vehicle of the simulator that drives alike, or why there is none."""
 
     def with_effects(self, names: Sequence[str]) -> Model:

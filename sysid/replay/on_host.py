@@ -20,7 +20,9 @@ from sysid.replay.delays import delayed
 from sysid.replay.records import Batch, Plant, Simulated
 from sysid.replay.rollout import Replay, simulate_one
 
-FEW = 4  # parameter sets whose readings are computed together at least
+FEW, MANY = 4, 32
+"""Parameter sets whose commands and readings are computed together: searches ask for a dozen other numbers of them, and
+each would be compiled."""
 
 
 class HostReplay:
@@ -66,19 +68,21 @@ class HostReplay:
 
     def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
         """Replay with each of values (N, P); leaves gain the axis N in front. `size` is not needed."""
-        count = len(values)
-        padded = np.concatenate([values, np.repeat(values[-1:], -count % FEW, axis=0)])  # few sizes are compiled
-        sets = jnp.asarray(padded, jnp.result_type(float))
-        given = jax.tree.map(np.asarray, self._before(sets, self.batch))
-        keys = [tuple(leaf[i].tobytes() for leaf in jax.tree.leaves(given)) for i in range(len(padded))]
+        given = _in_blocks(lambda sets: self._before(sets, self.batch), np.asarray(values, float))
+        keys = [tuple(leaf[i].tobytes() for leaf in jax.tree.leaves(given)) for i in range(len(values))]
         first = {key: i for i, key in reversed(list(enumerate(keys)))}
         place = {key: k for k, key in enumerate(first)}
-        inner, states, commands, begin = jax.tree.map(lambda leaf: leaf[list(first.values())], given)
-        motion = self._host.drive({name: leaf[:, 0] for name, leaf in inner.items()}, states, commands,
-                                  self.batch.warm_up, begin[..., :3])
-        motion = motion[[place[key] for key in keys]]
-        found = self._after(sets, self.batch, jnp.asarray(motion, jnp.result_type(float)))
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
+        drives = list(first.values())
+        driven = []
+        for start in range(0, len(drives), MANY):  # the host keeps all of its states
+            part = drives[start : start + MANY]
+            inner, states, commands, begin = jax.tree.map(lambda leaf, part=part: leaf[part], given)
+            driven.append(self._host.drive({name: leaf[:, 0] for name, leaf in inner.items()}, states, commands,
+                                           self.batch.warm_up, begin[..., :3]))
+        motion = np.concatenate(driven)[[place[key] for key in keys]]
+        found: Simulated = _in_blocks(lambda sets, seen: self._after(sets, self.batch, seen),
+                                      np.asarray(values, float), motion)
+        return found
 
     def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
         """There is none: differences of `simulate` are taken."""
@@ -87,6 +91,20 @@ class HostReplay:
     def traced(self, values: jax.Array) -> Simulated:
         """There is none: an accelerator steps the model by itself."""
         raise NotImplementedError("a model that the host steps cannot be traced")
+
+
+def _in_blocks(function: Callable[..., Any], *arrays: np.ndarray) -> Any:
+    """What a function makes of arrays (N, ...), in blocks of `MANY` rows, or of `FEW` where there are no more; the last
+    block is filled up with its last row."""
+    count, found = len(arrays[0]), []
+    size = FEW if count <= FEW else MANY
+    for first in range(0, count, size):
+        rows = [one[first : first + size] for one in arrays]
+        missing = size - len(rows[0])
+        filled = [np.concatenate([one, np.repeat(one[-1:], missing, axis=0)]) for one in rows]
+        block = function(*(jnp.asarray(one, jnp.result_type(float)) for one in filled))
+        found.append(jax.tree.map(lambda leaf, kept=size - missing: np.asarray(leaf)[:kept], block))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
 
 
 def _moved(motion: jax.Array, start: jax.Array) -> jax.Array:

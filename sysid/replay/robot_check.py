@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
-from sysid.replay.mjcf_file import KINDS, Robot
+from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
 
 STRAIGHT = 0.1  # share by which the speed may differ from the command
@@ -71,7 +71,7 @@ def _loads(robot: Robot) -> dict[str, float]:
         if len(ours) != 1:
             continue
         mujoco.mj_contactForce(host, data, number, force)
-        name = mujoco.mj_id2name(host, KINDS["geom"], ours[0]) or f"geom {ours[0]}"
+        name = host.geom(ours[0]).name or f"geom {ours[0]}"
         found[name] = found.get(name, 0.0) + float(force[0] * abs(contact.frame[2]))
     total = sum(found.values()) or 1.0
     return dict(sorted(((name, value / total) for name, value in found.items()), key=lambda one: -one[1]))
@@ -91,7 +91,7 @@ def describe_robot(robot: Robot, check: Check) -> list[str]:
     if count > 2:
         ahead = (data.xanchor[_joints(robot)] - data.xpos[root]) @ _forward(robot, data, root)
         lines[-1] += f", wheelbase {np.ptp(ahead):.4g} m"
-    names = [mujoco.mj_id2name(host, KINDS["joint"], joint) for joint in _joints(robot)]
+    names = [host.joint(joint).name for joint in _joints(robot)]
     lines += [f"  left: {', '.join(names[:half])}; right: {', '.join(names[half:])}",
               f"  driven by {_drive(robot)}"]
     lines += ["", "On the floor, at rest"]

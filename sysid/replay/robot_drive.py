@@ -12,7 +12,9 @@ import numpy as np
 from mujoco import rollout
 
 from sysid.replay.cores import cores
-from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
+from sysid.replay.robot import Robot
+from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_sizes import Size
 
 SPIN = 5.0  # rad/s of a wheel in the drives that are tried
 SECONDS = 3.0  # of each; the first second is left out

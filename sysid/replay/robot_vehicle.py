@@ -14,22 +14,25 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from sysid.replay.mjcf_file import Entry, Overlaid, Robot, Size
-from sysid.replay.models import Parameters, with_effects
+from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
+from sysid.replay.robot import Robot
+from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_sizes import Size
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
 CREEP, SIDE_CREEP = 0.002, 0.005  # m/s, sliding speeds of a stiff tyre along and across
+SAG = 0.01  # of the wheel radius, of hard tyres; with a chair's 5 mm a robot of 6 cm wheelbase tips over when it brakes
 DRIVE = {"drive.kp": "torque_drive.kp", "drive.ki": "torque_drive.ki", "drive.limit": "torque_drive.limit"}
 FRICTION = ".friction"
 
 
 def vehicle_of(
     robot: Robot, entries: dict[str, Entry | Size], params: Parameters, spec: VehicleSpec,
-) -> tuple[VehicleSpec, VehicleParams] | str:  # fmt: skip
-    """Spec and parameters of the vehicle that drives as the robot, or the reason why there is none.
+) -> Twin | str:  # fmt: skip
+    """The vehicle that drives as the robot, or the reason why there is none.
 
     Args:
         robot: that was fitted.
@@ -51,9 +54,13 @@ def vehicle_of(
     if ahead.min() < 0 < ahead.max():
         return "it stands on supports before and behind its axle"
     support = float(ahead.mean())
+    low, high = _extent(robot)
+    length, width, height = (high - low).tolist()
     spec = replace(spec, mass=mass, drive="differential", driven_axle="rear" if support > 0 else "front",
-                   wheelbase=abs(support), rear_axle_x=None, wheel_inertia=robot.spin)
-    wheels, balls = (_friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
+                   wheelbase=abs(support), rear_axle_x=min(support, 0.0) - float(low[0] + high[0]) / 2,
+                   wheel_inertia=robot.spin, body_length=length, body_width=width, body_height=height)
+    (tyre, wheels), (ball, balls) = (
+        _friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
     gain = float(abs(robot.host.actuator_gainprm[robot.actuators[0], 0])) if robot.motors else 1.0
     found = {
         "body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
@@ -63,12 +70,22 @@ def vehicle_of(
         "slip_traction.side_slip_speed": SIDE_CREEP, "slip_traction.mu_free": balls, "yaw_scrub.torque": 0.0,
         "rolling_resistance.mu_r": balls * share, "command_delay.delay": 0.0, "odometry_lag.time_constant": 0.0,
         "wheel_radius_difference.common": values["wheels.radius"] / spec.wheel_radius - 1,
+        "suspension.sag": SAG * spec.wheel_radius,
         "wheel_radius_difference.difference": values.get("wheels.difference", 0.0),
         "track_width.error": values.get("wheels.track", spec.track) / spec.track - 1}
     around = {effect.name: effect for effect in params.effects}
-    base = with_effects(preset_params(spec, "physical"), ("wheel_radius_difference", "track_width", *around))
+    own = ("wheel_radius_difference", "track_width", "suspension")
+    base = with_effects(preset_params(spec, "physical"), (*own, *around))
     vehicle = set_values(base, list(found), jnp.asarray(list(found.values()), jnp.result_type(float)))
-    return spec, VehicleParams(vehicle.body, tuple(around.get(effect.name, effect) for effect in vehicle.effects))
+    shared = {
+        **{ours: (name, gain if ours == "drive.kp" else 1.0, 0.0) for ours, name in DRIVE.items()},
+        **{name: (theirs, 1.0, 0.0) for name, theirs in ((tyre, "slip_traction.mu"), (ball, "slip_traction.mu_free"))},
+        "wheels.radius": ("wheel_radius_difference.common", 1 / spec.wheel_radius, -1.0),
+        "wheels.difference": ("wheel_radius_difference.difference", 1.0, 0.0),
+        "wheels.track": ("track_width.error", 1 / spec.track, -1.0),
+        **{name: (name, 1.0, 0.0) for name in describe_parameters(params) if name.partition(".")[0] in around}}
+    effects = tuple(around.get(effect.name, effect) for effect in vehicle.effects)
+    return Twin(spec, VehicleParams(vehicle.body, effects), shared)
 
 
 def _at_rest(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float, np.ndarray, float]:
@@ -94,6 +111,22 @@ def _at_rest(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
     return mass, centre, float(inertia), supports, float(np.clip(centre[0] / supports.mean(), 0.0, 1.0))
 
 
+def _extent(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest place (3,) of its geoms at rest: ahead of the driven axle's middle, to the left and up [m]."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(host, data)
+    root = int(host.body_rootid[host.jnt_bodyid[robot.joints[0]]])
+    ahead = data.xmat[root].reshape(3, 3) @ robot.forward
+    axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
+    geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == root)
+    turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
+    middle = (middle - data.xanchor[list(robot.joints)].mean(0)) @ axes.T
+    reach = np.einsum("gij,gj->gi", np.abs(axes @ turns), host.geom_aabb[geoms, 3:])
+    return (middle - reach).min(0), (middle + reach).max(0)
+
+
 def _tyres(robot: Robot) -> tuple[int, ...]:
     body = robot.host.jnt_bodyid[robot.joints[0]]
     return tuple(int(one) for one in np.flatnonzero(robot.host.body_weldid[robot.host.geom_bodyid] == body))
@@ -101,9 +134,9 @@ def _tyres(robot: Robot) -> tuple[int, ...]:
 
 def _friction(
     robot: Robot, entries: dict[str, Entry | Size], values: dict[str, float], geoms: tuple[int, ...],
-) -> float:  # fmt: skip
-    """Fitted sliding friction of geoms, or that of the file."""
+) -> tuple[str, float]:  # fmt: skip
+    """Parameter and fitted value of the sliding friction of geoms; no name and that of the file where it is fixed."""
     for name, entry in entries.items():
         if name.endswith(FRICTION) and isinstance(entry, Entry) and set(entry.ids) & set(geoms):
-            return values[name]
-    return float(robot.host.geom_friction[list(geoms), 0].max())
+            return name, values[name]
+    return "", float(robot.host.geom_friction[list(geoms), 0].max())

@@ -75,7 +75,9 @@ def _by_side(spec: Any, names: Sequence[str]) -> tuple[str, ...] | None:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     ids = [model.joint(name).id for name in names]
-    root = int(model.body_rootid[model.jnt_bodyid[ids[0]]])
+    wheel = int(model.jnt_bodyid[ids[0]])
+    root = int(model.body_rootid[wheel])
+    root = 0 if root == wheel else root  # the chassis of a URDF is part of the world until it gets a free joint
     turn = data.xmat[root].reshape(3, 3)
     place = (data.xanchor[ids] - data.xpos[root]) @ turn
     if (np.abs((data.xaxis[ids] @ turn)[:, 2]) > 0.5).any():

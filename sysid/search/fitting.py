@@ -18,7 +18,7 @@ from sysid.errors.space import Space, make_space, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
-from sysid.logs.log import check_same_vehicle
+from sysid.logs.log import of_file
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.logs.sources import refuse_recording
 from sysid.replay.differences import make_replay
@@ -104,7 +104,10 @@ def fit_log(
     config = config or FitConfig()
     check_options(config)
     began = time.perf_counter()
+    log = of_earlier(log, config)
     given = make_problem(log, config, params, model)
+    if config.quick and given.plant.host is not None:
+        config = replace(config, elsewhere=False)
     model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
     trials = objective.trials
     wanted = profiled(space, config)
@@ -216,6 +219,7 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
 def check_settings(log: Log, config: FitConfig) -> Model | None:
     """Raise ValueError or FileNotFoundError for settings that cannot fit a log; returns the model that they name."""
     model = load_model(config.model, log.spec, config.wheels, config.parameters) if config.model else None
+    log = of_earlier(log, config)
     space = _subject(log, config, _training(log, config), None, model)[3]
     profiled(space, config)
     return model
@@ -258,13 +262,14 @@ def _subject(
         plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
         given = params is not None
         if config.vehicle is not None:
-            params, intervals = _earlier(config.vehicle, log)
+            params, intervals = _earlier(config.vehicle)
         params = preset_params(log.spec, config.preset) if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
         sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
         params = with_effects(params, (*config.effects, *measured, *sizes, *gyro_effects(trials)))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+    if model is None or model.around:  # else a person chose what is fitted
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals
 
@@ -279,14 +284,21 @@ def profiled(space: Space, config: FitConfig) -> tuple[str, ...]:
     return wanted
 
 
-def _earlier(path: Path, log: Log) -> tuple[Any, dict[str, tuple[float, float]]]:
-    """Parameters and intervals of a vehicle file; ValueError where it is of another vehicle than the log."""
+def of_earlier(log: Log, config: FitConfig) -> Log:
+    """The log as one of the vehicle of an earlier file, where the settings name one."""
+    from whill_mjx.vehicle.vehicle_file import read_vehicle
+
+    if config.vehicle is None or config.model:
+        return log
+    refuse_recording(config.vehicle, "a vehicle file.")
+    return of_file(log, read_vehicle(config.vehicle)[0], str(config.vehicle))
+
+
+def _earlier(path: Path) -> tuple[Any, dict[str, tuple[float, float]]]:
+    """Parameters and intervals of a vehicle file."""
     from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
 
-    refuse_recording(path, "a vehicle file.")
-    spec, params, _ = read_vehicle(path)
-    check_same_vehicle(log, spec, str(path), "The vehicle file must be of the same vehicle")
-    return params, load_intervals(path)
+    return read_vehicle(path)[1], load_intervals(path)
 
 
 def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:

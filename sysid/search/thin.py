@@ -4,6 +4,7 @@ refused. What `sysid.inspect` says of a log binds the fit."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 
 from sysid.errors.space import Space
 from sysid.logs.coverage import Excitation, excitation
@@ -15,13 +16,14 @@ UNSEEN = "the log cannot show it"
 """Begins the reason for which a parameter keeps its value."""
 
 HIDDEN = {
-    "no outside pose": ("slip_traction.", "axle_pivot.", "lateral_damping."),
-    "no turn": ("body.yaw_inertia", "body.com_y", "yaw_scrub.", "lateral_damping.", "axle_pivot.",
-                "slip_traction.side_slip_speed", "slip_traction.mu_free", "track_width."),
-    "no straight motion": ("rolling_resistance.", "slip_traction.slip_speed", "suspension.", "body.com_x",
+    "no outside pose": ("slip_traction.*", "axle_pivot.*", "lateral_damping.*", "geom.*.friction"),
+    "no turn": ("body.yaw_inertia", "body.com_y", "yaw_scrub.*", "lateral_damping.*", "axle_pivot.*",
+                "slip_traction.side_slip_speed", "slip_traction.mu_free", "track_width.*", "wheels.track",
+                "body.*.inertia"),
+    "no straight motion": ("rolling_resistance.*", "slip_traction.slip_speed", "suspension.*", "body.com_x",
                            "body.com_z"),
 }
-"""Cause -> parameters, or beginnings of their names, that it hides."""
+"""Cause -> parameters that it hides, as patterns: of the simulator's vehicle and of robot files."""
 REMEDIES = {"no outside pose": "log motion capture, lidar or RTK", "no turn": "turn on the spot and drive circles",
             "no straight motion": "drive straight at two speeds"}
 
@@ -57,7 +59,7 @@ def without_hidden(space: Space, log: Log, asked: Sequence[str] = ()) -> Space:
     """The space without parameters that the log cannot show, but for those that were asked for by name."""
     for cause in causes(log.training):
         for name in space.names:
-            if name not in asked and name.startswith(HIDDEN[cause]):
+            if name not in asked and any(fnmatchcase(name, pattern) for pattern in HIDDEN[cause]):
                 space = space.without(name, f"{UNSEEN}: {cause}")
     return space
 

@@ -99,12 +99,14 @@ def find_missing(
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
-    """`find_missing` with a progress bar."""
+    """`find_missing` with a progress bar. With references, `vehicle` is where the fit to them starts."""
+    start = None if vehicle is None or not references else vehicle.params
+    kept = vehicle if start is None else None
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), vehicle is not None), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), kept is not None), "close the loop", "step")
     progress(0, "reference vehicle")
     try:
-        return find_missing(log, references, config, vehicle, progress)
+        return find_missing(log, references, config, kept, progress, start=start)
     finally:
         close()
 

@@ -11,21 +11,24 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.plant.first_day import SMALL, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
+from benchmarks.plant.first_day import SMALL, Day, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.prior import UNKNOWN, bounds_alone
+from sysid.errors.space import make_space
 from sysid.intervals.uncertainty import Estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
 from sysid.logs.synthetic import write_dataset
+from sysid.missing.reference import ASSUMED_SPREAD, assumed_spread
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import drive_entries, load_robot
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
+from sysid.replay.robot_loading import load_robot
+from sysid.replay.robot_parameters import drive_entries
 from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
@@ -57,7 +60,7 @@ def commands() -> dict[str, np.ndarray]:
 def uncalibrated(tmp_path_factory) -> Log:
     """A robot of 21 kg on the contact plant."""
     folder = tmp_path_factory.mktemp("uncalibrated") / "log"
-    return load_log(make_uncalibrated(folder, "robot", WRONG, seed=4, replicates=1, manoeuvres=commands()))
+    return load_log(make_uncalibrated(folder, Day("robot", WRONG, seed=4), replicates=1, manoeuvres=commands()))
 
 
 @pytest.mark.quick
@@ -164,7 +167,7 @@ def small_robot(tmp_path_factory):
     folder = tmp_path_factory.mktemp("small")
     tables = {name: table * [1, 0.3, 2.0] for name, table in commands().items()}
     wrong = dataclasses.replace(WRONG, x=0.05, y=-0.02, odometry=0.0)
-    log = make_uncalibrated(folder / "log", "small", wrong, seed=5, replicates=1, manoeuvres=tables)
+    log = make_uncalibrated(folder / "log", Day("small", wrong, seed=5), replicates=1, manoeuvres=tables)
     return load_log(log), write_urdf(folder / "robot.urdf")
 
 
@@ -179,6 +182,7 @@ def test_an_own_robot_gets_what_the_log_shows_by_default(small_robot):
     alone = make_problem(dataclasses.replace(log, trials=blind), FitConfig(model=str(file))).space
     assert not {"wheels.radius", "pose_mount.x", "odometry_scale.linear"} & set(alone.names)
     assert ("wheels.radius", "no outside pose shows it") in alone.fixed
+    assert ("geom.*_wheel.friction", "the log cannot show it: no outside pose") in alone.fixed
 
 
 def test_sizes_of_an_own_robot_come_out(small_robot):
@@ -283,16 +287,30 @@ def test_a_fitted_robot_becomes_a_vehicle_where_it_slides_on_a_ball(small_robot,
               "geom.*_wheel.friction": 0.7, "geom.ball.friction": 0.04, "command_delay.delay": 0.03,
               "pose_mount.x": 0.05}
     params = set_parameters(model.params, list(wanted), jnp.array(list(wanted.values())))
-    spec, vehicle = model.vehicle(params, log.spec)
+    twin = model.vehicle(params, log.spec)
+    spec, vehicle = twin.spec, twin.params
     save_vehicle(tmp_path / "vehicle.toml", spec, vehicle)
     spec, vehicle, _ = load_vehicle(tmp_path / "vehicle.toml")
-    assert spec.driven_axle == "front" and spec.reference_x == pytest.approx(0.03)  # the ball is 6 cm behind
+    assert spec.driven_axle == "front" and spec.wheelbase == pytest.approx(0.06)  # the ball is 6 cm behind
+    assert (spec.body_length, spec.reference_x) == pytest.approx((0.144, 0.01))  # its box reaches 62 mm ahead
     assert spec.mass == pytest.approx(SMALL.mass, abs=0.002) and spec.wheel_radius == 0.033
     found = dict(zip(NAMES, map(float, get_values(vehicle, NAMES)), strict=True))
     assert found == pytest.approx({
         "torque_drive.kp": 0.02, "torque_drive.ki": 0.1, "torque_drive.limit": 0.06, "slip_traction.mu": 0.7,
         "wheel_radius_difference.common": 1 / 33, "track_width.error": -0.05, "command_delay.delay": 0.03,
-        "pose_mount.x": 0.05, "body.com_x": 0.03 + SMALL.com[0] * 1.12 / 1.2}, rel=1e-2)
+        "pose_mount.x": 0.05, "body.com_x": 0.01 + SMALL.com[0] * 1.12 / 1.2}, rel=1e-2)
+
+
+@pytest.mark.quick
+def test_sizes_and_scales_are_not_taken_to_wander_by_a_share_of_their_value(small_robot):
+    """Else an odometry that reads 2 % too far on one day would be a usual day."""
+    spec = find_spec("create")
+    params = with_effects(preset_params(spec, "physical"), ("odometry_scale", "wheel_radius_difference"))
+    space = make_space(params, spec, ("odometry_scale.linear", "wheel_radius_difference.common", "torque_drive.kp"))
+    u = space.to_unit(space.initial)
+    linear, common, kp = assumed_spread(space, u) * space.slope(u)
+    assert linear < 0.002 and common < 0.002
+    assert kp == pytest.approx(ASSUMED_SPREAD * space.initial[2])
 
 
 @pytest.mark.quick

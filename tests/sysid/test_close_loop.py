@@ -46,7 +46,7 @@ from whill_mjx.effects.card import Falsifier
 from whill_mjx.effects.unnamed import KNOTS
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.config import VehicleConfig
-from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.parameters import describe, set_values
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle
@@ -349,15 +349,18 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
 
 def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr("sysid.verdict.pipeline.find_missing", lambda *given: asked.append(given) or sloping)
+    monkeypatch.setattr("sysid.verdict.pipeline.find_missing",
+                        lambda *given, start: asked.append((*given, start)) or sloping)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
-    [(log, references, config, vehicle, _)] = asked
-    assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
+    [(log, references, config, vehicle, _, start)] = asked
+    assert (log.name, [one.name for one in references], vehicle, start) == ("sloping", ["reference_1"], None, None)
     assert config.seed == 0
     assert json.loads((tmp_path / "run/report.json").read_text())["verdict"] == report["verdict"] == "named"
     assert "verdict: named" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="both given"):
-        main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "vehicle.toml"))
+    main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "run/vehicle.toml",
+                   out=tmp_path / "again"))
+    *_, vehicle, _, start = asked[-1]
+    assert vehicle is None and set(describe(start)) >= set(describe(sloping.reference.params))
 
 
 def test_refit_to_poses_lowers_the_training_error(drives, sloping):

@@ -24,7 +24,7 @@ from sysid.logs.rosbag import read_bag
 from sysid.missing.fit_statistics import FitStatistics, Leftovers, load_fitted
 from sysid.pages.report import read_report, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, load, save
-from sysid.replay.mjcf_file import load_robot
+from sysid.replay.robot_loading import load_robot
 from whill_mjx.logs.dataset import write_fields, write_trial
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.vehicle_file import save_vehicle

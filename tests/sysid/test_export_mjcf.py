@@ -11,7 +11,7 @@ import pytest
 
 from whill_mjx import export_mjcf
 from whill_mjx.effects import make_effect
-from whill_mjx.export_mjcf import VehicleForces, export, held, load_forces, replay, vehicle_mjcf
+from whill_mjx.export_mjcf import Replay, VehicleForces, export, held, in_proportion, load_forces, replay, vehicle_mjcf
 from whill_mjx.logs.manoeuvres import Scenario, command_table
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
@@ -40,6 +40,15 @@ def test_c_mujoco_drives_a_figure_eight_as_the_simulator_does(folder):
     found = replay(folder, held(command_table("figure_eight", Scenario()), 0.005))
     assert np.ptp(found.simulator[:, 0]) > 1.5 and np.ptp(np.unwrap(found.simulator[:, 2])) > 6.0
     assert found.distance < 6e-3 and found.turn < 2e-3
+
+
+def test_a_vehicle_that_tips_over_is_compared_until_then():
+    upright, fallen = np.zeros((4, 3)), np.array([[0, 0, 0], [0.001, 0, 0.002], [1, 0, 3], [1, 0, 3]], float)
+    found = Replay(fallen, upright, np.array([0.0, 0.1, 1.2, 1.5]))
+    assert (found.upright, found.distance, found.turn) == (2, 0.001, 0.002)
+    small = dataclasses.replace(WHILL_CR, track=WHILL_CR.track / 4)
+    assert in_proportion(WHILL_CR) == Scenario()
+    assert (in_proportion(small).v, in_proportion(small).omega) == pytest.approx((0.3, 1.0))  # 1.0: the limit
 
 
 def test_the_callback_repeats_itself_within_a_step_and_starts_afresh_when_time_goes_back(folder):

@@ -24,9 +24,10 @@ from sysid.logs.synthetic import write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import default_paths, load_robot, resolve, write_mjcf
 from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
+from sysid.replay.robot_loading import load_robot
+from sysid.replay.robot_parameters import default_paths, resolve, write_mjcf
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import Scenario, command_table

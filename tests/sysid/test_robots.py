@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from sysid import inspect as inspect_module
+from sysid.design import load_subject
+from sysid.logs.sources import about
 from sysid.replay import xacro_text
 from sysid.replay.mjcf import mjcf_model
-from sysid.replay.mjcf_file import default_paths, load_robot
 from sysid.replay.robot_check import check_robot, describe_robot
 from sysid.replay.robot_files import expand_xacro
+from sysid.replay.robot_loading import load_robot
+from sysid.replay.robot_parameters import default_paths
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 pytestmark = pytest.mark.quick
 CYLINDER = '<cylinder radius="0.1" length="0.05"/>'
@@ -55,6 +59,44 @@ NAMES = {
     "back": ["wheel_back_left", "wheel_back_right", "wheel_front_left", "wheel_front_right"],
     "numbers": ["wheel_1", "wheel_2", "wheel_3", "wheel_4"],
 }
+
+
+def test_driven_wheels_are_told_from_casters_with_sides_in_their_names(tmp_path):
+    """Wheel frames that are turned about x, on a chassis without a free joint of its own."""
+    def turned(name, y):
+        frame = joint(name, f"{name}_link", f'0 {y} 0" rpy="-1.5707963 0 0', "continuous", "0 0 1")
+        return link(f"{name}_link", CYLINDER) + frame
+
+    def caster(name, x, y):
+        return (link(f"{name}_1_link")
+                + joint(f"{name}_1_joint", f"{name}_1_link", f"{x} {y} -0.05", "continuous", "0 0 1")
+                + link(f"{name}_2_link", BALL)
+                + joint(f"{name}_2_joint", f"{name}_2_link", "-0.02 0 0", "continuous", "0 1 0", f"{name}_1_link"))
+
+    robot = load_robot(robot_file(tmp_path, turned("wheel_right_joint", -0.2), turned("wheel_left_joint", 0.2),
+                                  caster("caster_front_left", 0.2, 0.1), caster("caster_front_right", 0.2, -0.1)))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["wheel_left_joint", "wheel_right_joint"]
+
+
+def test_a_block_on_a_swivel_slides_as_a_ball_does(tmp_path):
+    swivel = (link("fork", '<box size="0.04 0.02 0.02"/>', 0.2, 1e-3, origin="-0.02 0 -0.04")
+              + joint("swivel", "fork", "-0.25 0 -0.05", "continuous", "0 0 1"))
+    robot = load_robot(robot_file(tmp_path, wheel("left_wheel", 0, 0.2), wheel("right_wheel", 0, -0.2), swivel))
+    assert robot.host.geom("fork").friction[0] == pytest.approx(0.05)
+    assert robot.sliding == ()  # it swings round: no vehicle of the simulator has such a support
+    check = check_robot(robot)
+    assert check.drives_straight and check.speed > 0.98 * check.command[0]
+
+
+def test_where_a_vehicle_file_is_needed_a_robot_file_is_told_what_to_do_first(tmp_path):
+    path = robot_file(tmp_path)
+    with pytest.raises(ValueError, match=f"a robot file; needed here is a vehicle file.*--model {path}"):
+        load_vehicle(path)
+    assert about(path).startswith("a robot file. Look at it with python -m sysid.inspect")
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "fit/model.toml").touch()
+    with pytest.raises(ValueError, match="the fit of a model of your own"):
+        load_subject(str(tmp_path / "fit"))
 
 
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
@@ -115,6 +157,15 @@ def test_balls_before_and_behind_the_axle_leave_the_weight_to_the_wheels(tmp_pat
     straight, check = drives(robot)
     assert straight and sum(share for name, share in check.loads.items() if "wheel" in name) > 0.5
     assert any("a, b are raised by up to 2 mm" in note for note in robot.notes)
+
+
+def test_a_support_that_hangs_just_above_the_floor_slides_too(tmp_path):
+    """A robot that leans forward comes down on it when it speeds up."""
+    balls = [link(name, BALL, mass) + joint(f"{name}_joint", name, f"{x} 0 {z}")
+             for name, mass, x, z in (("front", 2.0, 0.2, -0.05), ("rear", 0.1, -0.2, -0.047))]
+    robot = load_robot(robot_file(tmp_path, *TWO, *balls))
+    assert robot.host.geom("rear").friction[0] == pytest.approx(0.05)
+    assert any("front, rear are raised" in note for note in robot.notes) and drives(robot)[0]
 
 
 def test_a_ball_slides_with_the_friction_that_is_stated_for_gazebo(tmp_path):

@@ -33,6 +33,8 @@ from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
 SCHEMA = 1
 KIND = "micromobility-vehicle"
+ROBOT_FILES = (".xml", ".mjcf", ".urdf", ".xacro")
+"""Ends of the names of robot files, which people give in place of vehicle files."""
 LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period",
          "wheel_inertia.reaction"}
 """Parameters that earlier files do not have: where they are absent they are neutral."""
@@ -167,6 +169,10 @@ def _parameter_tables(holder: str, value: Any, intervals: dict[str, tuple[float,
 
 def _read(path: Path) -> dict[str, Any]:
     """Content of a vehicle file, of the right kind and schema."""
+    if path.suffix in ROBOT_FILES and path.is_file():
+        raise ValueError(f"{path}: a robot file; needed here is a vehicle file. Fit it to a driving log: python -m "
+                         f"sysid.fit DATASET --model {path} --out RUN writes RUN/vehicle.toml where a vehicle of the "
+                         "simulator drives alike.")
     content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
                         "Vehicle files are written by sysid.fit.")
     content = upgraded(KIND, content)

@@ -1,0 +1,149 @@
+"""A robot of one's own in the closed loop: which effect is hidden in drives of a robot that came as a URDF file.
+
+    python -m benchmarks.own_robot --part 1/5 --out runs/own_robot     # in five processes
+    python -m benchmarks.own_robot --collect                           # counts, and writes the figures
+
+A robot of 1.2 kg is driven on the contact plant, which shares no code with its model. Its wheels, track and markers are
+not where its owner believes. The first day is fitted by its URDF file, as `sysid.fit LOG --model robot.urdf` does. Then
+`sysid.close_loop LOG --vehicle RUN/vehicle.toml --reference DAYS` is asked about logs of other days, each with one
+effect at twice the base size of the plant's table, in proportion to the robot's mass, speeds and drives. Two more logs
+have no effect.
+
+Writes benchmarks/results/logs.json.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.calibration import MANOEUVRES, short_drives
+from benchmarks.harness import figure, record
+from benchmarks.logs import CLAIM
+from benchmarks.plant.effects import EFFECTS, in_proportion
+from benchmarks.plant.first_day import SLOWER, SMALL, Day, Wrong, make_uncalibrated, write_urdf
+from sysid.logs.log import load_log, of_file
+from sysid.missing.fit_statistics import load_fitted
+from sysid.pages.fit_report import fit_dataset
+from sysid.pages.loop_report import effects as named_effects
+from sysid.search.settings import FitConfig
+from sysid.verdict.pipeline import find_missing
+from sysid.verdict.preparation import prepare, reference_for
+from sysid.verdict.result import LoopConfig
+from whill_mjx.io import command_line
+from whill_mjx.io.folders import write_whole
+
+WRONG = Wrong(x=0.05, y=-0.02)
+TESTED = ("command_delay", "command_dead_zone", "acceleration_limit", "command_scale", "actuator_lag", "dry_friction",
+          "wheel_radius_difference", "track_width", "odometry_scale", "sensor_delay")
+"""Ten effects that the catalogue can name, of each place in the vehicle."""
+TIMES = 2.0  # of the base size
+SPEEDS = {"m/s": SLOWER, "s^2/m": 1 / SLOWER}
+"""By unit, of a size on a vehicle that drives at other speeds."""
+DRIVES = (*MANOEUVRES, "random", "reverse")
+FIRST_SEED, LOG_SEED = 300, 400
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What to run."""
+
+    out: Path = Path("runs/own_robot")
+    """Folder for drives, the fitted robot and verdicts; several processes may share it."""
+    part: str = "1/1"
+    """I/N: every N-th log, from the I-th."""
+    days: int = 4
+    """Reference days."""
+    nulls: int = 2
+    """Logs without an effect."""
+    only: tuple[str, ...] = ()
+    """Only logs with these effects, or of these names."""
+    quick: bool = False
+    """Fewer iterations of the loop; the fit has few in any case."""
+    collect: bool = False
+    """Only count what is there."""
+
+
+def size_of(name: str) -> float:
+    """Size of an effect on the small robot, in its unit."""
+    entry = EFFECTS[name]
+    return in_proportion(name, min(TIMES * entry.base, entry.most), SMALL) * SPEEDS.get(entry.unit, 1.0)
+
+
+def drive(folder: Path, seed: int, replicates: int, effects: tuple[tuple[str, float], ...] = ()) -> Path:
+    """A day of the small robot; its drives are kept."""
+    if not folder.exists():
+        day = Day("small", WRONG, seed, effects, varies=True)
+        make_uncalibrated(folder, day, replicates, short_drives(seed, DRIVES))
+    return folder
+
+
+def judge(config: Benchmark) -> None:
+    """Fit the robot, make its reference, and keep the verdict on each log of this part."""
+    first, count = (int(one) for one in config.part.split("/"))
+    out = config.out / f"part_{first}_of_{count}"
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    days = [load_log(drive(out / f"day_{k + 1}", FIRST_SEED + k, 3 if k == 0 else 1)) for k in range(config.days)]
+    fitted = out / "fit" / "vehicle.toml"
+    if not fitted.exists():
+        settings = FitConfig(model=str(write_urdf(out / "robot.urdf")), quick=True, elsewhere=False)
+        fit_dataset(out / "day_1", out / "fit", config=settings)
+        print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
+    loop = LoopConfig(quick=config.quick)
+    spec, vehicle = load_fitted(fitted)
+    days = [of_file(day, spec, str(fitted)) for day in days]
+    reference = reference_for(days[0], days, loop, start=vehicle.params)
+    ready = prepare(reference, days[0].spec, loop)
+    print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
+    names = (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))
+    for number, name in list(enumerate(names))[first - 1 :: count]:
+        path = config.out / "verdicts" / f"{name}.json"
+        if path.exists() or (config.only and name not in config.only):
+            continue
+        effects = ((name, size_of(name)),) if name in EFFECTS else ()
+        log = of_file(load_log(drive(out / f"log_{number}", LOG_SEED + number, 2, effects)), spec, str(fitted))
+        began_log = time.perf_counter()
+        result = find_missing(log, (), loop, reference=ready)
+        verdict_of = result.search.verdict
+        found = [[one["name"], *one["class"]] for one in named_effects(result)] if verdict_of == "named" else []
+        verdict = {"effect": name, "size": size_of(name) if effects else 0.0, "verdict": verdict_of,
+                   "named": found, "seconds": time.perf_counter() - began_log}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, json.dumps(verdict, indent=1) + "\n")
+        print(f"{name}: {verdict['verdict']} {found}, {verdict['seconds']:.0f} s", flush=True)
+
+
+def collect(config: Benchmark) -> dict[str, Any]:
+    """Figures of all verdicts: right is a log whose effect is in the class of one that was named, and no other."""
+    verdicts = [json.loads(path.read_text()) for path in sorted((config.out / "verdicts").glob("*.json"))]
+    right, false = [], []
+    for one in verdicts:
+        if one["effect"] in EFFECTS:
+            known = EFFECTS[one["effect"]].covered or one["effect"]
+            right.append(float(len(one["named"]) == 1 and known in one["named"][0]))
+            print(f"{one['effect']}: {one['verdict']} {one['named']}{'' if right[-1] else ' WRONG'}")
+        else:
+            false.append(float(one["verdict"] != "none"))
+    if not right:
+        raise ValueError(f"{config.out}: no verdict on a log with an effect. Run some parts first.")
+    return {"own_robot_loop_right": {**figure(right, "logs with the right class"), "value": sum(right)},
+            "own_robot_loop_logs": {**figure(right, "logs"), "value": float(len(right))},
+            **({"own_robot_loop_false": {**figure(false, "alarms of logs without an effect"), "value": sum(false)}}
+               if false else {})}
+
+
+def main(config: Benchmark) -> None:
+    """Judge the logs of this part, or count."""
+    if not config.collect:
+        judge(config)
+        if config.part != "1/1":
+            return
+    print(record("logs", CLAIM, collect(config)))
+
+
+if __name__ == "__main__":
+    command_line.run(Benchmark, main, __doc__, positional=False)

@@ -1,0 +1,70 @@
+"""A robot of a file: compiled, at rest on its floor, and where its parts are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A compiled differential drive and where its parts are."""
+
+    path: Path
+    spec: Any
+    """The editable mujoco.MjSpec."""
+    host: mujoco.MjModel
+    root: int
+    """Address of the free joint in qpos."""
+    speed: int
+    """Address of the free joint in qvel."""
+    wheels: tuple[int, ...]
+    """Addresses of the driven wheels in qvel: one to three on the left, then as many on the right."""
+    actuators: tuple[int, ...]
+    sign: tuple[float, ...]
+    """1 where a positive speed of the joint drives forwards."""
+    motors: bool
+    """The actuators take a torque, and not a speed."""
+    drive_gain: tuple[float, float]
+    """Gain of a speed controller before motors, and the highest stable one [N m s/rad over the motor's gain]."""
+    point: np.ndarray  # (3,) middle between the driven wheels, root's frame
+    forward: np.ndarray  # (3,) root's frame
+    wheel_radius: float
+    track: float
+    rest: np.ndarray  # qpos after SETTLE
+    added: tuple[int, ...] = ()
+    """Actuators that the file does not have."""
+    sliding: tuple[int, ...] = ()
+    """Geoms that stand on the floor and neither turn nor swivel."""
+    distance: float = 0.0
+    """Between the driven wheels, as the file says [m]."""
+    notes: tuple[str, ...] = ()
+    """What was left out of the file."""
+    integrals: tuple[int, ...] = ()
+    """Actuators that take the same targets and pull by how far their wheels lag behind; none, or one for each wheel."""
+    spin: float = 0.0
+    """Inertia of a driven wheel, motor included [kg m^2]."""
+    load: float = 0.0
+    """Inertia that it speeds up, its share of the vehicle's included [kg m^2]."""
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Those of the driven wheels."""
+        return tuple(int(self.host.dof_jntid[wheel]) for wheel in self.wheels)
+
+    @property
+    def activation(self) -> np.ndarray:
+        """(na,) of actuators with a memory, at rest: no wheel lags behind."""
+        found = np.zeros(self.host.na)
+        for one, joint in zip(self.integrals, self.joints, strict=False):
+            found[self.host.actuator_actadr[one]] = self.rest[self.host.jnt_qposadr[joint]]
+        return found
+
+    @property
+    def sides(self) -> np.ndarray:
+        """(W,) 0 for each driven wheel on the left, then 1 for each on the right."""
+        return np.repeat([0, 1], len(self.wheels) // 2)

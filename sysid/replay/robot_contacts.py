@@ -1,0 +1,123 @@
+"""What of a robot touches what: wheels and floor, and contacts that are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from whill_mjx.vehicle.model import import_mjx
+
+ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE)
+FIRM_TIME, FIRM, ALONE = [0.01, 1.0], [0.99, 0.99, 0.001, 0.5, 2.0], 1e3
+"""solref, solimp and solmix of wheels that a file says nothing of. With MuJoCo's own, one of 33 mm sinks by 0.4 mm, and
+rolls as if its radius were 0.6 % smaller."""
+WATER = 1000.0  # kg/m^3, of a link without a mass, as MuJoCo has it
+DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
+
+
+def parts(host: mujoco.MjModel, body: int) -> np.ndarray:
+    """Geoms of a body and of all that is fixed to it."""
+    return np.flatnonzero(host.body_weldid[host.geom_bodyid] == host.body_weldid[body])
+
+
+def touches_ground(host: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom may touch a plane of the world, or any geom where there is none: a visual one does not."""
+    ground = np.flatnonzero((host.geom_bodyid == 0) & (host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    if not len(ground):
+        return bool(host.geom_contype[geom] | host.geom_conaffinity[geom])
+    masks = host.geom_contype[geom] & host.geom_conaffinity[ground]
+    return bool((masks | host.geom_contype[ground] & host.geom_conaffinity[geom]).any())
+
+
+def radius_of(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
+    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
+    round_ones = [int(one) for one in parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
+    touching = [one for one in round_ones if touches_ground(host, one)]
+    sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
+    if not sizes and known is None:
+        raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to give its radius. Give wheel_radius.")
+    return max(sizes) if sizes else float(known or 0.0)
+
+
+def below_wheels(
+    path: Path, host: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], radius: float,
+) -> dict[str, str]:  # fmt: skip
+    """Geoms that reach so far below the driven wheels that these would hang in the air, with a note for each: mostly
+    boxes that stand in for meshes."""
+    floor = min(float(data.xpos[body, 2]) for body in bodies) - radius
+    wheels = {int(host.body_weldid[body]) for body in bodies}
+    found = {}
+    for geom in range(host.ngeom):
+        if host.geom_bodyid[geom] == 0 or int(host.body_weldid[host.geom_bodyid[geom]]) in wheels or not (
+                host.geom_contype[geom] | host.geom_conaffinity[geom]):
+            continue
+        turn, reach = data.geom_xmat[geom].reshape(3, 3), host.geom_aabb[geom, 3:]
+        round_one = int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
+        down = float(reach[0] if round_one else np.abs(turn[2]) @ reach)
+        low = floor - (float(data.geom_xpos[geom, 2] + turn[2] @ host.geom_aabb[geom, :3]) - down)
+        if low > DEEP * radius:
+            name = host.geom(geom).name
+            found[name] = (f"{path.name}: {name} reaches {low:.3g} m below the driven wheels: its contacts are left "
+                           "out")
+    return found
+
+
+def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
+    """What a URDF leaves to its simulator, a note for each change.
+
+    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges, scrubs in every turn
+    and turns as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of
+    arms, heads and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its
+    speed, whatever its bearing.
+    """
+    notes = []
+    driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = 0, 1
+        if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and geom.parent.name in driven:
+            if not geom.parent.explicitinertial:
+                geom.mass = WATER * 2 * np.pi * geom.size[0] ** 2 * geom.size[1]
+            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [geom.size[0], 0.0, 0.0]
+            geom.solref, geom.solimp, geom.solmix = FIRM_TIME, FIRM, ALONE
+    for joint in list(spec.joints):
+        if joint.name in joints:
+            if np.any(joint.frictionloss) or np.any(joint.damping):
+                notes.append(f"{path.name}: friction and damping of joint {joint.name} are left out: an added servo "
+                             "would make up for them")
+            joint.frictionloss = 0.0
+            joint.damping = np.zeros_like(joint.damping)
+        elif joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
+                joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.ptp(joint.range)):
+            notes.append(f"{path.name}: joint {joint.name} is held at 0: the file has no motor or spring for it")
+            spec.delete(joint)
+    return notes
+
+
+def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
+    """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    import_mjx()
+    from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
+
+    left_out: dict[tuple[str, str], str] = {}
+    for one, other, declared in geom_pairs(host):
+        kinds = [int(host.geom_type[geom]) for geom in (one, other)]
+        if has_collision_fn(*kinds):  # type: ignore[arg-type]
+            continue
+        shapes = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds]
+        geoms = " and ".join(f"geom {host.geom(int(geom)).name or geom!r} ({shape})"
+                             for geom, shape in zip((one, other), shapes, strict=True))
+        bodies = [int(host.geom_bodyid[geom]) for geom in (one, other)]
+        if declared >= 0 or 0 in bodies or host.body_rootid[bodies[0]] != host.body_rootid[bodies[1]]:
+            raise ValueError(f"{path}: MJX has no contact between {geoms}. Replace one by a sphere, capsule or box, or "
+                             "let their contype and conaffinity keep them apart.")
+        names = sorted(host.body(body).name for body in bodies)
+        left_out.setdefault((names[0], names[1]), f"{path.name}: MJX has no contact between {geoms}; contacts between "
+                            f"their bodies {names[0]} and {names[1]} are left out")
+    for first, second in left_out:
+        spec.add_exclude(name=f"{first}_{second}_left_out", bodyname1=first, bodyname2=second)
+    return tuple(left_out.values())

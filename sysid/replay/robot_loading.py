@@ -1,0 +1,185 @@
+"""A robot from its file: completed with what the file lacks, compiled, and at rest on its floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import as_in_gazebo, below_wheels, leave_out_contacts, radius_of
+from sysid.replay.robot_files import read_robot
+from sysid.replay.robot_rest import NEAR, near_floor, raise_supports, settle, sliding
+from sysid.replay.robot_servos import add_servos, are_motors, drive_gain, integrals, is_stable, regulate, wheel_inertias
+from sysid.replay.wheels import wheel_joints
+from whill_mjx.io.fields import Field, check
+
+TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
+STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
+SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
+URDF_STEP = 0.0025  # s; a URDF states none
+
+
+def load_robot(
+    path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None, track: float | None = None,
+    timestep: float | None = None, regulated: bool = False,
+) -> Robot:
+    """Read, complete and compile a differential drive; errors as of `sysid.replay.mjcf.mjcf_model`.
+
+    `regulated`: its wheels are driven as by the controller of a usual robot, with an integral part and a limit.
+    """
+    try:
+        draft = _read(path, wheels, wheel_radius, timestep)
+        radius = float(radius_of(path, draft.host, draft.bodies[0]) if wheel_radius is None else wheel_radius)
+        bare = _drive(draft, radius, regulated)
+        _ground(draft, radius)
+    except (ValueError, KeyError, mujoco.FatalError, mujoco.UnexpectedError) as error:
+        text = str(error).strip()
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}. Correct the "
+                         "model.") from None
+    host, data, ids = draft.host, draft.data, draft.ids
+    body = int(host.body_rootid[draft.bodies[0]])
+    half = len(ids) // 2
+    left = data.xanchor[ids[:half]].mean(0) - data.xanchor[ids[half:]].mean(0)
+    distance = float(np.linalg.norm(left))
+    left = left / distance
+    rotation = data.xmat[body].reshape(3, 3).copy()  # the data moves on
+    middle = data.xanchor[ids].mean(0) - data.xpos[body]
+    sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
+    actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
+    free = int(host.body_jntadr[body])
+    root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), host.jnt_dofadr[ids].tolist()
+    supports = _rest(draft, speed, turning, radius)
+    inertias = [wheel_inertias(host, one, radius, len(ids)) for one in ids]
+    return Robot(path, draft.spec, host, root, speed, tuple(turning), actuators, sign,
+                 are_motors(path, host, actuators), drive_gain(host, actuators, inertias), rotation.T @ middle,
+                 rotation.T @ np.cross(left, [0.0, 0.0, 1.0]), radius, distance if track is None else track,
+                 data.qpos.copy(), tuple(actuators[one] for one in bare), supports, distance, tuple(draft.notes),
+                 integrals(host, ids), *(float(one) for one in np.mean(inertias, axis=0)))
+
+
+@dataclass
+class _Draft:
+    """A robot while it is completed."""
+
+    path: Path
+    spec: Any
+    joints: tuple[str, ...]
+    """Of the driven wheels."""
+    stated: dict[str, float] | None
+    """Friction of links as a URDF states it for Gazebo; None for MJCF."""
+    notes: list[str]
+    host: mujoco.MjModel = field(init=False)
+    data: mujoco.MjData = field(init=False)
+
+    def compile(self) -> None:
+        """Renew the model and where its bodies are."""
+        self.host = self.spec.compile()
+        self.data = mujoco.MjData(self.host)
+        mujoco.mj_kinematics(self.host, self.data)
+
+    @property
+    def ids(self) -> list[int]:
+        """Of the driven wheels' joints."""
+        return [self.host.joint(name).id for name in self.joints]
+
+    @property
+    def bodies(self) -> list[int]:
+        """Of the driven wheels."""
+        return [int(self.host.jnt_bodyid[one]) for one in self.ids]
+
+
+def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timestep: float | None) -> _Draft:
+    """The file with its free joint and names, compiled."""
+    spec, notes, stated = read_robot(path, wheels, wheel_radius)
+    joints = wheel_joints(path, spec, wheels)
+    if stated is not None:
+        if len(joints) == 2:  # the file has none
+            spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
+        notes += as_in_gazebo(path, spec, joints)
+        spec.option.timestep = URDF_STEP
+    _complete(path, spec, joints)
+    if timestep is not None:
+        spec.option.timestep = timestep
+    check(str(path), TIMESTEP, float(spec.option.timestep))
+    draft = _Draft(path, spec, joints, stated, notes)
+    draft.compile()
+    return draft
+
+
+def _drive(draft: _Draft, radius: float, regulated: bool) -> list[int]:
+    """Give wheels what turns them; numbers of those that the file has nothing for."""
+    spec, host, joints = draft.spec, draft.host, draft.joints
+    inertias = [wheel_inertias(host, one, radius, len(joints)) for one in draft.ids]
+    bare = add_servos(spec, joints, inertias)
+    if regulated and is_stable(host, joints, inertias):
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    if regulated:
+        regulate(spec, host, joints, inertias, radius)
+    if bare or regulated:
+        draft.compile()
+    return bare
+
+
+def _ground(draft: _Draft, radius: float) -> None:
+    """Put the robot on a floor, without contacts that would lift its wheels and those that MJX lacks."""
+    path, spec, bodies = draft.path, draft.spec, draft.bodies
+    if not (draft.host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
+        bottom = float(draft.data.xpos[bodies[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
+        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],
+                                friction=[0, 0, 0])  # MuJoCo takes the larger one of two geoms
+        draft.compile()
+    if draft.stated is not None and (low := below_wheels(path, draft.host, draft.data, bodies, radius)):
+        for name in low:
+            spec.geom(name).conaffinity = 0
+        draft.notes += list(low.values())
+        draft.compile()
+    if left_out := leave_out_contacts(path, spec, draft.host):
+        draft.notes += left_out
+        draft.compile()
+
+
+def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> tuple[int, ...]:
+    """Let the robot settle; geoms that slide on the floor, with the friction of a URDF."""
+    path, spec, host, data = draft.path, draft.spec, draft.host, draft.data
+    root = int(host.body_rootid[draft.bodies[0]])
+    settle(path, host, data, speed, turning, radius)
+    if draft.stated is None:
+        return sliding(host, data, root)
+    supports = near_floor(host, data, root, NEAR * radius)
+    if raised := raise_supports(path, host, data, spec, supports, draft.bodies):
+        draft.notes += raised
+        mujoco.mj_resetData(host, data)
+        settle(path, host, data, speed, turning, radius)
+    for geom in {*supports, *sliding(host, data, root, swivelling=True)}:
+        friction = min(draft.stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
+        host.geom_friction[geom, 0] = friction
+        spec.geom(host.geom(geom).name).friction[0] = friction
+    return sliding(host, data, root)
+
+
+def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
+    """Give the model a free joint and names to its bodies and geoms, where it has none."""
+    spec.compiler.fusestatic = False
+    named = {body.name for body in spec.bodies}
+    for k, body in enumerate(spec.bodies):
+        if not body.name:
+            body.name = next(name for name in (f"body_{k}", f"body_{k}_unnamed") if name not in named)
+    top = next(body for body in spec.bodies if any(joint.name == joints[0] for joint in body.joints))
+    while top.parent.name != "world":
+        top = top.parent
+    if not len(top.joints):
+        top.add_freejoint()
+    elif top.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError(f"{path}: body {top.name!r} hangs on joint {top.joints[0].name!r}; a vehicle moves freely. "
+                         "Give it a freejoint, or no joint.")
+    for body in spec.bodies:
+        taken = {geom.name for geom in spec.geoms}
+        for k, geom in enumerate(body.geoms):
+            plain = body.name if k == 0 else f"{body.name}_{k}"
+            if not geom.name and plain and plain not in taken:
+                geom.name = plain

@@ -1,0 +1,265 @@
+"""Parameters of a robot by dotted paths: where they stand in its model, and how they are written back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import parts, touches_ground
+from sysid.replay.robot_servos import LAGGING
+from sysid.replay.robot_sizes import Size
+from whill_mjx.logs.dataset import write_text
+
+FIELDS = {  # KIND, FIELD -> array of the model, column, unit
+    ("body", "mass"): ("body_mass", None, "kg"),
+    **{("body", f"com_{axis}"): ("body_ipos", i, "m") for i, axis in enumerate("xyz")},
+    **{("body", f"inertia_{axis}"): ("body_inertia", i, "kg m^2") for i, axis in enumerate("xyz")},
+    **{("geom", name): ("geom_friction", i, unit) for i, (name, unit) in enumerate(
+        (("friction", "-"), ("friction_torsional", "m"), ("friction_rolling", "m")))},
+    ("geom", "radius"): ("geom_size", 0, "m"),
+    ("joint", "damping"): ("dof_damping", None, "N m s/rad"),
+    ("joint", "armature"): ("dof_armature", None, "kg m^2"),
+    ("joint", "frictionloss"): ("dof_frictionloss", None, "N m"),
+    ("joint", "stiffness"): ("jnt_stiffness", None, "N m/rad"),
+    ("joint", "force_limit"): ("jnt_actfrcrange", 1, "N m"),
+    ("actuator", "gain"): ("actuator_gainprm", 0, "-"),
+    ("actuator", "force_limit"): ("actuator_forcerange", 1, "N m"),
+}
+KINDS = {"body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM, "joint": mujoco.mjtObj.mjOBJ_JOINT,
+         "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR}
+PREFIXES = {"body": "body", "geom": "geom", "dof": "joint", "jnt": "joint", "actuator": "actuator"}
+"""Of arrays, and the KIND of what their rows are."""
+LIMITS = ("actuator_forcerange", "jnt_actfrcrange")  # the same either way
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a parameter stands in the model."""
+
+    path: str
+    array: str
+    rows: tuple[int, ...]
+    column: int | None
+    unit: str
+    ids: tuple[int, ...]
+    """Of the elements that the path names."""
+    servo: tuple[int, ...] = ()
+    """Columns of actuator_biasprm with which a servo pulls back what its gain pulls."""
+
+    @property
+    def kind(self) -> str:
+        """KIND of what it changes."""
+        return PREFIXES[self.array.partition("_")[0]]
+
+    def read(self, model: Any) -> float:
+        """Its value, of the first element."""
+        values = np.asarray(getattr(model, self.array))
+        return float(values[self.rows[0]] if self.column is None else values[self.rows[0], self.column])
+
+    def changes(self, model: Any, value: Any) -> dict[str, Any]:
+        """Arrays of a model, of NumPy or JAX, with the value put in."""
+        rows = np.array(self.rows)
+
+        def put(array: Any, column: int | None, value: Any) -> Any:
+            index: Any = rows if column is None else (rows, column)
+            if isinstance(array, jax.Array):
+                return array.at[index].set(value)
+            array = np.array(array)
+            array[index] = value
+            return array
+
+        found = {self.array: put(getattr(model, self.array), self.column, value)}
+        if self.array == "body_mass":
+            scale = (value / model.body_mass[rows])[:, None]
+            found["body_inertia"] = put(model.body_inertia, None, model.body_inertia[rows] * scale)
+        if self.array == "body_inertia" and self.path.endswith(".inertia"):
+            scale = (value / model.body_inertia[rows, self.column])[:, None]
+            found[self.array] = put(model.body_inertia, None, model.body_inertia[rows] * scale)
+        if self.array in LIMITS:
+            found[self.array] = put(found[self.array], 0, -value)
+        for column in self.servo:
+            found["actuator_biasprm"] = put(found.get("actuator_biasprm", model.actuator_biasprm), column, -value)
+        return found
+
+
+class Overlaid:
+    """A model with some of its arrays replaced."""
+
+    def __init__(self, host: mujoco.MjModel, arrays: dict[str, np.ndarray]):
+        self._host, self._arrays = host, arrays
+
+    def __getattr__(self, name: str) -> Any:
+        return self._arrays.get(name, getattr(self._host, name))
+
+
+def resolve(robot: Robot, path: str) -> Entry:
+    """Where a dotted path leads; ValueError names what is known."""
+    kind, _, rest = path.partition(".")
+    host = robot.host
+    parts = rest.split(".")
+    if kind not in KINDS or len(parts) < 2:
+        raise ValueError(f"{robot.path}: parameter {path!r} is not KIND.NAME.FIELD with KIND one of "
+                         f"{', '.join(KINDS)}; write for example body.base.mass.")
+    numbered = parts[-1].isdigit() and len(parts) > 2
+    pattern, field = ".".join(parts[: -2 if numbered else -1]), parts[-2 if numbered else -1]
+    known = names_of(host, kind)
+    ids = [number for name, number in known.items()
+           if any(name == one or fnmatchcase(name, one) for one in (pattern, *pattern.split("|")))]
+    if not ids:
+        raise ValueError(f"{robot.path}: no {kind} {pattern!r} (known: {', '.join(known)}). Correct {path!r}.")
+    array, column, unit = FIELDS.get((kind, field), (f"{kind}_{field}", None, "-"))
+    if (kind, field) not in FIELDS:
+        values = getattr(host, array, None)
+        if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+            fields = [name for one, name in FIELDS if one == kind]
+            raise ValueError(f"{robot.path}: {kind} has no field {field!r} (known: {', '.join(fields)}, or an array "
+                             f"{kind}_NAME of mjx.Model). Correct {path!r}.")
+        column = int(parts[-1]) if numbered else 0 if values.ndim > 1 else None
+        if (kind, field) == ("body", "inertia") and not numbered:
+            column, unit = _upright(robot, ids[0]), "kg m^2"
+    rows = [int(host.jnt_dofadr[one]) for one in ids] if array.startswith("dof_") else ids
+    servo: tuple[int, ...] = ()
+    if array == "actuator_gainprm" and column == 0:
+        servo = tuple(one for one in (1, 2) if (host.actuator_biasprm[ids, one] != 0).all())
+    entry = Entry(path, array, tuple(rows), column, unit, tuple(ids), servo)
+    if array == "dof_frictionloss" and (host.dof_frictionloss[rows] <= 0).any():
+        raise ValueError(f"{robot.path}: {path} is 0 in the file, and MJX then leaves dry friction out. Give the joint "
+                         "a small frictionloss.")
+    if array == "actuator_forcerange" and not host.actuator_forcelimited[list(ids)].all():
+        raise ValueError(f"{robot.path}: {path} has no limit in the file. Give the actuator a forcerange.")
+    return entry
+
+
+def _upright(robot: Robot, body: int) -> int:
+    """Principal axis of a body that is the most upright at rest."""
+    data = mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(robot.host, data)
+    return int(np.abs(data.ximat[body].reshape(3, 3)[2]).argmax())
+
+
+def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
+    """Elements of a kind by name."""
+    count = {"body": host.nbody, "geom": host.ngeom, "joint": host.njnt, "actuator": host.nu}[kind]
+    found = {mujoco.mj_id2name(host, KINDS[kind], i): i for i in range(count)}
+    return {name: i for name, i in found.items() if name and name != "world"}
+
+
+def default_paths(robot: Robot) -> tuple[str, ...]:
+    """Gain and damping of the driven wheels and friction of their tyres, each pair as one pattern where one fits."""
+    host = robot.host
+    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    bodies = host.jnt_bodyid[joints]
+    geoms = [max((int(one) for one in parts(host, body) if touches_ground(host, int(one))),
+                 key=lambda one: host.geom_rbound[one], default=None) for body in bodies]
+    if any(one is None for one in geoms):
+        raise ValueError(f"{robot.path}: a driven wheel has no geom that touches the ground (contype and conaffinity). "
+                         "Give it one.")
+    found = []
+    for kind, ids, field in (("actuator", robot.actuators, "gain"), ("joint", joints, "damping"),
+                             ("geom", geoms, "friction")):
+        names = [mujoco.mj_id2name(host, KINDS[kind], one) for one in ids]
+        pattern = _pattern(names, names_of(host, kind))
+        together = ["|".join(names)] if len(names) > 2 else names  # all wheels of a skid drive share one value
+        for name in together if pattern is None else [pattern]:
+            path = f"{kind}.{name}.{field}"
+            if resolve(robot, path).read(host) != 0:
+                found.append(path)
+    return tuple(found)
+
+
+def _pattern(names: Sequence[str], known: Mapping[str, int]) -> str | None:
+    """One pattern that matches these names and no other."""
+    side = names[0].lower().find("left") if len(names) == 2 else -1
+    start = names[0][:side] if side >= 0 else os.path.commonprefix(list(names))
+    end = names[0][side + 4 :] if side >= 0 else os.path.commonprefix([name[len(start):][::-1] for name in names])[::-1]
+    pattern = f"{start}*{end}"
+    return pattern if {name for name in known if fnmatchcase(name, pattern)} == set(names) else None
+
+
+def turning_inertia(robot: Robot) -> str:
+    """Path of the inertia of the vehicle's heaviest body: robot files often have a placeholder there, and the rest of
+    its controller's lag shows in turns."""
+    host = robot.host
+    root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
+    heaviest = int(np.where(host.body_rootid == root, host.body_mass, 0.0).argmax())
+    return f"body.{host.body(heaviest).name}.inertia"
+
+
+def drive_entries(robot: Robot) -> dict[str, tuple[Entry, float, float, float]]:
+    """Parameters of the controller that a regulated robot got, each with its start and bounds.
+
+    All follow from the inertia that a wheel speeds up: lags of up to a second, oscillations of up to 7 Hz, and
+    accelerations of up to 30 m/s^2.
+    """
+    host, load, both = robot.host, robot.load, robot.integrals
+    found = {}
+    if robot.added:
+        ids = tuple(robot.added)
+        kp = Entry("drive.kp", "actuator_gainprm", ids, 0, "N m s/rad", ids, (2,))
+        high = robot.spin / host.opt.timestep  # a wheel that slips is stable
+        found["drive.kp"] = (kp, min(load / 0.1, high / 2), load / 1.0, high)
+    if both:
+        ki = Entry("drive.ki", "actuator_gainprm", both, 0, "N m/rad", both, (1,))
+        found["drive.ki"] = (ki, LAGGING * load, 0.3 * load, 2000.0 * load)
+        limit = Entry("drive.limit", "jnt_actfrcrange", robot.joints, 1, "N m", robot.joints)
+        high = limit.read(host)
+        found["drive.limit"] = (limit, high, high / 100, high * 1.001)
+    return found
+
+
+def write_mjcf(robot: Robot, values: Mapping[Entry | Size, float], path: Path) -> Path:
+    """Write the completed model with values put in, whole or not at all."""
+    host, spec = robot.host, robot.spec.copy()
+    arrays: dict[str, np.ndarray] = {}
+    for entry, value in values.items():
+        view: Any = Overlaid(host, arrays)
+        arrays.update(entry.changes(view, value))
+    for entry in values:
+        if isinstance(entry, Size):
+            _put_size(spec, entry, Overlaid(host, arrays))
+            continue
+        for number in entry.ids:
+            _put(spec, entry, number, Overlaid(host, arrays))
+    spec.compile()
+    write_text(path, spec.to_xml())
+    return path
+
+
+def _put_size(spec: Any, entry: Size, model: Any) -> None:
+    for body in entry.bodies:
+        spec.body(mujoco.mj_id2name(model._host, KINDS["body"], body)).pos = model.body_pos[body]
+    for geom in (one for geoms in entry.geoms for one in geoms):
+        spec.geom(mujoco.mj_id2name(model._host, KINDS["geom"], geom)).size[0] = model.geom_size[geom, 0]
+
+
+def _put(spec: Any, entry: Entry, number: int, model: Any) -> None:
+    """Set one element of the editable model to what the compiled one says."""
+    kind = entry.kind
+    name = mujoco.mj_id2name(model._host, KINDS[kind], number)
+    element = {"body": spec.body, "geom": spec.geom, "joint": spec.joint, "actuator": spec.actuator}[kind](name)
+    if kind == "body" and entry.array in ("body_mass", "body_ipos", "body_inertia"):
+        element.explicitinertial = True
+        element.mass = float(model.body_mass[number])
+        element.ipos, element.iquat = model.body_ipos[number], model.body_iquat[number]
+        element.inertia = model.body_inertia[number]
+        element.fullinertia = np.full(6, np.nan)
+        return
+    arrays = (entry.array, "actuator_biasprm") if entry.array == "actuator_gainprm" else (entry.array,)
+    for array in arrays:
+        row = entry.rows[entry.ids.index(number)]
+        values, field = np.asarray(getattr(model, array))[row], array.partition("_")[2]
+        held = getattr(element, field)
+        if isinstance(held, np.ndarray):
+            held[: values.size] = values.reshape(-1)[: held.size]
+        else:
+            setattr(element, field, float(values))

@@ -1,0 +1,124 @@
+"""What turns a robot's wheels: servos and motors of its file, and those that it gets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+SERVO_TIME = 0.005  # s in which the servos that a model without actuators gets follow a change of speed
+SKID_SHARE = 1.0
+"""As `ROTOR_SHARE`, where wheels skid in every turn: heavy ones hold their speed while contacts find how they slide."""
+ROTOR_SHARE = 0.25
+"""Of the inertia that it speeds up, which a wheel with such a servo has at least by itself: geared motors have as much.
+MuJoCo finds contact forces as if wheels turned freely. With a servo that is integrated implicitly it then moves a
+vehicle up to 90 ms ahead of its wheels, so the servo's torque is explicit, and a wheel that slips must be heavy."""
+LAGGING = 10.0  # 1/s^2, integral gain over the load of a wheel with which a controller starts: it takes half a second
+STRONG = 30.0  # m/s^2, acceleration at the limit of a drive whose limit is not known
+
+
+def wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) -> tuple[float, float]:
+    """Inertia about a wheel's axle [kg m^2]: of the wheel alone, and with its share of a vehicle on `count` wheels."""
+    body = int(host.jnt_bodyid[joint])
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, host.body_iquat[body])
+    axis = turn.reshape(3, 3).T @ host.jnt_axis[joint]
+    wheel = float(axis**2 @ host.body_inertia[body] + host.dof_armature[host.jnt_dofadr[joint]])
+    return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / count
+
+
+def add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> list[int]:
+    """Give velocity servos to wheels without actuators; numbers of these wheels.
+
+    Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
+    vehicles follow within the same time. MuJoCo softens a contact with the inverse inertia of what touches: a wheel
+    without a motor's rotor would creep.
+    """
+    bare = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)]
+    share = ROTOR_SHARE if len(joints) == 2 else SKID_SHARE
+    time = max(SERVO_TIME, spec.option.timestep / share)
+    for k in bare:
+        actuator = spec.add_actuator(name=joints[k], target=joints[k], trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        wheel, total = inertias[k]
+        actuator.set_to_velocity(kv=total / time)
+        joint = spec.joint(joints[k])
+        joint.armature += max(share * total - wheel, 0.0)
+    if bare:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    return bare
+
+
+def regulate(
+    spec: Any, host: mujoco.MjModel, joints: Sequence[str], inertias: Sequence[tuple[float, float]], radius: float,
+) -> None:  # fmt: skip
+    """Give wheels without one an integral part beside their servo or motor, and a limit of what both pull together.
+
+    The integral part takes the same targets: torque = ki (integral of the target - angle of the wheel). A usual
+    controller of a robot's wheels is of this kind. Its gain starts where it hardly acts.
+    """
+    for name, (_, total) in zip(joints, inertias, strict=True):
+        joint = spec.joint(name)
+        mine = [one for one in spec.actuators if one.target == name]
+        if not any(one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR for one in mine):
+            actuator = spec.add_actuator(name=f"{name}_integral", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.set_to_intvelocity(kp=total * LAGGING)
+            actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if not host.jnt_actfrclimited[host.joint(name).id]:
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            limit = min(_motor_limit(host, host.joint(name).id), total * STRONG / radius)
+            joint.actfrcrange = [-limit, limit]
+
+
+def is_stable(host: mujoco.MjModel, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
+    """Whether wheels that slip are stable under the torques of their actuators at the start of a step."""
+    gains = [float(-host.actuator_biasprm[host.actuator_trnid[:, 0] == host.joint(name).id, 2].min(initial=0.0))
+             for name in joints]
+    return all(gain * host.opt.timestep <= wheel for gain, (wheel, _) in zip(gains, inertias, strict=True))
+
+
+def _motor_limit(host: mujoco.MjModel, joint: int) -> float:
+    """Largest torque of the file's motor on a joint; infinite where it has none."""
+    found = float("inf")
+    for one in np.flatnonzero(host.actuator_trnid[:, 0] == joint):
+        gear, gain = abs(host.actuator_gear[one, 0]), abs(host.actuator_gainprm[one, 0])
+        if host.actuator_forcelimited[one]:
+            found = min(found, gear * float(np.abs(host.actuator_forcerange[one]).max()))
+        if host.actuator_ctrllimited[one] and host.actuator_biastype[one] == int(mujoco.mjtBias.mjBIAS_NONE):
+            found = min(found, gear * gain * float(np.abs(host.actuator_ctrlrange[one]).max()))
+    return found
+
+
+def integrals(host: mujoco.MjModel, joints: Sequence[int]) -> tuple[int, ...]:
+    """Actuators with an integral part on these joints; none where one lacks it."""
+    integrator = host.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+    found = [np.flatnonzero((host.actuator_trnid[:, 0] == joint) & integrator) for joint in joints]
+    return tuple(int(one[0]) for one in found) if all(len(one) for one in found) else ()
+
+
+def drive_gain(
+    host: mujoco.MjModel, actuators: Sequence[int], inertias: Sequence[tuple[float, float]],
+) -> tuple[float, float]:  # fmt: skip
+    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable.
+
+    The controller's torque is computed before a step, so it may take away at most a wheel's whole speed in one.
+    """
+    wheel, total = (min(one) for one in zip(*inertias, strict=True))
+    motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
+    time = max(SERVO_TIME, 2 * host.opt.timestep)
+    high = wheel / host.opt.timestep
+    return min(total / time, high / 2) / motor, high / motor
+
+
+def are_motors(path: Path, host: mujoco.MjModel, actuators: Sequence[int]) -> bool:
+    """Whether the wheels' actuators take a torque; ValueError where they take neither that nor a speed."""
+    ids = list(actuators)
+    bias = host.actuator_biasprm[ids]
+    if (host.actuator_biastype[ids] == int(mujoco.mjtBias.mjBIAS_NONE)).all():
+        return True
+    if (bias[:, 1] == 0).all() and (bias[:, 2] < 0).all() and (host.actuator_dyntype[ids] == 0).all():
+        return False
+    raise ValueError(f"{path}: the wheels' actuators are neither motors nor velocity servos. Use <motor> or "
+                     "<velocity>.")
