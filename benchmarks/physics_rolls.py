@@ -30,11 +30,11 @@ def vehicle_of(name: str) -> tuple[VehicleSpec, VehicleParams]:
 
 
 def random_instances(
-    vehicle: str, count: int, dynamics: str = "fused"
+    vehicle: str, count: int, dynamics: str = "fused", kernel: bool | None = None
 ) -> tuple[VehicleModel, VehicleParams, VehicleState]:
     """`count` vehicles at rest with every parameter spread by SPREAD."""
     spec, params = vehicle_of(vehicle)
-    model = build_model(spec, VehicleConfig(dynamics=dynamics))
+    model = build_model(spec, VehicleConfig(dynamics=dynamics, kernel=kernel))
     key = jax.random.key(0)
 
     def scatter(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
