@@ -31,11 +31,12 @@ PERIODS = 10  # of 0.1 s: a second
 SWEEP = {
     "plain": None,
     "32 lanes": Launch(),
-    "32 lanes, exact": Launch(fast=False),
+    "32 lanes, no hoist": Launch(hoist=False),
     "64 lanes, 2 warps": Launch(64, 2),
     "128 lanes, 4 warps": Launch(128, 4),
     "64 lanes, 1 warp": Launch(64, 1),
     "32 lanes, 2 steps": Launch(unroll=2),
+    "32 lanes, 5 steps": Launch(unroll=5),
 }
 
 

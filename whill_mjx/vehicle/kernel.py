@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 
+from whill_mjx.vehicle import ptx
 from whill_mjx.vehicle.scalars import in_pieces
 
 PRIMITIVES = {
@@ -41,6 +42,10 @@ class Launch:
     """Warps of 32 threads that share them; a power of two."""
     fast: bool = True
     """Divide and take roots by the GPU's approximations (2 units in the last place)."""
+    assembly: bool = True
+    """Write plain arithmetic as PTX (`ptx.py`) instead of operations of Triton, which takes minutes to compile them."""
+    hoist: bool = True
+    """Compute before the loop what does not change in it."""
     unroll: int = 1
     """Steps written out in the kernel's loop; divides the number of steps."""
 
@@ -137,12 +142,21 @@ def _run(traced: Any, steps: int, launch: Launch, interpret: bool, *args: Any) -
             for ref, size in zip(inputs, sizes, strict=True) for place in range(size)
         ]  # fmt: skip
         first, last = (sum(sizes[:end]) for end in (len(params), len(params) + len(state)))
-        fixed, command = pieces[:first], pieces[last:]
+        jaxpr = traced.jaxpr
+        carry = jaxpr.invars[first:last]
+        still, moved = ptx.apart_from(ptx.needed(jaxpr), set(carry) if launch.hoist else set(jaxpr.invars))
+        ends = {v for v in jaxpr.outvars if not hasattr(v, "val")}
+        used = ends | {v for one in moved for v in ptx.variables(one)}
+        fixed = dict(zip(jaxpr.invars, pieces, strict=True))
+        _follow(still, used, fixed, launch, interpret)
 
         def body(_: Any, moving: tuple) -> tuple:
             for _ in range(launch.unroll):
-                moving = _on_blocks(traced, [*fixed, *moving, *command], launch.fast and not interpret)
-            return tuple(moving)
+                values = fixed | dict(zip(carry, moving, strict=True))
+                _follow(moved, ends, values,
+                        launch, interpret)  # fmt: skip
+                moving = tuple(_block(atom, values, pieces[0].shape) for atom in jaxpr.outvars)
+            return moving
 
         moving = iter(jax.lax.fori_loop(0, steps // launch.unroll, body, tuple(pieces[first:last])))
         for ref, size in zip(outputs, sizes[len(params) :], strict=False):
@@ -160,23 +174,63 @@ def _run(traced: Any, steps: int, launch: Launch, interpret: bool, *args: Any) -
     return jax.tree.unflatten(structure, [end.reshape(like.shape) for end, like in zip(ends, likes, strict=True)])
 
 
-def _on_blocks(traced: Any, blocks: list, fast: bool) -> list:
-    """Results of a jaxpr of single numbers for blocks of them."""
-    shape = blocks[0].shape
-    values = dict(zip(traced.jaxpr.invars, blocks, strict=True))
-    values |= {
-        v: jnp.full(shape, np.asarray(c), c.dtype) for v, c in zip(traced.jaxpr.constvars, traced.consts, strict=True)
-    }
+def _block(atom: Any, values: dict, shape: tuple[int, ...]) -> jax.Array:
+    """The block of a variable or a literal."""
+    return jnp.full(shape, atom.val, atom.aval.dtype) if hasattr(atom, "val") else values[atom]
 
-    def read(atom: Any) -> Any:
-        return jnp.full(shape, atom.val, atom.aval.dtype) if hasattr(atom, "val") else values[atom]
 
-    replaced = REPLACED | (APPROXIMATE if fast else {})
-    for one in traced.jaxpr.eqns:
-        given = [read(atom) for atom in one.invars]
-        other = replaced.get(one.primitive.name)
-        values[one.outvars[0]] = other(one, *given) if other else one.primitive.bind(*given, **one.params)
-    return [read(atom) for atom in traced.jaxpr.outvars]
+def _follow(equations: list, wanted: set, values: dict, launch: Launch, interpret: bool) -> None:
+    """Put the blocks that the equations give into `values`."""
+    if interpret or not launch.assembly:
+        for one in equations:
+            _operate(one, values, launch.fast and not interpret)
+        return
+    for stage in ptx.stages(equations, wanted):
+        _assemble(stage, values)
+        for one in stage.others:
+            _operate(one, values, launch.fast)
+
+
+def _operate(one: Any, values: dict, fast: bool) -> None:
+    """One operation as Pallas has it."""
+    shape = next(iter(values.values())).shape
+    given = [_block(atom, values, shape) for atom in one.invars]
+    other = (REPLACED | (APPROXIMATE if fast else {})).get(one.primitive.name)
+    values[one.outvars[0]] = other(one, *given) if other else one.primitive.bind(*given, **one.params)
+
+
+def _assemble(stage: ptx.Stage, values: dict) -> None:
+    """One block of inline assembly; truth values pass as integers."""
+    if not stage.outputs:
+        return
+    given = [values[v] for v in stage.inputs]
+    given = [block.astype(jnp.int32) if block.dtype == bool else block for block in given]
+    shape = next(iter(values.values())).shape
+    kinds = [jax.ShapeDtypeStruct(shape, jnp.int32 if v.aval.dtype == bool else v.aval.dtype) for v in stage.outputs]
+    results = _assembly().bind(*given, code=stage.code, constraints=stage.constraints, kinds=tuple(kinds))
+    for variable, result in zip(stage.outputs, results, strict=True):
+        values[variable] = result != 0 if variable.aval.dtype == bool else result
+
+
+@cache
+def _assembly() -> Any:
+    """The primitive of a block of assembly with several results; Pallas' own has one."""
+    from jax._src.lib.triton import dialect
+    from jax._src.pallas.triton import lowering
+    from jax.extend.core import Primitive
+    from jax.interpreters import mlir
+
+    primitive = Primitive("assembly")
+    primitive.multiple_results = True
+    primitive.def_abstract_eval(lambda *_, kinds, **__: [jax.core.ShapedArray(k.shape, k.dtype) for k in kinds])
+
+    @lowering.register_lowering(primitive)
+    def _(ctx: Any, *args: Any, code: str, constraints: str, kinds: tuple) -> Any:
+        types = [mlir.ir.RankedTensorType.get(k.shape, mlir.dtype_to_ir_type(np.dtype(k.dtype))) for k in kinds]
+        made = dialect.ElementwiseInlineAsmOp(types, code, constraints=constraints, pure=True, packed_element=1, args=args)
+        return list(made.results)
+
+    return primitive
 
 
 def _round(one: Any, x: jax.Array) -> jax.Array:
