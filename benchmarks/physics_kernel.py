@@ -1,6 +1,6 @@
 """The kernel that steps a whole control period, against the scan over physics steps, in one call.
 
-    python -m benchmarks.physics_kernel [--vehicle loaded] [--instances 131072 32768 1024]
+    python -m benchmarks.physics_kernel [--vehicles loaded] [--instances 131072 32768 1024]
     python -m benchmarks.physics_kernel --sweep    # block sizes and warps; nothing is recorded
 
 Both ways drive the same vehicles with the same commands. They take turns, and their states are compared after a second.
@@ -66,52 +66,54 @@ def compiled(vehicle: str, count: int, launch: Launch | None) -> tuple[Any, tupl
 
 def differences(found: Any, expected: Any) -> dict[str, float]:
     """Largest difference of position [m], of the whole qpos and qvel, and the share of instances that diverged."""
-    apart = {name: np.abs(np.asarray(getattr(found, name)) - np.asarray(getattr(expected, name)))
-             for name in ("qpos", "qvel")}  # fmt: skip
-    return {"position_m": float(apart["qpos"][:, :3].max()), "qpos": float(apart["qpos"].max()),
-            "qvel": float(apart["qvel"].max()), "median_qvel": float(np.median(apart["qvel"].max(1))),
-            "farthest_m": float(jnp.abs(expected.qpos[:, :2]).max()), "diverged": float(found.diverged.mean())}  # fmt: skip
+    qpos, qvel = (np.abs(np.asarray(getattr(found, name)) - np.asarray(getattr(expected, name)))
+                  for name in ("qpos", "qvel"))  # fmt: skip
+    far = float(jnp.abs(expected.qpos[:, :2]).max())
+    return {
+        "position_m": float(qpos[:, :3].max()),
+        "qpos": float(qpos.max()),
+        "qvel": float(qvel.max()),
+        "median_qvel": float(np.median(qvel.max(1))),
+        "farthest_m": far,
+        "diverged": float(found.diverged.mean()),
+    }
 
 
-def sweep(options: argparse.Namespace) -> None:
+def sweep(vehicle: str, count: int, repeats: int) -> None:
     """Print rates and differences of every launch; one that fails prints why."""
-    for count in options.instances:
-        with ThreadPoolExecutor(8) as pool:
-            jobs = {name: pool.submit(compiled, options.vehicle, count, launch) for name, launch in SWEEP.items()}
-            expected = None
-            for name, job in jobs.items():
-                try:
-                    function, arguments, steps, seconds = job.result()
-                    end = function(*arguments)
-                    expected = end if expected is None else expected
-                    rate = steps / float(np.median(time_calls(partial(function, *arguments), options.repeats)))
-                    print(f"{count:7d} {name:20s} {rate / 1e6:9.1f} M steps/s, compiled in {seconds:.0f} s, "
-                          f"{differences(end, expected)}", flush=True)  # fmt: skip
-                except Exception:
-                    print(f"{count:7d} {name:20s} failed")
-                    traceback.print_exc(limit=-3)
+    with ThreadPoolExecutor(8) as pool:
+        jobs = {name: pool.submit(compiled, vehicle, count, launch) for name, launch in SWEEP.items()}
+        expected = None
+        for name, job in jobs.items():
+            try:
+                function, arguments, steps, seconds = job.result()
+                end = function(*arguments)
+                expected = end if expected is None else expected
+                rate = steps / float(np.median(time_calls(partial(function, *arguments), repeats)))
+                print(f"{count:7d} {name:20s} {rate / 1e6:9.1f} M steps/s, compiled in {seconds:.0f} s, "
+                      f"{differences(end, expected)}", flush=True)  # fmt: skip
+            except Exception:
+                print(f"{count:7d} {name:20s} failed")
+                traceback.print_exc(limit=-3)
 
 
-def compare(options: argparse.Namespace) -> None:
+def compare(vehicle: str, count: int, repeats: int) -> None:
     """Print and record both ways, in turns."""
-    for count in options.instances:
-        ways = {"scan": compiled(options.vehicle, count, None), "kernel": compiled(options.vehicle, count, Launch())}
-        ends = {name: way[0](*way[1]) for name, way in ways.items()}
-        rates: dict[str, list[float]] = {name: [] for name in ways}
-        for _ in range(options.repeats):
-            for name, (function, arguments, steps, _) in ways.items():
-                rates[name].append(steps / time_calls(partial(function, *arguments), 1)[0])
-        ratio = [new / old for new, old in zip(rates["kernel"], rates["scan"], strict=True)]
-        apart = differences(ends["kernel"], ends["scan"])
-        about = {name: {"vehicle": options.vehicle, "compile_s": way[3]} for name, way in ways.items()}
-        record("physics", CLAIM, {
-            f"registers_scan_steps_per_s_{count}": {**figure(rates["scan"], "physics steps/s"), **about["scan"]},
-            f"registers_kernel_steps_per_s_{count}": {**figure(rates["kernel"], "physics steps/s"), **about["kernel"]},
-            f"registers_ratio_{count}": {**figure(ratio, "times"), **apart},
-        })  # fmt: skip
-        print(f"{count:7d} instances on {device_name()}: scan {np.median(rates['scan']) / 1e6:.1f}, "
-              f"kernel {np.median(rates['kernel']) / 1e6:.1f} M steps/s, {np.median(ratio):.2f} times; {about}; {apart}",
-              flush=True)  # fmt: skip
+    ways = {"scan": compiled(vehicle, count, None), "kernel": compiled(vehicle, count, Launch())}
+    ends = {name: way[0](*way[1]) for name, way in ways.items()}
+    rates: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(repeats):
+        for name, (function, arguments, steps, _) in ways.items():
+            rates[name].append(steps / time_calls(partial(function, *arguments), 1)[0])
+    ratio = [new / old for new, old in zip(rates["kernel"], rates["scan"], strict=True)]
+    apart = differences(ends["kernel"], ends["scan"])
+    suffix = f"{count}" if vehicle == "loaded" else f"{count}_{vehicle.removeprefix('whill_cr_')}"
+    figures = {f"{name}_steps_per_s_{suffix}": {
+        **figure(rates[name], "physics steps/s"), "vehicle": vehicle, "compile_s": way[3]} for name, way in ways.items()}  # fmt: skip
+    record("physics", CLAIM, {**figures, f"kernel_over_scan_{suffix}": {**figure(ratio, "times"), **apart}})
+    medians = {name: f"{np.median(one) / 1e6:.1f} M steps/s, compiled in {ways[name][3]:.1f} s"
+               for name, one in rates.items()}  # fmt: skip
+    print(f"{vehicle} {count:7d} on {device_name()}: {medians}, {np.median(ratio):.2f} times; {apart}", flush=True)
 
 
 def main() -> None:
@@ -120,12 +122,17 @@ def main() -> None:
         prog="python -m benchmarks.physics_kernel", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("--vehicle", default="loaded")
+    parser.add_argument("--vehicles", nargs="+", default=["loaded"])
     parser.add_argument("--instances", type=whole(), nargs="+", default=[131072, 32768, 1024])
     parser.add_argument("--repeats", type=whole(), default=7)
     parser.add_argument("--sweep", action="store_true")
     options = parser.parse_args()
-    (sweep if options.sweep else compare)(options)
+    for vehicle in options.vehicles:
+        for count in options.instances:
+            try:
+                (sweep if options.sweep else compare)(vehicle, count, options.repeats)
+            except Exception:  # whatever one size meets, the others are measured
+                traceback.print_exc()
 
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ def _run(traced: Any, steps: int, launch: Launch, interpret: bool, *args: Any) -
 
 def _block(atom: Any, values: dict, shape: tuple[int, ...]) -> jax.Array:
     """The block of a variable or a literal."""
-    return jnp.full(shape, atom.val, atom.aval.dtype) if hasattr(atom, "val") else values[atom]
+    return jnp.full(shape, np.asarray(atom.val, atom.aval.dtype)) if hasattr(atom, "val") else values[atom]
 
 
 def _follow(equations: list, wanted: set, values: dict, launch: Launch, interpret: bool) -> None:
@@ -227,7 +227,9 @@ def _assembly() -> Any:
     @lowering.register_lowering(primitive)
     def _(ctx: Any, *args: Any, code: str, constraints: str, kinds: tuple) -> Any:
         types = [mlir.ir.RankedTensorType.get(k.shape, mlir.dtype_to_ir_type(np.dtype(k.dtype))) for k in kinds]
-        made = dialect.ElementwiseInlineAsmOp(types, code, constraints=constraints, pure=True, packed_element=1, args=args)
+        made = dialect.ElementwiseInlineAsmOp(
+            types, code, constraints=constraints, pure=True, packed_element=1, args=args
+        )
         return list(made.results)
 
     return primitive
