@@ -49,6 +49,12 @@ class Launch:
     unroll: int = 1
     """Steps written out in the kernel's loop; divides the number of steps."""
 
+    def __post_init__(self) -> None:
+        for name in ("lanes", "warps"):
+            value = getattr(self, name)
+            if value < 1 or value & (value - 1):
+                raise ValueError(f"launch: {name} is {value}; Triton needs a power of two.")
+
 
 Step = Callable[[Any, Any, Any], Any]
 """(parameters, state, input) -> state, of one instance."""
