@@ -48,9 +48,11 @@ def random_instances(
     return model, scattered, states
 
 
-def compiled_roll(vehicle: str, count: int, periods: int, dynamics: str) -> tuple[VehicleModel, Any, tuple]:
+def compiled_roll(
+    vehicle: str, count: int, periods: int, dynamics: str = "fused", kernel: bool | None = None
+) -> tuple[VehicleModel, Any, tuple]:
     """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments."""
-    model, params, states = random_instances(vehicle, count, dynamics)
+    model, params, states = random_instances(vehicle, count, dynamics, kernel)
     commands = jax.random.uniform(jax.random.key(1), (periods, count, 2), minval=-1.0)
 
     @jax.jit

@@ -18,9 +18,9 @@ from whill_mjx.effects.base import place_of
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import (
     SMOOTH_LOAD,
-    one_step,
     forces,
     mass_distribution,
+    one_step,
     place,
     substeps,
     suspension,

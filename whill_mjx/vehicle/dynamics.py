@@ -18,7 +18,7 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
-from whill_mjx.vehicle.kernel import held_in_registers
+from whill_mjx.vehicle.kernel import Roll, held_in_registers
 from whill_mjx.vehicle.kinematics import (
     body_twist,
     heading,
@@ -119,9 +119,8 @@ def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, comma
     wanted = jax.default_backend() == "gpu" if config.kernel is None else config.kernel
     if config.dynamics != "fused" or not wanted:
         return plain(params, state, command)
-    return held_in_registers(
-        partial(one_step, model), config.substeps, plain, (params, state, command), forced=config.kernel is True
-    )
+    roll = Roll(partial(one_step, model), config.substeps, plain)
+    return held_in_registers(roll, (params, state, command), forced=config.kernel is True)
 
 
 def forces(

@@ -1,8 +1,9 @@
 """Many vehicles through many steps in one kernel for NVIDIA GPUs (Pallas, Triton): the state stays in registers.
 
 The kernel is made of the traced step: `scalars.in_pieces` gives its operations on single numbers, and each becomes one
-on a block of instances, an instance to a thread. Parameters and state are read once and the state is written once, in
-whatever number of steps. Derivatives are those of the plain function.
+on a block of instances, an instance to a thread. Plain arithmetic is written as assembly (`ptx.py`), the rest are
+operations of Triton. Parameters and state are read once and the state is written once, in whatever number of steps.
+What does not change from step to step is computed before the first. Derivatives are those of the plain function.
 """
 
 from __future__ import annotations
@@ -23,13 +24,11 @@ from whill_mjx.vehicle import ptx
 from whill_mjx.vehicle.scalars import in_pieces
 
 PRIMITIVES = {
-    "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
-    "convert_element_type", "copy", "cos", "cosh", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt",
-    "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or",
-    "pow", "rem", "round", "rsqrt", "select_n", "shift_left", "shift_right_arithmetic", "shift_right_logical", "sign",
-    "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
+    *ptx.WRITERS, "acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "exp", "exp2",
+    "expm1", "log", "log1p", "logistic", "pow", "rem", "shift_left", "shift_right_arithmetic", "shift_right_logical",
+    "sin", "sinh", "tan", "tanh",
 }  # fmt: skip
-"""Operations on single numbers that Triton knows, or that are replaced here by some that it knows."""
+"""Operations that are written as assembly, or that Triton knows."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +39,6 @@ class Launch:
     """Instances of a program; a power of two."""
     warps: int = 1
     """Warps of 32 threads that share them; a power of two."""
-    fast: bool = True
-    """Divide and take roots by the GPU's approximations (2 units in the last place)."""
-    assembly: bool = True
-    """Write plain arithmetic as PTX (`ptx.py`) instead of operations of Triton, which takes minutes to compile them."""
-    hoist: bool = True
-    """Compute before the loop what does not change in it."""
-    unroll: int = 1
-    """Steps written out in the kernel's loop; divides the number of steps."""
 
     def __post_init__(self) -> None:
         for name in ("lanes", "warps"):
@@ -60,33 +51,43 @@ Step = Callable[[Any, Any, Any], Any]
 """(parameters, state, input) -> state, of one instance."""
 
 
+@dataclass(frozen=True, eq=False)
+class Roll:
+    """Several steps of one instance with its input held. Static."""
+
+    step: Step
+    steps: int
+    plain: Step
+    """All steps without the kernel: for derivatives, and for devices other than NVIDIA GPUs."""
+
+
 def held_in_registers(
-    step: Step, steps: int, plain: Step, args: tuple[Any, Any, Any], launch: Launch | None = None, forced: bool = False
+    roll: Roll, args: tuple[Any, Any, Any], launch: Launch | None = None, forced: bool = False
 ) -> Any:
-    """The state after `steps` steps of one instance with its input held; of all instances of a `vmap` at once.
+    """The state of one instance after the steps; `vmap` makes one kernel of all instances.
 
     Args:
-        step: one step of one instance.
-        steps: how many.
-        plain: the same as all of them, for derivatives and for devices other than NVIDIA GPUs.
+        roll: the steps.
         args: parameters, state and input, pytrees of arrays of one instance.
         launch: how the kernel runs.
-        forced: interpret the kernel on other devices, and refuse a step that it cannot run, instead of `plain`.
+        forced: interpret the kernel on other devices, and refuse a step that it cannot run, instead of `roll.plain`.
 
     Raises:
-        ValueError: the step has operations that the kernel lacks, and `forced`.
+        ValueError: the kernel lacks something that the step needs, and `forced`.
     """
     args = jax.tree.map(jnp.asarray, args)
-    traced = in_pieces(step, *args)
-    lacking = unknown(traced)
-    if lacking and not forced:
-        warnings.warn(f"physics without its GPU kernel, which lacks {lacking}: slower, with the same results",
-                      stacklevel=2)  # fmt: skip
-        return plain(*args)
-    if lacking:
+    traced = in_pieces(roll.step, *args)
+    lacking = _lacking(traced)
+    if lacking and forced:
         raise ValueError(f"the physics kernel for GPUs lacks {lacking}; choose kernel=False for this vehicle.")
-    many, native = jax.vmap(plain), partial(_run, traced, steps, launch or Launch(), False)
-    elsewhere = partial(_run, traced, steps, launch or Launch(), True) if forced else many
+    if lacking or not forced and any(v.aval.dtype == np.float64 for v in traced.jaxpr.invars):
+        if lacking:
+            warnings.warn(
+                f"physics without its GPU kernel, which lacks {lacking}: slower, the same results", stacklevel=2
+            )
+        return roll.plain(*args)
+    many, run = jax.vmap(roll.plain), partial(_run, traced, roll.steps, launch or Launch())
+    native, elsewhere = partial(run, False), partial(run, True) if forced else many
 
     @jax.custom_jvp
     def instances(*args: Any) -> Any:
@@ -100,12 +101,18 @@ def held_in_registers(
     return jax.tree.map(lambda leaf: leaf[0], instances(*alone))
 
 
-def unknown(traced: Any) -> str:
-    """Names of the operations of a closed jaxpr that the kernel lacks; "" where it has all."""
-    whole = {one.primitive.name for one in traced.jaxpr.eqns if any(v.aval.shape for v in (*one.invars, *one.outvars))}
+def _lacking(traced: Any) -> str:
+    """What a closed jaxpr needs that the kernel lacks; "" where it has all."""
     names = {one.primitive.name for one in traced.jaxpr.eqns} - PRIMITIVES
-    arrays = [name + " of arrays" for name in sorted(whole - names)]
-    return ", ".join([*sorted(names), *arrays, *(["arrays"] if any(v.aval.shape for v in traced.jaxpr.invars) else [])])
+    if any(v.aval.shape for v in traced.jaxpr.invars):
+        names.add("arrays of so many numbers")
+    known = [one for one in traced.jaxpr.eqns if one.primitive.name in PRIMITIVES]
+    names |= {f"{one.primitive.name} of arrays" for one in known if any(v.aval.shape for v in one.invars + one.outvars)}
+    try:
+        _assembly()
+    except (ImportError, AttributeError) as error:
+        names.add(f"assembly in this version of JAX ({error})")
+    return ", ".join(sorted(names))
 
 
 def _along_the_axis(function: Callable) -> Callable:
@@ -121,8 +128,7 @@ def _along_the_axis(function: Callable) -> Callable:
             every = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
             return every.reshape(-1, *every.shape[2:])
 
-        args = jax.tree.map(longer, args, tuple(mapped))
-        result = _along_the_axis(function)(*args)
+        result = _along_the_axis(function)(*jax.tree.map(longer, args, tuple(mapped)))
         result = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), result)
         return result, jax.tree.map(lambda _: True, result)
 
@@ -134,40 +140,22 @@ def _run(traced: Any, steps: int, launch: Launch, interpret: bool, *args: Any) -
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
-    params, state, given = (jax.tree.leaves(part) for part in args)
-    likes, structure = jax.tree.flatten(args[1])
-    count = likes[0].shape[0]
-    sizes = [math.prod(leaf.shape[1:]) for leaf in (*params, *state, *given)]
+    leaves, (state, structure) = jax.tree.leaves(args), jax.tree.flatten(args[1])
+    count = state[0].shape[0]
+    sizes = [math.prod(leaf.shape[1:]) for leaf in leaves]
+    before = len(jax.tree.leaves(args[0]))
+    first, last = sum(sizes[:before]), sum(sizes[: before + len(state)])
 
     def kernel(*refs: Any) -> None:
         rows = pl.program_id(0) * launch.lanes + jax.lax.iota(jnp.int32, launch.lanes)
         there = jnp.minimum(rows, count - 1)
-        inputs, outputs = refs[: len(sizes)], refs[len(sizes) :]
-        pieces = [
-            plt.load(ref.at[there * size + place])
-            for ref, size in zip(inputs, sizes, strict=True) for place in range(size)
-        ]  # fmt: skip
-        first, last = (sum(sizes[:end]) for end in (len(params), len(params) + len(state)))
-        jaxpr = traced.jaxpr
-        carry = jaxpr.invars[first:last]
-        still, moved = ptx.apart_from(ptx.needed(jaxpr), set(carry) if launch.hoist else set(jaxpr.invars))
-        ends = {v for v in jaxpr.outvars if not hasattr(v, "val")}
-        used = ends | {v for one in moved for v in ptx.variables(one)}
-        fixed = dict(zip(jaxpr.invars, pieces, strict=True))
-        _follow(still, used, fixed, launch, interpret)
-
-        def body(_: Any, moving: tuple) -> tuple:
-            for _ in range(launch.unroll):
-                values = fixed | dict(zip(carry, moving, strict=True))
-                _follow(moved, ends, values,
-                        launch, interpret)  # fmt: skip
-                moving = tuple(_block(atom, values, pieces[0].shape) for atom in jaxpr.outvars)
-            return moving
-
-        moving = iter(jax.lax.fori_loop(0, steps // launch.unroll, body, tuple(pieces[first:last])))
-        for ref, size in zip(outputs, sizes[len(params) :], strict=False):
-            for place in range(size):
-                plt.store(ref.at[rows * size + place], next(moving), mask=rows < count)
+        places = [(ref, size, place) for ref, size in zip(refs, sizes, strict=False) for place in range(size)]
+        pieces = [plt.load(ref.at[there * size + place]) for ref, size, place in places]
+        ends = _steps(traced.jaxpr, steps, pieces, slice(first, last), interpret)
+        outputs = zip(refs[len(sizes) :], sizes[before:], strict=False)
+        places = [(ref, size, place) for ref, size in outputs for place in range(size)]
+        for (ref, size, place), end in zip(places, ends, strict=True):
+            plt.store(ref.at[rows * size + place], end, mask=rows < count)
 
     ends = pl.pallas_call(
         kernel,
@@ -176,41 +164,47 @@ def _run(traced: Any, steps: int, launch: Launch, interpret: bool, *args: Any) -
         compiler_params=plt.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="physics",
-    )(*(leaf.reshape(-1) for leaf in (*params, *state, *given)))
-    return jax.tree.unflatten(structure, [end.reshape(like.shape) for end, like in zip(ends, likes, strict=True)])
+    )(*(leaf.reshape(-1) for leaf in leaves))
+    return jax.tree.unflatten(structure, [end.reshape(like.shape) for end, like in zip(ends, state, strict=True)])
 
 
-def _block(atom: Any, values: dict, shape: tuple[int, ...]) -> jax.Array:
+def _steps(jaxpr: Any, steps: int, pieces: list, moving: slice, interpret: bool) -> tuple:
+    """The blocks `pieces[moving]` after the steps; the others are the same in each."""
+    carry, ends = jaxpr.invars[moving], ptx.variables(jaxpr.outvars)
+    still, moved = ptx.apart_from(ptx.needed(jaxpr), set(carry))
+    used = ends | {v for one in moved for v in ptx.variables(one.invars)}
+    fixed = _followed(still, used, dict(zip(jaxpr.invars, pieces, strict=True)), interpret)
+
+    def body(_: Any, blocks: tuple) -> tuple:
+        values = _followed(moved, ends, fixed | dict(zip(carry, blocks, strict=True)), interpret)
+        return tuple(_block(atom, values) for atom in jaxpr.outvars)
+
+    return jax.lax.fori_loop(0, steps, body, tuple(pieces[moving]))
+
+
+def _followed(equations: list, wanted: set, values: dict, interpret: bool) -> dict:
+    """`values`, the blocks of variables, with those that the equations give."""
+    values = dict(values)
+    stages = [ptx.Stage(others=tuple(equations))] if interpret else ptx.stages(equations, wanted)
+    for stage in stages:
+        if stage.outputs:
+            _assemble(stage, values)
+        for one in stage.others:
+            given = [_block(atom, values) for atom in one.invars]
+            other = REPLACED.get(one.primitive.name)
+            values[one.outvars[0]] = other(one, *given) if other else one.primitive.bind(*given, **one.params)
+    return values
+
+
+def _block(atom: Any, values: dict) -> jax.Array:
     """The block of a variable or a literal."""
+    shape = next(iter(values.values())).shape
     return jnp.full(shape, np.asarray(atom.val, atom.aval.dtype)) if hasattr(atom, "val") else values[atom]
 
 
-def _follow(equations: list, wanted: set, values: dict, launch: Launch, interpret: bool) -> None:
-    """Put the blocks that the equations give into `values`."""
-    if interpret or not launch.assembly:
-        for one in equations:
-            _operate(one, values, launch.fast and not interpret)
-        return
-    for stage in ptx.stages(equations, wanted):
-        _assemble(stage, values)
-        for one in stage.others:
-            _operate(one, values, launch.fast)
-
-
-def _operate(one: Any, values: dict, fast: bool) -> None:
-    """One operation as Pallas has it."""
-    shape = next(iter(values.values())).shape
-    given = [_block(atom, values, shape) for atom in one.invars]
-    other = (REPLACED | (APPROXIMATE if fast else {})).get(one.primitive.name)
-    values[one.outvars[0]] = other(one, *given) if other else one.primitive.bind(*given, **one.params)
-
-
 def _assemble(stage: ptx.Stage, values: dict) -> None:
-    """One block of inline assembly; truth values pass as integers."""
-    if not stage.outputs:
-        return
-    given = [values[v] for v in stage.inputs]
-    given = [block.astype(jnp.int32) if block.dtype == bool else block for block in given]
+    """One block of assembly; truth values pass as integers."""
+    given = [values[v].astype(jnp.int32) if v.aval.dtype == bool else values[v] for v in stage.inputs]
     shape = next(iter(values.values())).shape
     kinds = [jax.ShapeDtypeStruct(shape, jnp.int32 if v.aval.dtype == bool else v.aval.dtype) for v in stage.outputs]
     results = _assembly().bind(*given, code=stage.code, constraints=stage.constraints, kinds=tuple(kinds))
@@ -226,50 +220,27 @@ def _assembly() -> Any:
     from jax.extend.core import Primitive
     from jax.interpreters import mlir
 
+    make = dialect.ElementwiseInlineAsmOp
     primitive = Primitive("assembly")
     primitive.multiple_results = True
     primitive.def_abstract_eval(lambda *_, kinds, **__: [jax.core.ShapedArray(k.shape, k.dtype) for k in kinds])
 
     @lowering.register_lowering(primitive)
-    def _(ctx: Any, *args: Any, code: str, constraints: str, kinds: tuple) -> Any:
+    def _(ctx: Any, *args: Any, code: str, constraints: str, kinds: tuple) -> list:
         types = [mlir.ir.RankedTensorType.get(k.shape, mlir.dtype_to_ir_type(np.dtype(k.dtype))) for k in kinds]
-        made = dialect.ElementwiseInlineAsmOp(
-            types, code, constraints=constraints, pure=True, packed_element=1, args=args
-        )
-        return list(made.results)
+        return list(make(types, code, constraints=constraints, pure=True, packed_element=1, args=args).results)
 
     return primitive
 
 
 def _round(one: Any, x: jax.Array) -> jax.Array:
+    """`lax.round`, which Triton lacks."""
     low = jnp.floor(x)
     behind = x - low
-    if one.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
-        up = (behind > 0.5) | ((behind == 0.5) & (low != 2 * jnp.floor(low / 2)))
-    else:
-        up = (behind > 0.5) | ((behind == 0.5) & (x > 0))
-    return jnp.where(up, low + 1, low)
+    even = one.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    up = (low != 2 * jnp.floor(low / 2)) if even else x > 0
+    return jnp.where((behind > 0.5) | ((behind == 0.5) & up), low + 1, low)
 
 
 REPLACED: dict[str, Callable] = {"round": _round, "copy": lambda one, x: x}
 """What stands for operations that Triton lacks: (equation, operands) -> result."""
-
-
-def _special(code: str, x: jax.Array) -> jax.Array:
-    """One instruction of the special-function unit, on float32."""
-    from jax.experimental.pallas import triton as plt
-
-    result = jax.ShapeDtypeStruct(x.shape, x.dtype)
-    return plt.elementwise_inline_asm(f"{code} $0, $1;", args=[x], constraints="=f,f", pack=1,
-                                      result_shape_dtypes=[result])[0]  # fmt: skip
-
-
-def _divide(one: Any, x: jax.Array, y: jax.Array) -> jax.Array:
-    return x * _special("rcp.approx.ftz.f32", y) if x.dtype == jnp.float32 else one.primitive.bind(x, y)
-
-
-def _root(one: Any, x: jax.Array) -> jax.Array:
-    return _special("sqrt.approx.f32", x) if x.dtype == jnp.float32 else one.primitive.bind(x, **one.params)
-
-
-APPROXIMATE: dict[str, Callable] = {"div": _divide, "sqrt": _root}

@@ -8,7 +8,7 @@ the GPU's own assembler schedules them. What PTX has no instruction for (sin, ex
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,14 +22,15 @@ FLOAT, BOOL = np.dtype(np.float32), np.dtype(bool)
 class Stage:
     """One block of assembly and the operations that follow it."""
 
-    inputs: tuple
+    inputs: tuple = ()
     """Variables of the jaxpr that the block reads."""
-    outputs: tuple
+    outputs: tuple = ()
     """Variables that it gives, in order."""
-    code: str
+    code: str = ""
     """The block; operands are numbered outputs first."""
-    constraints: str
-    others: tuple
+    constraints: str = ""
+    """Kinds of the operands, outputs first: =f and f for float32, =r and r for truth values as integers."""
+    others: tuple = ()
     """Equations to evaluate after it."""
 
 
@@ -39,14 +40,14 @@ def stages(equations: list, wanted: set) -> list[Stage]:
     blocks: list[list] = []
     others: list[list] = []
     for one in equations:
-        at = max([ready.get(v, 0) for v in variables(one)], default=0)
+        at = max([ready.get(v, 0) for v in variables(one.invars)], default=0)
         while len(blocks) <= at:
             blocks.append([])
             others.append([])
         written = can_write(one)
         (blocks if written else others)[at].append(one)
         ready[one.outvars[0]] = at if written else at + 1
-    later = wanted | {v for rest in others for one in rest for v in variables(one)}
+    later = wanted | {v for rest in others for one in rest for v in variables(one.invars)}
     result = []
     for block, rest in zip(reversed(blocks), reversed(others), strict=True):
         result.append(_stage(block, [one.outvars[0] for one in block if one.outvars[0] in later], rest))
@@ -54,19 +55,19 @@ def stages(equations: list, wanted: set) -> list[Stage]:
     return result[::-1]
 
 
-def variables(equation: Any) -> list:
-    """What it reads, without literals."""
-    return [v for v in equation.invars if not hasattr(v, "val")]
+def variables(atoms: Sequence) -> set:
+    """Those that are no literals."""
+    return {atom for atom in atoms if not hasattr(atom, "val")}
 
 
 def needed(jaxpr: Any) -> list:
     """The equations of a jaxpr whose results something needs."""
-    wanted = {v for v in jaxpr.outvars if not hasattr(v, "val")}
+    wanted = variables(jaxpr.outvars)
     kept = []
     for one in reversed(jaxpr.eqns):
         if wanted & set(one.outvars):
             kept.append(one)
-            wanted |= set(variables(one))
+            wanted |= variables(one.invars)
     return kept[::-1]
 
 
@@ -75,7 +76,7 @@ def apart_from(equations: list, moving: set) -> tuple[list, list]:
     still, rest = [], []
     moving = set(moving)
     for one in equations:
-        if moving & set(variables(one)):
+        if moving & variables(one.invars):
             rest.append(one)
             moving |= set(one.outvars)
         else:
