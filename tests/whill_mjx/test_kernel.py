@@ -106,23 +106,6 @@ def test_a_launch_that_triton_lacks_is_refused():
         Launch(lanes=12)
 
 
-def test_a_period_in_the_kernel_equals_one_by_scan():
-    """Of chairs with different parameters, in the ways that a configuration asks for."""
-    spec, params = preset("whill_cr_paper")
-    masses = params.body.mass * jnp.linspace(0.8, 1.2, 3)
-    ends = []
-    for kernel in (True, False):
-        model = build_model(spec, VehicleConfig(control_dt=0.015, kernel=kernel))
-
-        def period(mass, command, model=model):
-            vehicle = params.replace(body=params.body.replace(mass=mass))
-            return drive(model, vehicle, place(model, vehicle, 0.0, 0.0, 0.3, v=0.4, omega=0.2), command)
-
-        ends.append(jax.jit(jax.vmap(period))(masses, jnp.array([[0.5, 0.3], [-0.2, 0.1], [0.9, -0.6]])))
-    assert np.ptp(ends[1].qvel[:, 0]) > 1e-3
-    close(*ends)
-
-
 def test_the_kernel_of_a_vehicle_lowers_for_cuda():
     spec, params = preset("whill_cr_paper")
     model = build_model(spec, VehicleConfig(kernel=True))

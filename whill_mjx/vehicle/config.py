@@ -20,7 +20,7 @@ class VehicleConfig:
     so that it compiles into few kernels; "mjx" calls `mjx.step`. Both give the same motion to rounding."""
     kernel: bool | None = False
     """Whether all physics steps of a control period are one GPU kernel (`vehicle/kernel.py`), for "fused" dynamics.
-    None: on NVIDIA GPUs, where it has all operations of the effects. True elsewhere interprets the kernel: slow."""
+    None: on NVIDIA GPUs since Ampere, where it has all operations of the effects. True elsewhere interprets it: slow."""
     limited: bool = True
     """Whether commands are limited to the spec's limits; a replay of a log takes them as they were recorded."""
 

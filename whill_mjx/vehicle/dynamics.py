@@ -18,7 +18,7 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
-from whill_mjx.vehicle.kernel import Roll, held_in_registers
+from whill_mjx.vehicle.kernel import Roll, held_in_registers, suits_device
 from whill_mjx.vehicle.kinematics import (
     body_twist,
     heading,
@@ -116,7 +116,7 @@ def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, comma
     def plain(params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
         return substeps(model, params, state, jnp.broadcast_to(command, (config.substeps, 2)))
 
-    wanted = jax.default_backend() == "gpu" if config.kernel is None else config.kernel
+    wanted = suits_device() if config.kernel is None else config.kernel
     if config.dynamics != "fused" or not wanted:
         return plain(params, state, command)
     roll = Roll(partial(one_step, model), config.substeps, plain)
