@@ -40,28 +40,14 @@ def save_figure(figure: Any, out: Path) -> None:
 def frames(out: Path) -> None:
     """The built-in chair from above, with its frames."""
     import matplotlib.pyplot as plt
-    from matplotlib.patches import Arc, Rectangle
+    from matplotlib.patches import Arc
 
     from whill_mjx.vehicle.presets import preset
 
     spec, _ = preset("whill_cr")
     figure, axes = plt.subplots(figsize=(7.4, 4.6), constrained_layout=True)
     middle = -spec.rear_x  # the chassis origin, counted from the drive axle
-    axes.add_patch(
-        Rectangle(
-            (middle - spec.body_length / 2, -spec.body_width / 2),
-            spec.body_length,
-            spec.body_width,
-            fc="#eef3f7",
-            ec="0.4",
-        )
-    )
-    for side in (1, -1):
-        axes.add_patch(
-            Rectangle((-spec.wheel_radius, side * spec.track / 2 - 0.03), 2 * spec.wheel_radius, 0.06, fc="0.25")
-        )
-        front = (spec.wheelbase - 0.08, side * spec.track / 2 - 0.025)
-        axes.add_patch(Rectangle(front, 0.16, 0.05, fc="0.7"))
+    _chair_from_above(axes, spec, middle)
     for (x, y), (dx, dy), label, place in (
         ((0, 0), (0.55, 0), "x ahead, v > 0", (0.36, 0.05)),
         ((0, 0), (0, 0.5), "y left", (0.02, 0.5)),
@@ -71,28 +57,16 @@ def frames(out: Path) -> None:
     axes.add_patch(Arc((0, 0), 0.44, 0.44, theta1=0, theta2=70, color="tab:blue", lw=2))
     axes.annotate("", (0.06, 0.214), (0.10, 0.200), arrowprops={"arrowstyle": "-|>", "lw": 2, "color": "tab:blue"})
     axes.text(0.2, 0.15, "yaw, omega > 0:\nto the left", color="tab:blue", fontsize=9)
-    axes.plot(0, 0, "o", color="tab:red", ms=7)
-    axes.annotate(
-        "reference point:\nmiddle of the drive axle",
-        (0, 0),
-        (-0.62, -0.12),
-        fontsize=9,
-        va="center",
-        arrowprops={"arrowstyle": "-", "color": "0.5"},
-    )
-    axes.plot(middle, 0, "s", color="tab:green", ms=6)
-    axes.annotate(
-        "chassis origin: middle of the length,\nat the height of the wheel centres",
-        (middle, 0),
-        (middle + 0.05, -0.42),
-        fontsize=9,
-        arrowprops={"arrowstyle": "-", "color": "0.5"},
-    )
     camera = middle + spec.camera.x
-    axes.plot(camera, 0, "^", color="tab:purple", ms=8)
-    axes.annotate(
-        "camera", (camera, 0), (camera + 0.07, -0.16), fontsize=9, arrowprops={"arrowstyle": "-", "color": "0.5"}
-    )
+    line = {"arrowstyle": "-", "color": "0.5"}
+    for along, mark, colour, text, at in (
+        (0, "o", "tab:red", "reference point:\nmiddle of the drive axle", (-0.62, -0.12)),
+        (middle, "s", "tab:green", "chassis origin: middle of the length,\nat the height of the wheel centres",
+         (middle + 0.05, -0.42)),
+        (camera, "^", "tab:purple", "camera", (camera + 0.07, -0.16)),
+    ):  # fmt: skip
+        axes.plot(along, 0, mark, color=colour, ms=7)
+        axes.annotate(text, (along, 0), at, fontsize=9, va="center", arrowprops=line)
     axes.annotate(
         "", (-0.22, spec.track / 2), (-0.22, -spec.track / 2), arrowprops={"arrowstyle": "<->", "color": "0.4"}
     )
@@ -100,6 +74,19 @@ def frames(out: Path) -> None:
     axes.set(xlim=(-0.75, 1.15), ylim=(-0.52, 0.56), aspect="equal")
     axes.axis("off")
     save_figure(figure, out)
+
+
+def _chair_from_above(axes: Any, spec: Any, middle: float) -> None:
+    """Body and wheels; `middle` is the chassis origin, counted from the drive axle [m]."""
+    from matplotlib.patches import Rectangle
+
+    corner = (middle - spec.body_length / 2, -spec.body_width / 2)
+    axes.add_patch(Rectangle(corner, spec.body_length, spec.body_width, fc="#eef3f7", ec="0.4"))
+    for side in (1, -1):
+        rear = (-spec.wheel_radius, side * spec.track / 2 - 0.03)
+        axes.add_patch(Rectangle(rear, 2 * spec.wheel_radius, 0.06, fc="0.25"))
+        front = (spec.wheelbase - 0.08, side * spec.track / 2 - 0.025)
+        axes.add_patch(Rectangle(front, 0.16, 0.05, fc="0.7"))
 
 
 def drives(out: Path) -> None:

@@ -2,7 +2,8 @@
 
 Parts: "frames" times images with rich looks, "steps" control steps of an environment that shows them, "foreign" gathers
 what `python -m benchmarks.foreign --out FILE` wrote (`--drives FILE ...`), "training" the speed of trainings and their
-last evaluation (`--runs NAME=FOLDER ...`, names that begin with paper or transfer).
+last evaluation (`--runs NAME=FOLDER ...`, names that begin with paper or transfer), "foretell" how well success here
+foretells success there, over policies named NAME or, of an evaluation inside a training, NAME@STEPS.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Options:
     """Options of the benchmark."""
 
     parts: tuple[str, ...] = ("frames", "steps")
-    """Parts to measure: frames, steps, foreign, training."""
+    """Parts to measure: frames, steps, foreign, training, foretell."""
     worlds: int = 0
     """Worlds per call; 0 takes 16,384 on an accelerator and 64 on a CPU."""
     repeats: int = 5
@@ -167,6 +168,32 @@ def training(options: Options) -> dict[str, dict[str, Any]]:
     return found
 
 
+def foretell(options: Options) -> dict[str, dict[str, Any]]:
+    """Spearman's rank correlation and Pearson's r of success here and in each foreign variant (SRCC, Kadian 2020)."""
+    from scipy.stats import pearsonr, spearmanr
+
+    here: dict[str, float] = {}
+    for text in options.runs:
+        name, folder = text.split("=", 1)
+        rows = [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+        evaluated = {int(row["env_steps"]): row["eval/success"] for row in rows if "eval/success" in row}
+        best = max(evaluated, key=lambda steps: evaluated[steps])
+        here |= {name: evaluated[best], **{f"{name}@{steps}": share for steps, share in evaluated.items()}}
+    there: dict[str, dict[str, list[bool]]] = {}
+    for one in (one for path in options.drives for one in json.loads(path.read_text())["drives"]):
+        if one["driver"] == "policy" and one["policy"] in here:
+            there.setdefault(one["variant"], {}).setdefault(one["policy"], []).append(one["end"] == "arrived")
+    found: dict[str, dict[str, Any]] = {}
+    for variant, policies in sorted(there.items()):
+        names = sorted(policies)
+        ours, theirs = [here[name] for name in names], [statistics.mean(policies[name]) for name in names]
+        points = {name: [a, b] for name, a, b in zip(names, ours, theirs, strict=True)}
+        common = {"device": options.device or device_name(), "policies": len(names), "success_here_and_there": points}
+        found[f"srcc_{variant}"] = {"value": float(spearmanr(ours, theirs)[0]), "unit": "rank correlation", **common}
+        found[f"pearson_{variant}"] = {"value": float(pearsonr(ours, theirs)[0]), "unit": "correlation", **common}
+    return found
+
+
 def main(options: Options) -> None:
     """Measure the parts, print and record."""
     worlds = options.worlds or (64 if jax.devices()[0].platform == "cpu" else 16_384)
@@ -179,6 +206,8 @@ def main(options: Options) -> None:
         found |= foreign(options)
     if "training" in options.parts:
         found |= training(options)
+    if "foretell" in options.parts:
+        found |= foretell(options)
     record("sight", CLAIM, found)
 
 

@@ -29,7 +29,7 @@ from sysid.verdict.result import LoopConfig
 from whill_mjx.batch import make_batch
 from whill_mjx.effects import EFFECTS, Effect, make_effect, register, unregister
 from whill_mjx.effects.card import Axis, Card, Falsifier, Variant
-from whill_mjx.effects.registry import Registry
+from whill_mjx.effects.registry import all_effects
 from whill_mjx.env import make_env
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.tasks.tasks import ObstacleCourse
@@ -100,7 +100,7 @@ def test_a_registered_effect_stands_behind_those_of_the_package(registered):
 
 @quick
 def test_an_installed_package_offers_its_effects_by_entry_points(installed):
-    known = Registry()
+    known = all_effects()
     assert list(known)[-1] == "heading_drift"
     assert known["heading_drift"].__module__ == "drifting"
 
@@ -117,7 +117,7 @@ def test_every_program_knows_the_effects_of_installed_packages(installed):
 def test_an_installed_package_that_cannot_be_loaded_is_named(installed):
     (installed / "drifting.py").write_text("import no_such_module")
     with pytest.raises(ImportError, match="installed package 'drifting'.*no_such_module.*uninstall"):
-        list(Registry())
+        list(all_effects())
 
 
 @quick

@@ -8,83 +8,21 @@ An installed package offers effects by entry points of the group `whill_mjx.effe
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import pkgutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import is_dataclass
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Card
+from whill_mjx.io.registry import Registry
 from whill_mjx.vehicle.types import parameters_of
 
-GROUP = "whill_mjx.effects"
-"""Group of the entry points."""
 Kind = TypeVar("Kind", bound=type[Effect])
-
-
-class Registry(Mapping[str, type[Effect]]):
-    """Effect classes by name: this package's in order of their names, then entry points by name, then registered ones.
-
-    Modules and entry points are loaded when an effect is first looked up, not on import. So a module that defines an
-    effect can import this package, whichever of the two is imported first.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[str, type[Effect]] = {}
-        self._loaded = False
-
-    def __getitem__(self, name: str) -> type[Effect]:
-        return self._all()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all())
-
-    def __len__(self) -> int:
-        return len(self._all())
-
-    def add(self, kind: type[Effect]) -> None:
-        """Add a checked effect at the end; a class that is defined again takes the place of its older self."""
-        known = self._all()
-        check_effect(kind)
-        other = known.get(kind.name)
-        if other is not None and (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
-            raise ValueError(f"effect {kind.name!r} of {kind.__module__}: {other.__module__} has one of this name. "
-                             "Choose another name.")
-        known[kind.name] = kind
-
-    def remove(self, name: str) -> None:
-        """Forget an effect; KeyError where there is none of this name."""
-        del self._all()[name]
-
-    def _all(self) -> dict[str, type[Effect]]:
-        if not self._loaded:
-            self._loaded = True  # first: what is loaded may register an effect
-            try:
-                self._load()
-            except BaseException:
-                self._known, self._loaded = {}, False
-                raise
-        return self._known
-
-    def _load(self) -> None:
-        own = [info.name for info in pkgutil.iter_modules([str(Path(__file__).parent)])]
-        kinds = [kind for name in own for kind in effects_in(importlib.import_module(f"whill_mjx.effects.{name}"))]
-        for kind in sorted(kinds, key=lambda kind: kind.name):
-            self.add(kind)
-        for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
-            self.add(_loaded(point))
-
-
-EFFECTS = Registry()
-"""Every known effect by name; docs/effects.md lists those of this package."""
 
 
 def register(kind: Kind) -> Kind:
@@ -109,8 +47,8 @@ def effects_in(module: ModuleType) -> list[type[Effect]]:
     return [kind for kind in kinds if kind.name and kind.__module__ == module.__name__]
 
 
-def check_effect(kind: type[Effect]) -> None:
-    """Raise TypeError or ValueError where a class is not a complete effect; names the rule and the remedy."""
+def check_effect(kind: Any, where: str = "") -> type[Effect]:
+    """The class, if it is a complete effect; TypeError or ValueError names the rule and the remedy."""
     if not (isinstance(kind, type) and issubclass(kind, Effect) and is_dataclass(kind)):
         raise TypeError(f"{kind!r} is not an effect. Derive it from whill_mjx.effects.base.Effect and decorate it with "
                         "flax.struct.dataclass.")
@@ -128,6 +66,16 @@ def check_effect(kind: type[Effect]) -> None:
     if unknown:
         raise ValueError(f"effect {kind.name!r} has no parameter {unknown[0]!r} (known: {', '.join(about)}). Correct "
                          "its card or its usual values.")
+    return kind
+
+
+def all_effects() -> Registry[type[Effect]]:
+    """A registry of all effects that are installed."""
+    return Registry("effect", "whill_mjx.effects", __file__, effects_in, check_effect)
+
+
+EFFECTS = all_effects()
+"""Every known effect by name; docs/effects.md lists those of this package."""
 
 
 def make_effect(name: str, **values: float) -> Effect:
@@ -161,13 +109,3 @@ def equation(kind: type[Effect]) -> str:
 def card_of(name: str) -> Card:
     """The card of an effect; a blank one for a name that is no effect."""
     return EFFECTS[name].card if name in EFFECTS else Card()
-
-
-def _loaded(point: EntryPoint) -> type[Effect]:
-    """The class of an entry point; ImportError names the package that it comes from."""
-    try:
-        return point.load()
-    except Exception as error:
-        package = point.dist.name if point.dist else "unknown"
-        raise ImportError(f"effect {point.name!r} of the installed package {package!r} ({point.value}) cannot be "
-                          f"loaded: {error}. Mend or uninstall that package.") from error

@@ -15,16 +15,14 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
-import pkgutil
 import sys
-from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import jax
 
+from whill_mjx.io.registry import Registry
 from whill_mjx.tasks.base import LAYOUTS as LAYOUTS
 from whill_mjx.tasks.base import Budget as Budget
 from whill_mjx.tasks.base import Task as Task
@@ -35,65 +33,8 @@ from whill_mjx.tasks.base import scale_action as scale_action
 from whill_mjx.tasks.corridor import Corridor as Corridor
 from whill_mjx.tasks.obstacle_course import ObstacleCourse as ObstacleCourse
 
-GROUP = "whill_mjx.tasks"
-"""Group of the entry points."""
 PARTS = ("base", "check", "options", "parts", "starts", "tasks", "terms")
 """Files of this room that hold no task."""
-
-
-class Registry(Mapping[str, Task]):
-    """Tasks with their defaults by name: this package's, then entry points, then registered ones.
-
-    Modules and entry points are loaded when a task is first looked up, so that their files can import this package.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[str, Task] = {}
-        self._loaded = False
-
-    def __getitem__(self, name: str) -> Task:
-        return self._all()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all())
-
-    def __len__(self) -> int:
-        return len(self._all())
-
-    def add(self, task: Task) -> None:
-        """Add a task; one that is defined again takes the place of its older self."""
-        known = self._all()
-        other = known.get(task.name)
-        if other is not None and _home(other) != _home(task):
-            raise ValueError(f"task {task.name!r} of {_home(task)}: {_home(other)} has one of this name. Give it "
-                             "another name.")
-        known[task.name] = task
-
-    def remove(self, name: str) -> None:
-        """Forget a task; KeyError where there is none of this name."""
-        del self._all()[name]
-
-    def _all(self) -> dict[str, Task]:
-        if not self._loaded:
-            self._loaded = True  # first: what is loaded may register a task
-            try:
-                self._load()
-            except BaseException:
-                self._known, self._loaded = {}, False
-                raise
-        return self._known
-
-    def _load(self) -> None:
-        own = [info.name for info in pkgutil.iter_modules([str(Path(__file__).parent)]) if info.name not in PARTS]
-        found = [task for name in own for task in tasks_in(importlib.import_module(f"whill_mjx.tasks.{name}")).values()]
-        for task in sorted(found, key=lambda task: task.name):
-            self.add(task)
-        for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
-            self.add(_as_task(point.load(), f"entry point {point.name} = {point.value}"))
-
-
-TASKS = Registry()
-"""Every known task by name."""
 
 
 def register_task(task: Any) -> Any:
@@ -109,8 +50,7 @@ def register_task(task: Any) -> Any:
         TypeError: it is no task.
         ValueError: a field is wrong, or another task has its name.
     """
-    known = _as_task(task, "register_task")
-    TASKS.add(known)
+    known = TASKS.add(task, "register_task")
     if "whill_mjx.gym" in sys.modules:  # which gives every task an id, when it is imported
         sys.modules["whill_mjx.gym"].register_id(known)
     return task
@@ -228,5 +168,7 @@ def _import(name: str, place: str) -> ModuleType:
                          "file.") from error
 
 
-def _home(task: Task) -> str:
-    return f"{type(task).__module__}.{type(task).__qualname__}"
+TASKS: Registry[Task] = Registry(
+    "task", "whill_mjx.tasks", __file__, lambda module: tasks_in(module).values(), _as_task, PARTS
+)
+"""Every known task by name."""

@@ -342,6 +342,10 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
     "black": {"value": (0.01, 0.08), "saturation": (0.0, 0.2)},
     "metal": {"value": (0.15, 0.7), "saturation": (0.0, 0.05), "grain_s": (0.2, 0.5), "grain_t": (0.004, 0.01)},
 }  # fmt: skip
+BOLD, BOLDEST = 0.5, 4.0
+"""Share of the worlds whose patterns and colours are bolder than usual, and by how much they are at most."""
+BOLD_LIMITS = {"joint": (0.0, 0.03), "joint_tone": (-1.5, 0.95), "tone": (0.0, 0.7), "blotch": (0.0, 0.6),
+               "grain": (0.0, 0.7)}  # fmt: skip
 WARM = ("brick", "planks", "cardboard")
 """Families whose hue lies between red and yellow."""
 CHOICE: dict[int, tuple[str, ...]] = {
@@ -388,7 +392,7 @@ def paint(key: jax.Array, scene: Scene) -> Scene:
 def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     """Materials of labels with these roles. Most walls look alike, and so do doors, frames and lamps."""
     labels, width = roles.shape[0], len(PROPERTIES) + 16
-    own_key, shared_key, alike_key = jax.random.split(key, 3)
+    own_key, shared_key, alike_key, bold_key = jax.random.split(key, 4)
     own = jax.random.uniform(own_key, (labels, width))
     shared = jax.random.uniform(shared_key, (14, width))[np.minimum(roles, 13)]
     alike = np.isin(roles, (FLOOR, WALL, FRAME, DOOR, LAMP, CEILING))
@@ -401,6 +405,7 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     level = low + part * (high - low)
     scaled = jnp.exp(jnp.log(jnp.maximum(low, 1e-3)) + part * jnp.log(jnp.maximum(high, 1e-3) / jnp.maximum(low, 1e-3)))
     value = dict(zip(PROPERTIES, jnp.where(_IS_LOG, scaled, level).T, strict=True))
+    value = _bold(value, *jax.random.uniform(bold_key, (2,)))
     rest = u[:, 1 + len(PROPERTIES) :]
     warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
     odd = rest[:, 14] < 0.12  # a tail of saturated paints
@@ -434,6 +439,18 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
         grain_size=jnp.stack([value["grain_s"], value["grain_t"]], 1), band=jnp.stack([foot, top], 1), glow=glow,
         gloss=value["gloss"],
     )  # fmt: skip
+
+
+def _bold(value: dict[str, jax.Array], chance: jax.Array, size: jax.Array) -> dict[str, jax.Array]:
+    """Properties of a world that is drawn bolder than its materials usually are, for a BOLD share of the worlds.
+
+    The ranges are those of real materials; a policy that has seen no stronger pattern or colour takes one for a thing.
+    """
+    times = jnp.where(chance < BOLD, 1.0 + (BOLDEST - 1.0) * size, 1.0)
+    wider = {name: jnp.clip(times * value[name], *limits) for name, limits in BOLD_LIMITS.items()}
+    second = jnp.clip(value["second"], 0.05) ** times
+    saturation = jnp.clip(value["saturation"] + (times - 1.0) * 0.25 * value["saturation"] ** 0.5, 0.0, 1.0)
+    return {**value, **wider, "second": jnp.clip(second, 0.02, 10.0), "saturation": saturation}
 
 
 def _reflectance(value, saturation, hue, warm) -> jax.Array:

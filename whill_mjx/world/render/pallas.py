@@ -111,15 +111,7 @@ def render_pallas(
     tiling = tiling or Tiling()
     inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
-    static: dict[str, Any] = {
-        "bits": parts_of(scene).bits,
-        "lit_words": lit_words(scene),
-        "atlas_shape": None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.shape,
-        "starts": _first_labels(scene),
-        "fast": tiling.fast and not interpret,
-        "interpret": interpret,
-        "cull": tiling.cull,
-    }
+    static = _static(scene, tiling, interpret)
     down, across = -(-height // tiling.rows), -(-width // tiling.columns)
     whole = height % tiling.rows == 0 and width % tiling.columns == 0
 
@@ -138,17 +130,11 @@ def render_pallas(
         colours = pixel_colours(view, stage, quality, rows, columns)
         word = jnp.where(data.integers[1] != 0, pack_channels(stage, colours), np.uint32(0))
         inside = None if whole else (row < height) & (column < width)
-        here = (pl.ds(top, tiling.rows), pl.ds(left, tiling.columns))
-        if tiling.words:
-            plt.store(out.at[here], word, mask=inside)
-            return
-        for channel in range(3):
-            level = (word >> np.uint32(8 * channel) & np.uint32(255)).astype(jnp.int32).astype(jnp.uint8)
-            mask = None if inside is None else inside[..., None]
-            plt.store(out.at[(*here, pl.ds(channel, 1))], level[..., None], mask=mask)
+        _write(out, (pl.ds(top, tiling.rows), pl.ds(left, tiling.columns)), word, inside, tiling.words)
 
-    drawn = jax.ShapeDtypeStruct((height, width) if tiling.words else (height, width, 3),
-                                 jnp.uint32 if tiling.words else jnp.uint8)
+    drawn = jax.ShapeDtypeStruct(
+        (height, width) if tiling.words else (height, width, 3), jnp.uint32 if tiling.words else jnp.uint8
+    )
     call = pl.pallas_call(
         kernel,
         out_shape=drawn,
@@ -159,6 +145,33 @@ def render_pallas(
     )
     image = call(*leaves)
     return unpack_colours(image) if tiling.words else image
+
+
+def _static(scene: Scene, tiling: Tiling, interpret: bool) -> dict[str, Any]:
+    """What the kernel knows when it is compiled."""
+    return {
+        "bits": parts_of(scene).bits,
+        "lit_words": lit_words(scene),
+        "atlas_shape": None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.shape,
+        "starts": _first_labels(scene),
+        "fast": tiling.fast and not interpret,
+        "interpret": interpret,
+        "cull": tiling.cull,
+    }
+
+
+def _write(out: Any, here: tuple[Any, Any], word: jax.Array, inside: jax.Array | None, words: bool) -> None:
+    """Write a tile's colours, as words or as three bytes a pixel; only those `inside` the image, if some are not."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton as plt
+
+    if words:
+        plt.store(out.at[here], word, mask=inside)
+        return
+    for channel in range(3):
+        level = (word >> np.uint32(8 * channel) & np.uint32(255)).astype(jnp.int32).astype(jnp.uint8)
+        mask = None if inside is None else inside[..., None]
+        plt.store(out.at[(*here, pl.ds(channel, 1))], level[..., None], mask=mask)
 
 
 def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort: bool) -> tuple[Inputs, Callable]:

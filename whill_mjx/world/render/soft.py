@@ -8,6 +8,8 @@ face is seen edge-on. Flat colours; upright boxes, marker and blocks; no texture
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.culling import EDGES, SIGNS
 from whill_mjx.world.render.tables import parts_of
 from whill_mjx.world.render.visibility import into_frame
-from whill_mjx.world.scene import Scene
+from whill_mjx.world.scene import Looks, Scene
 
 SKY_DEPTH = 100.0
 """Depth at which the sky stands [m]."""
@@ -59,30 +61,9 @@ def render_soft(
     way = jnp.stack([u, v, jnp.ones_like(u)], -1) @ rotation.T  # (H, W, 3)
 
     blur = intrinsics.fy / softness
-
-    def one_thing(centre, half, frame, colour, mask):
-        ray = into_frame(frame, way)
-        ray = jnp.where(jnp.abs(ray) < 1e-6, 1e-6, ray)
-        middle = into_frame(frame, centre - position) / ray
-        reach = jnp.abs(half / ray)
-        near = jnp.max(middle - reach, -1)
-        axis = jnp.argmax(middle - reach, -1)
-        facing = -jnp.sign(jnp.take_along_axis(ray, axis[..., None], -1)[..., 0])
-        sun = into_frame(frame, looks.sun)[axis] * facing
-        light = looks.ambient + looks.diffuse * jnp.maximum(sun, 0.0)
-        depth = jnp.maximum(near, 0.02)
-        inside = _angle_inside(into_frame(frame, position - centre), half, ray) * blur
-        cover = jnp.where(mask, jax.nn.sigmoid(jnp.clip(inside, -30.0, 30.0)), 0.0)
-        return cover, light[..., None] * colour, depth
-
+    one_thing = partial(_thing, way, position, looks, blur)
     cover, colour, depth = jax.vmap(one_thing)(*things)  # (P, H, W), (P, H, W, 3), (P, H, W)
-    ground = jnp.where(way[..., 2] < -1e-3, -position[2] / jnp.minimum(way[..., 2], -1e-3), SKY_DEPTH)
-    ground = jnp.clip(ground, 0.02, SKY_DEPTH)
-    lit = looks.ambient + looks.diffuse * jnp.maximum(looks.sun[2], 0.0)
-    height_of = jnp.clip(way[..., 2] / jnp.linalg.norm(way, axis=-1), 0.0, 1.0)[..., None]
-    sky = looks.sky_horizon + height_of * (looks.sky_zenith - looks.sky_horizon)
-    below = jax.nn.sigmoid(-blur * way[..., 2])[..., None]
-    back = below * jnp.mean(looks.ground, 0) * lit + (1.0 - below) * sky
+    back, ground = _behind(way, position, looks, blur)
 
     cover = jnp.concatenate([cover, jnp.ones_like(ground)[None]])
     place = order * jnp.log(jnp.concatenate([depth, jnp.full_like(ground, SKY_DEPTH)[None]]))
@@ -96,6 +77,32 @@ def render_soft(
     share = share / jnp.sum(share, 0)
     image = jnp.sum(share[..., None] * jnp.concatenate([colour, back[None]]), 0)
     return jnp.clip(image, 0.0, 1.0), jnp.sum(share * jnp.concatenate([depth, ground[None]]), 0)
+
+
+def _thing(way, position, looks: Looks, blur, centre, half, frame, colour, mask) -> tuple[jax.Array, ...]:
+    """Cover (H, W) of the rays by one box, its colour (H, W, 3) and depth (H, W) [m]."""
+    ray = into_frame(frame, way)
+    ray = jnp.where(jnp.abs(ray) < 1e-6, 1e-6, ray)
+    middle = into_frame(frame, centre - position) / ray
+    reach = jnp.abs(half / ray)
+    near = jnp.max(middle - reach, -1)
+    axis = jnp.argmax(middle - reach, -1)
+    facing = -jnp.sign(jnp.take_along_axis(ray, axis[..., None], -1)[..., 0])
+    sun = into_frame(frame, looks.sun)[axis] * facing
+    light = looks.ambient + looks.diffuse * jnp.maximum(sun, 0.0)
+    inside = _angle_inside(into_frame(frame, position - centre), half, ray) * blur
+    cover = jnp.where(mask, jax.nn.sigmoid(jnp.clip(inside, -30.0, 30.0)), 0.0)
+    return cover, light[..., None] * colour, jnp.maximum(near, 0.02)
+
+
+def _behind(way, position, looks: Looks, blur) -> tuple[jax.Array, jax.Array]:
+    """Colour (H, W, 3) of ground and sky behind all things, and the ground's depth (H, W) [m]."""
+    ground = jnp.where(way[..., 2] < -1e-3, -position[2] / jnp.minimum(way[..., 2], -1e-3), SKY_DEPTH)
+    lit = looks.ambient + looks.diffuse * jnp.maximum(looks.sun[2], 0.0)
+    height_of = jnp.clip(way[..., 2] / jnp.linalg.norm(way, axis=-1), 0.0, 1.0)[..., None]
+    sky = looks.sky_horizon + height_of * (looks.sky_zenith - looks.sky_horizon)
+    below = jax.nn.sigmoid(-blur * way[..., 2])[..., None]
+    return below * jnp.mean(looks.ground, 0) * lit + (1.0 - below) * sky, jnp.clip(ground, 0.02, SKY_DEPTH)
 
 
 def _angle_inside(eye: jax.Array, half: jax.Array, ray: jax.Array) -> jax.Array:
