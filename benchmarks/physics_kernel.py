@@ -96,19 +96,3 @@ def print_launches(vehicle: str, count: int, repeats: int, launches: Sequence[La
             except Exception:
                 print(f"{vehicle:18s} {count:7d} {launch} failed")
                 traceback.print_exc(limit=-3)
-
-
-if __name__ == "__main__":
-    import sys
-
-    for number in (131072, 1024, 32768):
-        try:
-            if "--sweep" in sys.argv:
-                print_launches("loaded", number, 5)
-            elif "--vehicles" in sys.argv:
-                for name in ("whill_cr_physical", "whill_cr_paper", "+suspension", "+sensor_delay"):
-                    print(measure_kernel(name, number, 3))
-            else:
-                print(measure_kernel("loaded", number, 5))
-        except Exception:
-            traceback.print_exc()
