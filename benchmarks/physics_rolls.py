@@ -30,7 +30,7 @@ def vehicle_of(name: str) -> tuple[VehicleSpec, VehicleParams]:
 
 
 def random_instances(
-    vehicle: str, count: int, dynamics: str = "fused", kernel: bool | None = None
+    vehicle: str, count: int, dynamics: str = "fused", kernel: bool | None = VehicleConfig.kernel
 ) -> tuple[VehicleModel, VehicleParams, VehicleState]:
     """`count` vehicles at rest with every parameter spread by SPREAD."""
     spec, params = vehicle_of(vehicle)
@@ -49,7 +49,7 @@ def random_instances(
 
 
 def compiled_roll(
-    vehicle: str, count: int, periods: int, dynamics: str = "fused", kernel: bool | None = None
+    vehicle: str, count: int, periods: int, dynamics: str = "fused", kernel: bool | None = VehicleConfig.kernel
 ) -> tuple[VehicleModel, Any, tuple]:
     """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments."""
     model, params, states = random_instances(vehicle, count, dynamics, kernel)
