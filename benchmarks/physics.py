@@ -6,6 +6,8 @@
     python -m benchmarks.physics --parts peers_step  # the same figure-eight on wheel contacts, as the peers step it
     python -m benchmarks.physics --parts peers       # mjx and C MuJoCo and MuJoCo Warp on a chair with wheel contacts
     python -m benchmarks.physics --parts kernels     # operations of one compiled step, closed form against mjx.step
+    python -m benchmarks.physics --parts kernel      # a control period in one GPU kernel against the scan over steps
+    python -m benchmarks.physics --parts launches    # block sizes of that kernel; printed only
     python -m benchmarks.physics --parts roofline    # what a step computes and moves, and what an H200 would allow
 
 The figures without a suffix are of "loaded": the physical base model with five more effects, one of each place.
@@ -44,7 +46,7 @@ DRIVES = ("pid_drive", "forward_slip", "rolling_contact", "unnamed")  # of the o
 DT = VehicleConfig().physics_dt
 SLIPPERY = 0.1
 """Friction of a floor on which the chair's wheels break away whenever it starts or stops."""
-PARTS = ("timestep", "kernels", "speed", "roofline", "effects", "peers_step", "peers")
+PARTS = ("timestep", "kernels", "kernel", "launches", "speed", "roofline", "effects", "peers_step", "peers")
 
 
 def measure(
@@ -130,8 +132,9 @@ def record_peers(options: argparse.Namespace, on_cpu: bool) -> None:
 
 
 def kernels_per_step(vehicle: str, dynamics: str) -> int:
-    """Fused loops, products and library calls in the compiled loop over physics steps: what a GPU launches per step."""
-    _, compiled, _ = compiled_roll(vehicle, 1024, 1, dynamics)
+    """Fused loops, products and library calls in the compiled loop over physics steps: what a GPU launches per step
+    where no kernel takes a whole control period."""
+    _, compiled, _ = compiled_roll(vehicle, 1024, 1, dynamics, kernel=False)
     bodies = re.split(r"\n(?=%|ENTRY)", compiled.as_text())
     kernel = re.compile(r" (?:fusion|dot|custom-call|copy)\(")
     return max(len(kernel.findall(body)) for body in bodies if not body.startswith("ENTRY"))
@@ -197,6 +200,18 @@ def record_kernels(vehicle: str = "whill_cr_physical") -> None:
     record("physics", CLAIM, figures)
 
 
+def compare_ways(options: argparse.Namespace) -> None:
+    """Print and record the kernel of whole control periods beside the scan, and print its launches."""
+    from benchmarks.physics_kernel import measure_kernel, print_launches
+
+    for vehicle in options.vehicles:
+        for count in options.instances:
+            if "launches" in options.parts:
+                print_launches(vehicle, count, options.repeats)
+            if "kernel" in options.parts:
+                record("physics", CLAIM, measure_kernel(vehicle, count, options.repeats))
+
+
 def record_roofline() -> None:
     """Print and record what a step computes and moves, and how far the recorded rates are from the limits."""
     from benchmarks.physics_profile import measure_roofline
@@ -248,6 +263,8 @@ def main() -> None:
         record_timestep()
     if "kernels" in options.parts:
         record_kernels()
+    if {"kernel", "launches"} & set(options.parts):
+        compare_ways(options)
     if "speed" in options.parts:
         record_speed(options, on_cpu)
     if "roofline" in options.parts:

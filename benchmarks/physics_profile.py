@@ -137,7 +137,7 @@ def measure_roofline(vehicle: str = "loaded", count: int = 1024) -> dict[str, di
     from benchmarks.physics_rolls import compiled_roll
 
     work, platform = work_of(vehicle), jax.devices()[0].platform
-    compiled = compiled_roll(vehicle, count, 1, "fused")[1]
+    compiled = compiled_roll(vehicle, count, 1, kernel=False)[1]
     moved = traffic(compiled.as_text(), count)
     counted = compiled.cost_analysis()  # a loop's body counts once; None where the compiler does not count
     figures = {

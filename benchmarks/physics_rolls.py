@@ -30,11 +30,11 @@ def vehicle_of(name: str) -> tuple[VehicleSpec, VehicleParams]:
 
 
 def random_instances(
-    vehicle: str, count: int, dynamics: str = "fused"
+    vehicle: str, count: int, dynamics: str = "fused", kernel: bool | None = VehicleConfig.kernel
 ) -> tuple[VehicleModel, VehicleParams, VehicleState]:
     """`count` vehicles at rest with every parameter spread by SPREAD."""
     spec, params = vehicle_of(vehicle)
-    model = build_model(spec, VehicleConfig(dynamics=dynamics))
+    model = build_model(spec, VehicleConfig(dynamics=dynamics, kernel=kernel))
     key = jax.random.key(0)
 
     def scatter(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
@@ -48,9 +48,11 @@ def random_instances(
     return model, scattered, states
 
 
-def compiled_roll(vehicle: str, count: int, periods: int, dynamics: str) -> tuple[VehicleModel, Any, tuple]:
+def compiled_roll(
+    vehicle: str, count: int, periods: int, dynamics: str = "fused", kernel: bool | None = VehicleConfig.kernel
+) -> tuple[VehicleModel, Any, tuple]:
     """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments."""
-    model, params, states = random_instances(vehicle, count, dynamics)
+    model, params, states = random_instances(vehicle, count, dynamics, kernel)
     commands = jax.random.uniform(jax.random.key(1), (periods, count, 2), minval=-1.0)
 
     @jax.jit

@@ -18,9 +18,9 @@ from whill_mjx.effects.base import place_of
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import (
     SMOOTH_LOAD,
-    _substep,
     forces,
     mass_distribution,
+    one_step,
     place,
     substeps,
     suspension,
@@ -91,12 +91,12 @@ def driven(group):
         commands = np.repeat(held, 100, axis=0).reshape(-1, 10, 2)  # 1.5 s
 
         def outcome(values, side):
-            # `_substep` on vectors: taken apart, it would run faster but take longer to compile.
+            # `one_step` on vectors: taken apart, it would run faster but take longer to compile.
             changed = set_values(params, names, values)
 
             def record(state, command):
                 state = jax.lax.scan(
-                    lambda s, c: (_substep(model, changed, s, c), None), state, command * jnp.stack([1.0, side]))[0]
+                    lambda s, c: (one_step(model, changed, s, c), None), state, command * jnp.stack([1.0, side]))[0]
                 pose, read = reference_pose(model, state.qpos), state.odometry
                 return state, jnp.stack([*pose, state.qpos[2], read.x, read.y, read.yaw, read.v, read.omega, read.gyro])
 

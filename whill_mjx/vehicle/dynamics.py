@@ -18,6 +18,7 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
+from whill_mjx.vehicle.kernel import Roll, held_in_registers, suits_device
 from whill_mjx.vehicle.kinematics import (
     body_twist,
     heading,
@@ -61,11 +62,11 @@ def substep(model: VehicleModel, params: VehicleParams, state: VehicleState, com
         The next state. A non-finite result is replaced by the previous state and flagged `diverged`.
     """
     if model.config.dynamics == "fused":
-        return apart(partial(_substep, model))(params, state, command)
-    return _substep(model, params, state, command)
+        return apart(partial(one_step, model))(params, state, command)
+    return one_step(model, params, state, command)
 
 
-def _substep(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
+def one_step(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
     memory, force, motion = forces(model, params, state, command)
     qpos, qvel = integrate(model, params, motion.world, state, force)
     healthy = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
@@ -79,7 +80,7 @@ def substeps(model: VehicleModel, params: VehicleParams, state: VehicleState, co
     """Advance one instance by K physics steps, each with its own command of commands (K, 2)."""
 
     def body(state: VehicleState, command: jax.Array) -> tuple[VehicleState, None]:
-        return _substep(model, params, state, command), None
+        return one_step(model, params, state, command), None
 
     scan = scan_apart if model.config.dynamics == "fused" else jax.lax.scan
     return scan(body, state, commands)[0]
@@ -101,7 +102,7 @@ def record(
 
     def body(state: VehicleState, commands: jax.Array) -> tuple[VehicleState, jax.Array]:
         for command in commands:
-            state = _substep(model, params, state, command)
+            state = one_step(model, params, state, command)
         return state, observe(state)
 
     scan = scan_apart if model.config.dynamics == "fused" else jax.lax.scan
@@ -110,7 +111,16 @@ def record(
 
 def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
     """Advance one instance by one control period with one command (2,) held."""
-    return substeps(model, params, state, jnp.broadcast_to(command, (model.config.substeps, 2)))
+    config = model.config
+
+    def plain(params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
+        return substeps(model, params, state, jnp.broadcast_to(command, (config.substeps, 2)))
+
+    wanted = suits_device() if config.kernel is None else config.kernel
+    if config.dynamics != "fused" or not wanted:
+        return plain(params, state, command)
+    roll = Roll(partial(one_step, model), config.substeps, plain)
+    return held_in_registers(roll, (params, state, command), forced=config.kernel is True)
 
 
 def forces(

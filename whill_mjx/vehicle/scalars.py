@@ -86,6 +86,18 @@ def scan_apart(
     return jax.tree.unflatten(structure, leaves), jax.tree.unflatten(outside, ys)
 
 
+def in_pieces(function: Callable, *args: Any) -> Any:
+    """The closed jaxpr of `function` from all elements of `args`, in order, to those of its results; arrays that stay
+    whole are one each."""
+    traced, leaves = jax.make_jaxpr(function)(*args), jax.tree.leaves(args)
+
+    def evaluated(pieces: list) -> list:
+        found = evaluate(traced, _regroup(pieces, leaves))
+        return _flat([_as_arrays(parts, like) for parts, like in _typed(traced, found)])
+
+    return jax.make_jaxpr(evaluated)(_flat([_as_arrays(take_apart(leaf), leaf) for leaf in leaves]))
+
+
 def take_apart(array: Any) -> Parts:
     """Elements of an array; the array itself where it is large or not numeric."""
     if np.size(array) > LARGEST or jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended):
