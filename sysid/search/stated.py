@@ -3,7 +3,7 @@
 A fit frees what a first calibration finds: sizes of the wheels, scales of the odometry, the tracked point. Where their
 estimates lie within their own errors of what data sheet and rulers say, those errors are all that they would add, and
 every other parameter bends to fit them. So a group of them that does not differ from what was stated, by a Wald test
-with the covariance of the fit, goes back to it, and the others follow.
+with the covariance of the fit as wide as its intervals, goes back to it, and the others follow.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from sysid.errors.pose_objective import Told
+from sysid.errors.prior import QUANTILE
 from sysid.intervals.uncertainty import Uncertainty
 from sysid.search import least_squares
 
@@ -36,9 +37,12 @@ def not_different(known: Uncertainty, names: tuple[str, ...], u: np.ndarray, sta
         u, stated: (P,) fitted and stated unit coordinates.
     """
 
+    wide = known.quantile * known.deviation / QUANTILE  # as the intervals are: few drives know their own errors badly
+    scale = wide / np.sqrt(np.maximum(np.diag(known.covariance), 1e-300))
+
     def share(places: list[int]) -> float:
         """Chance of so large a difference, or a larger one, where there is none."""
-        away = (u - stated)[places]
+        away = (u - stated)[places] / scale[places]
         covariance = known.covariance[np.ix_(places, places)]
         return float(chi2.sf(away @ np.linalg.lstsq(covariance, away, rcond=None)[0], len(places)))
 
