@@ -50,7 +50,6 @@ from sysid.search.settings import (
     TRIED,
     FitConfig,
 )
-from sysid.search.stated import as_stated
 from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
@@ -145,13 +144,7 @@ def fit_log(
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
-    robust = config.robust and config.method not in GLOBAL
-    known = uncertainty.estimate(chosen, u, robust=robust)
-    if config.calibrate and config.vehicle is None and config.method not in GLOBAL:
-        u, stated = as_stated(chosen, u, known, config.parameters, robust)
-        if stated:
-            known = uncertainty.estimate(chosen, u, robust=robust)
-            final_cost = float(robust_cost(chosen.residuals(u[None]), config.robust)[0]) / chosen.counted
+    known = uncertainty.estimate(chosen, u, robust=config.robust and config.method not in GLOBAL)
     traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))

@@ -32,7 +32,7 @@ def mistaken(command, words, capsys):
 
 
 @pytest.mark.parametrize("command, words, told", [
-    ("look", "--scene nope", "unknown scene 'nope' (known: corridor, "),
+    ("look", "--scene nope", "unknown scene 'nope' (known: among_people, corridor, "),
     ("look", "--scene task.py", "--scene task.py: a task in a file is named too. Give task.py:CLASS."),
     ("look", "--layout nope", "--layout nope: unknown (known: randomised, fixed)"),
     ("look", "--worlds 0", "--worlds 0: must be at least 1"),
@@ -78,7 +78,7 @@ def mistaken(command, words, capsys):
     ("view", "training --embed-mb -1", "--embed-mb -1.0: must be at least 0"),
     ("view", "training --serve --port 70000", "--port 70000: must be at least 0 and at most 65535"),
     ("evaluate", "nowhere", "nowhere"),
-    ("evaluate", "planner --task nope", "--task nope: unknown (known: corridor, "),
+    ("evaluate", "planner --task nope", "--task nope: unknown (known: among_people, corridor, "),
     ("evaluate", "planner --episodes 0", "--episodes 0: must be at least 1"),
     ("evaluate", "planner --batch -2", "--batch -2: must be at least 1"),
     ("evaluate", "planner --sweep-episodes 0", "--sweep-episodes 0: must be at least 1"),
