@@ -37,9 +37,9 @@ HEADLINES = (  # file, what, value
         "{steps_per_s_32768|1e-6} million",
     ),
     (
-        "camera",
-        "Camera images per second: 64x64 RGB, 32 boxes in the scene, 16,384 scenes at once",
-        "{frames_per_s_32box_16384|1e-6} million",
+        "sight",
+        "Arrivals in another simulator that no policy was trained in: furnished corridors (odd furniture and colours)",
+        "{foreign_furnished|%} ({foreign_unseen|%})",
     ),
     (
         "learner",
@@ -642,6 +642,42 @@ CLAIMS = (
             ("PPO", "{success_ppo|%}", "{success_ppo|range %}", "{collisions_ppo|%}", "-"),
         ),
         ("corridor.png", "corridor_ppo.png"),
+    ),
+    Claim(
+        TRAINING,
+        "Sight in another simulator",
+        "sight",
+        "A policy of the preset `transfer` drives in a foreign corridor: another simulator, renderer, textures and "
+        "furniture (`benchmarks/foreign`). Medians and ranges over three seeds, each stopped after 120,000 of its "
+        "200,000 steps, 60 drives a seed and variant. The policy of the preset `paper` drove 18 to 23 times. With the "
+        "stop, a drive ends where the policy is surprised beyond its own limit.",
+        ("what", "plain", "furnished", "never seen"),
+        (
+            ("arrived", "{foreign_plain|%}", "{foreign_furnished|%}", "{foreign_unseen|%}"),
+            ("of each seed", *(f"{{foreign_{one}|range %}}" for one in ("plain", "furnished", "unseen"))),
+            ("collided", *(f"{{foreign_{one}_collided|%}}" for one in ("plain", "furnished", "unseen"))),
+            ("arrived, with the stop", *(f"{{foreign_with_stop_{one}|%}}" for one in ("plain", "furnished", "unseen"))),
+            ("collided, with the stop",
+             *(f"{{foreign_with_stop_{one}_collided|%}}" for one in ("plain", "furnished", "unseen"))),
+            ("arrived, preset `paper`", *(f"{{foreign_paper0_{one}_arrived|%}}"
+                                          for one in ("plain", "furnished", "unseen"))),
+            ("arrived, straight ahead", *(f"{{foreign_straight_{one}_arrived|%}}"
+                                          for one in ("plain", "furnished", "unseen"))),
+            ("arrived, a planner that knows all", *(f"{{foreign_planner_{one}_arrived|%}}"
+                                                    for one in ("plain", "furnished", "unseen"))),
+        ),
+    ),  # fmt: skip
+    Claim(
+        TRAINING,
+        "Seconds until something happens",
+        "speed",
+        "Fresh processes: the first finds no compiled programs, the others what it left, with another seed. "
+        "The host did other work beside them.",
+        ("what", "cold [s]", "warm [s]"),
+        (
+            ("first step of a `WhillEnv`, one GPU", "{env_first_step_cold_s}", "{env_first_step_warm_s}"),
+            ("PPO to 99 % of new obstacle courses, one GPU", "{ppo_99_cold_s}", "{ppo_99_warm_s}"),
+        ),
     ),
     Claim(
         TRAINING,

@@ -124,21 +124,22 @@ def foreign(options: Options) -> dict[str, dict[str, Any]]:
             end = "stopped" if surprised else one["end"]
             groups.setdefault((one["policy"], "with_stop", one["variant"]), []).append(end)
     found: dict[str, dict[str, Any]] = {}
-    medians: dict[tuple[str, str], list[float]] = {}
+    seeds: dict[tuple[str, str, str], list[float]] = {}
+    device = options.device or device_name()
     for (policy, driver, variant), ends in sorted(groups.items()):
         for end in ("arrived", "collided", *(["stopped"] if driver == "with_stop" else [])):
             share = ends.count(end) / len(ends)
             name = "_".join(["foreign", policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
-            device = options.device or device_name()
             found[name] = {"value": share, "unit": "share", "device": device, "drives": len(ends)}
-            if policy.startswith("transfer") and driver == "policy":
-                medians.setdefault((variant, end), []).append(share)
-    for (variant, end), shares in medians.items():
-        if end == "arrived":
-            found[f"foreign_{variant}"] = figure(shares, "share", options.device or None)
-    worst = [medians[key] for key in medians if key[1] == "collided"]
-    if worst:
-        found["foreign_collided_worst"] = figure(max(worst, key=statistics.median), "share", options.device or None)
+            if policy.startswith("transfer") and driver in ("policy", "with_stop"):
+                seeds.setdefault((driver, variant, end), []).append(share)
+    for (driver, variant, end), shares in seeds.items():
+        name = "_".join(["foreign", *(["with_stop"] if driver == "with_stop" else []), variant])
+        found[name if end == "arrived" else f"{name}_{end}"] = figure(shares, "share", device)
+    driver = "with_stop" if any(key[0] == "with_stop" for key in seeds) else "policy"
+    collided = [shares for key, shares in seeds.items() if (key[0], key[2]) == (driver, "collided")]
+    if collided:
+        found["foreign_collided_worst"] = figure(max(collided, key=statistics.median), "share", device)
     return found
 
 
