@@ -16,7 +16,7 @@ OPSET = 18
 """ONNX operator set of the file. 18 is readable by onnxruntime 1.14 and newer, so also by a vehicle's older system."""
 IR_VERSION = 8
 """ONNX file version that belongs to opset 18."""
-ACTION_TOLERANCE = 1e-4
+ACTION_TOLERANCE = 1e-5
 """Largest difference of two actions in [-1, 1], or probabilities, that still counts as float32 rounding of one step."""
 FLIP_SHARE = 0.02
 """Share of steps in which an argmax may fall to the other side of a tie. A wrong export differs at every step."""

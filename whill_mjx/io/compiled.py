@@ -28,7 +28,7 @@ ZLIB = b"\x78"
 def keep_compiled() -> None:
     """Keep what XLA compiles in this process, and in those that it starts, in the user's cache folder.
 
-    Nothing changes where JAX was told of a folder, or where this one cannot be written. A damaged entry, a full disk or
+    Nothing changes where JAX has a folder already, or where this one cannot be written. A damaged entry, a full disk or
     another process that writes the same entry cost a compilation, no more.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
