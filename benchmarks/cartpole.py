@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import statistics
 import time
 from pathlib import Path
@@ -34,6 +33,7 @@ from dreamer.evaluate import evaluate
 from dreamer.train import TrainingOptions, train
 from dreamer.types import FunctionalEnv
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.reading import read_lines
 
 CLAIM = "DreamerV3 on tasks that are not ours; the curve of every seed, [environment steps, return of each seed]"
 TINY = dict(
@@ -130,7 +130,7 @@ def folder(options: argparse.Namespace, seeds: tuple[int, ...]) -> Path:
 
 def read_log(out: Path) -> list[dict[str, float]]:
     """All lines of a run's log."""
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return [line for _, line in read_lines(out / "metrics.jsonl")]
 
 
 def train_group(

@@ -31,6 +31,7 @@ from dreamer.evaluate import evaluate
 from dreamer.train import TrainingOptions, train
 from whill_mjx import evaluate as evaluation_command
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.checks import mean_figures
 from whill_mjx.learning.setup import (
     TRUTH,
@@ -93,7 +94,7 @@ def train_alone(asked: TrainOptions) -> dict[str, Any]:
     train_it = train_policy if asked.learner == "dreamer" else train_baseline
     with begin(asked, preset) as vehicle:
         train_it(asked, preset, vehicle)
-    lines = [json.loads(line) for line in (asked.out / "metrics.jsonl").read_text().splitlines()]
+    lines = [line for _, line in read_lines(asked.out / "metrics.jsonl")]
     return {"learner": asked.learner, "seed": asked.seed, **last_evaluation(asked.out, plain(preset), lines)}
 
 
@@ -140,7 +141,7 @@ def together(options: argparse.Namespace) -> None:
     if result.env_steps < steps:
         print(f"stopped at {result.env_steps} of {steps} steps; the same command goes on.")
         return
-    lines = [json.loads(line) for line in (options.out / "metrics.jsonl").read_text().splitlines()]
+    lines = [line for _, line in read_lines(options.out / "metrics.jsonl")]
     last = evaluation(result.agent.acting, 1077, FINAL)
     for seed, policy in zip(options.seeds, last, strict=True):
         folder = options.out / f"seed_{seed}"
@@ -185,7 +186,7 @@ def ablation(options: argparse.Namespace) -> None:
     groups: dict[str, dict[int, tuple[Path, list[dict[str, Any]]]]] = {}
     for path in options.runs:
         name, _, seed = path.name.rpartition("_")
-        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        lines = [line for _, line in read_lines(path / "metrics.jsonl")]
         groups.setdefault(name, {})[int(seed)] = path, lines
     figures = {}
     for name, seeds in groups.items():

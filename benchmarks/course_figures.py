@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.harness import figure
+from whill_mjx.io.reading import read_lines
 
 LEARNERS = {"dreamer": "", "ppo": "_ppo"}
 """What the names of each learner's figures end in."""
@@ -26,7 +27,7 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     Raises:
         ValueError: there is no note and no device is given; or there was no evaluation.
     """
-    metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    metrics = [line for _, line in read_lines(path / "metrics.jsonl")]
     if (path / "course.json").exists():
         noted = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
         starts = {"exploring_starts": noted["exploring_starts"]} if "exploring_starts" in noted else {}

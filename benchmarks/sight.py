@@ -23,6 +23,7 @@ from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import RICH, Env, State, make_env, reset_state
 from whill_mjx.evaluation.novelty import SETTLED
 from whill_mjx.io import command_line
+from whill_mjx.io.reading import read_lines
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.world.render import pinhole, render
 from whill_mjx.world.render.pallas import render_pallas
@@ -151,7 +152,7 @@ def training(options: Options) -> dict[str, dict[str, Any]]:
     for text in options.runs:
         name, folder = text.split("=", 1)
         kind = next(kind for kind in speeds if name.startswith(kind))
-        rows = [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+        rows = [line for _, line in read_lines(Path(folder) / "metrics.jsonl")]
         rates = [row["env_steps_per_s"] for row in rows if "env_steps_per_s" in row]
         speeds[kind].append(statistics.median(rates[5:]))  # the first rows compile
         evaluated = [row for row in rows if "eval/success" in row]
@@ -176,7 +177,7 @@ def foretell(options: Options) -> dict[str, dict[str, Any]]:
     here: dict[str, float] = {}
     for text in options.runs:
         name, folder = text.split("=", 1)
-        rows = [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+        rows = [line for _, line in read_lines(Path(folder) / "metrics.jsonl")]
         evaluated = {int(row["env_steps"]): row["eval/success"] for row in rows if "eval/success" in row}
         best = max(evaluated, key=lambda steps: evaluated[steps])
         here |= {name: evaluated[best], **{f"{name}@{steps}": share for steps, share in evaluated.items()}}
