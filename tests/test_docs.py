@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -79,6 +80,16 @@ def test_commands_that_a_page_shows_can_be_started(page):
     for module in set(re.findall(rf"python -m ({OURS}(?:\.\w+)*)", page.read_text())):
         path = ROOT / module.replace(".", "/")
         assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), f"{page.name}: python -m {module}"
+
+
+@pytest.mark.long
+def test_commands_that_pages_show_are_taken_by_their_parsers():
+    script = ROOT / "tests" / "parse_commands.py"
+    pages = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "examples" / "README.md"]
+    done = subprocess.run([sys.executable, str(script), *map(str, pages)], cwd=ROOT, capture_output=True, text=True,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    *refused, count = done.stdout.splitlines()
+    assert done.returncode == 0 and not refused and int(count.split()[0]) > 100, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)
