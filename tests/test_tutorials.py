@@ -105,7 +105,8 @@ CODE_PAGES = [page for page in (tutorials.ROOT / "README.md", *sorted((tutorials
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", CODE_PAGES, ids=lambda page: page.name)
-def test_the_code_of_a_page_runs(page, tmp_path):
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)  # as a program in this folder has it
     with workplace(tmp_path):
         map_block = blocks(tutorials.TUTORIALS / "5_my_map_my_task.md")[0]
         exec(map_block.code, {})  # the small map that pages use
