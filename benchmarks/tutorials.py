@@ -136,7 +136,7 @@ def run_page(page: Path, tests: bool = False, quick: bool = False) -> None:
         where = f"{page.name}, line {block.line}"
         try:
             if block.language == "python":
-                exec(compile("\n" * (block.line - 1) + code, str(page), "exec"), names)
+                exec(compile("\n" * (block.line - 1) + code, str(page), "exec", dont_inherit=True), names)
             elif quick:
                 for line in code.replace("\\\n", " ").splitlines():
                     run_here(line)
