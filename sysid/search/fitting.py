@@ -109,7 +109,7 @@ def fit_log(
     began = time.perf_counter()
     log = of_earlier(log, config)
     given = make_problem(log, config, params, model)
-    if config.quick and given.plant.host is not None:
+    if given.plant.host is not None:
         config = replace(config, elsewhere=False)
     space, objective = given.space, given.objective
     wanted = profiled(space, config)
@@ -134,7 +134,8 @@ def fit_log(
         if config.calibrate and config.vehicle is None:
             sizes = chosen_sizes(chosen, objective.renewed(u), known.evidence, final_cost, config.parameters, robust)
             u, final_cost, stated = sizes.u, sizes.cost, sizes.names
-            known = uncertainty.estimate(chosen, u, robust=robust) if stated else known
+            # What the drives say of stated sizes counts as well, and they say it where all are free.
+            known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
     traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
