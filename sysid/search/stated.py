@@ -3,8 +3,8 @@
 A first calibration frees sizes of the wheels, scales of the odometry and the tracked point. Few drives determine them
 only together with slip, scrub and lags, so that freeing what was right makes other drives worse. Groups of them are
 judged by what counts in the end: how far whole drives are off that the fit has not seen. Each manoeuvre of the training
-drives is held back in turn, all other parameters follow the rest of the drives, and the groups stay free with which
-those that were held back come out best. Source: Stone (1974), cross-validatory choice.
+drives is held back in turn, all other parameters follow the rest of the drives, and the groups stay free that those
+which were held back need. Source: Stone (1974), cross-validatory choice.
 """
 
 from __future__ import annotations
@@ -66,13 +66,30 @@ def chosen_sizes(
     held = np.array([[any(name in groups[group] for group in some) for name in space.names] for some in options])
     follow = _Follow(objective, evidence, space.to_unit(space.initial))
     left = _held_back(follow, poses, held, robust) if groups else np.zeros((1, 1))
-    best = int(np.log(np.maximum(left, 1e-300)).mean(0).argmin())  # each manoeuvre has noise of a size of its own
+    best = simplest(np.log(np.maximum(left, 1e-300)), held.sum(1))  # noise of a manoeuvre has a size of its own
     if not held[best].any():
         return Choice((), u, cost)
     names = tuple(name for name, one in zip(space.names, held[best], strict=True) if one)
     begin = follow(held[best], np.ones(evidence.scores.shape[:2], bool))
     found = least_squares.fit(objective, space, starts=begin[None], iterations=ITERATIONS, robust=robust, frozen=names)
     return Choice(options[best], found.u, found.cost)
+
+
+def simplest(errors: np.ndarray, held: np.ndarray) -> int:
+    """The option that holds most and whose mean error is within a standard error of the least (Breiman et al., 1984).
+
+    Among as simple ones it is the best. That standard error is of gains by the best option, and its variance twice the
+    mean square of those below 0: what a right size gains in a single manoeuvre is no noise.
+
+    Args:
+        errors: (G, O) of G manoeuvres and O options.
+        held: (O,) how many parameters each option holds.
+    """
+    mean = errors.mean(0)
+    gains = errors - errors[:, [mean.argmin()]]
+    noise = np.sqrt(2 * np.square(np.minimum(gains, 0.0)).mean(0) / len(gains))
+    near = gains.mean(0) <= noise
+    return int(np.lexsort((mean, -held, ~near))[0])
 
 
 @dataclass(frozen=True)

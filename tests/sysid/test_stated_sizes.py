@@ -12,7 +12,7 @@ from sysid.errors.prior import Prior, bounds_alone
 from sysid.errors.space import Space
 from sysid.intervals.independence import Evidence
 from sysid.intervals.uncertainty import PIECES
-from sysid.search.stated import chosen_sizes
+from sysid.search.stated import chosen_sizes, simplest
 
 NAMES = ("body.yaw_inertia", "track_width.error", "wheel_radius_difference.common", "odometry_scale.linear")
 DRIVES, SAMPLES = 6, 80
@@ -83,3 +83,12 @@ def test_sizes_that_are_right_stay_as_stated_unless_a_person_frees_them():
     assert len(names) >= 2
     kept, _ = choice((0.7, 0.0, 0.0, 1.0), groups, kept=("track_width.error",))
     assert "track" not in kept
+
+
+@pytest.mark.quick
+def test_gains_within_their_noise_free_nothing_and_a_gain_in_one_manoeuvre_does():
+    noisy = np.array([[0.1, 0.0], [-0.03, 0.0], [-0.03, 0.0], [0.04, 0.0], [-0.06, 0.0]])
+    assert simplest(noisy, np.array([2, 0])) == 0
+    clear = np.array([[3.0, 0.0], [0.01, 0.0], [-0.01, 0.0], [0.0, 0.0]])
+    assert simplest(clear, np.array([2, 0])) == 1
+    assert simplest(np.array([[0.2, 0.1, 0.1], [0.2, 0.1, 0.1]]), np.array([0, 1, 2])) == 2
