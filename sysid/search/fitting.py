@@ -119,7 +119,8 @@ def fit_log(
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
     chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
-    robust, search, stated = config.robust and config.method not in GLOBAL, None, ()
+    robust, search = config.robust and config.method not in GLOBAL, None
+    stated: tuple[str, ...] = ()
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
     if config.method in GLOBAL:
         assert scan is not None

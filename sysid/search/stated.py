@@ -60,10 +60,10 @@ def chosen_sizes(
         robust: whether large residuals count linearly.
     """
     space, u = objective.space, evidence.u
-    groups = {group: held for group, names in GROUPS.items()
-              if (held := tuple(name for name in names if name in space.names)) and not set(held) & set(kept)}
-    options = [some for count in range(len(groups), -1, -1) for some in combinations(groups, count)]
-    held = np.array([[any(name in groups[group] for group in some) for name in space.names] for some in options])
+    groups = {group: some for group, names in GROUPS.items()
+              if (some := set(names) & set(space.names)) and not some & set(kept)}
+    options = [tuple(one) for count in range(len(groups), -1, -1) for one in combinations(groups, count)]
+    held = np.array([[any(name in groups[group] for group in one) for name in space.names] for one in options])
     follow = _Follow(objective, evidence, space.to_unit(space.initial))
     left = _held_back(follow, poses, held, robust) if groups else np.zeros((1, 1))
     best = simplest(np.log(np.maximum(left, 1e-300)), held.sum(1))  # noise of a manoeuvre has a size of its own
