@@ -125,19 +125,20 @@ def fit_log(
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
-        known = uncertainty.estimate(chosen, u, robust=robust)
     else:
         search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
-        known = uncertainty.estimate(chosen, u, robust=robust)
-        if config.calibrate and config.vehicle is None:
-            sizes = chosen_sizes(chosen, objective.renewed(u), known.evidence, final_cost, config.parameters, robust)
-            u, final_cost, stated = sizes.u, sizes.cost, sizes.names
-            # What the drives say of stated sizes counts as well, and they say it where all are free.
-            known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
+    known = uncertainty.estimate(chosen, u, robust=robust)
     traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    if config.calibrate and config.vehicle is None and config.method not in GLOBAL:
+        if progress is not None:
+            progress(0, "sizes: stated or free")
+        sizes = chosen_sizes(chosen, objective.renewed(u), known.evidence, final_cost, config.parameters, robust)
+        u, final_cost, stated = sizes.u, sizes.cost, sizes.names
+        # What the drives say of stated sizes counts as well, and they say it where all are free.
+        known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = set_parameters(given.params, space.names, values)
