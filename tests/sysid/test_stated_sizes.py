@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,10 @@ from sysid.errors.prior import Prior, bounds_alone
 from sysid.errors.space import Space
 from sysid.intervals.independence import Evidence
 from sysid.intervals.uncertainty import PIECES
+from sysid.logs.log import load_log
+from sysid.pages.report import error_rows, summaries
+from sysid.search.fitting import fit_log, predict
+from sysid.search.settings import FitConfig
 from sysid.search.stated import chosen_sizes, simplest
 
 NAMES = ("body.yaw_inertia", "track_width.error", "wheel_radius_difference.common", "odometry_scale.linear")
@@ -92,3 +97,13 @@ def test_gains_within_their_noise_free_nothing_and_a_gain_in_one_manoeuvre_does(
     clear = np.array([[3.0, 0.0], [0.01, 0.0], [-0.01, 0.0], [0.0, 0.0]])
     assert simplest(clear, np.array([2, 0])) == 1
     assert simplest(np.array([[0.2, 0.1, 0.1], [0.2, 0.1, 0.1]]), np.array([0, 1, 2])) == 2
+
+
+@pytest.mark.long
+def test_seven_drives_of_a_chair_of_stated_sizes_foretell_others_as_well_as_their_replicates():
+    log = load_log(Path(__file__).parents[2] / "sysid" / "data" / "chair")
+    fit = fit_log(log, FitConfig(elsewhere=False))
+    assert "track" in fit.stated and "wheel radii" in fit.stated
+    rows = error_rows(log.trials, *predict(fit, log.trials))
+    one = summaries(rows, log.trials)["summary"]["held_out"]["ground_truth"]["trajectory"]
+    assert one["fitted"] < 1.2 * one["noise_floor"]
