@@ -135,7 +135,7 @@ def fit_log(
     if config.calibrate and config.vehicle is None and config.method not in GLOBAL:
         if progress is not None:
             progress(0, "sizes: stated or free")
-        sizes = chosen_sizes(chosen, objective.renewed(u), known.evidence, final_cost, config.parameters, robust)
+        sizes = chosen_sizes(chosen, objective.renewed(u), known, final_cost, config.parameters, robust)
         u, final_cost, stated = sizes.u, sizes.cost, sizes.names
         # What the drives say of stated sizes counts as well, and they say it where all are free.
         known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known

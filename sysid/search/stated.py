@@ -1,10 +1,10 @@
 """Sizes that need not be freed: drives that are held back are foretold as well with what data sheet and rulers say.
 
 A first calibration frees sizes of the wheels, scales of the odometry and the tracked point. Few drives determine them
-only together with slip, scrub and lags, so that freeing what was right makes other drives worse. Groups of them are
-judged by what counts in the end: how far whole drives are off that the fit has not seen. Each manoeuvre of the training
-drives is held back in turn, all other parameters follow the rest of the drives, and the groups stay free that those
-which were held back need. Source: Stone (1974), cross-validatory choice.
+only together with slip, scrub and lags, so that freeing what was right makes other drives worse. Groups that all drives
+contradict are free. The others are judged by what counts in the end: how far whole drives are off that the fit has not
+seen. Each manoeuvre of the training drives is held back in turn, all other parameters follow the rest of the drives,
+and the groups stay free that those which were held back need. Source: Stone (1974), cross-validatory choice.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from itertools import combinations
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, Told
+from sysid.errors.prior import expected_sd
 from sysid.errors.robust import HUBER
+from sysid.errors.space import Space
 from sysid.intervals.independence import Evidence
-from sysid.intervals.uncertainty import PIECES
+from sysid.intervals.uncertainty import PIECES, Uncertainty
 from sysid.search import least_squares
 from sysid.search.gauss_newton import BoxStep
 from sysid.search.slopes import AT_ONCE
@@ -47,21 +49,24 @@ class Choice:
 
 
 def chosen_sizes(
-    objective: Told, poses: Objective, evidence: Evidence, cost: float, kept: Sequence[str] = (), robust: bool = True
+    objective: Told, poses: Objective, known: Uncertainty, cost: float, kept: Sequence[str] = (), robust: bool = True
 ) -> Choice:
-    """The point (P,) at which only those groups differ from what was stated that foretell held-back drives better so.
+    """The point (P,) at which only those groups differ from what was stated that the drives need.
+
+    A group that all drives together contradict is free. Others are judged by drives that are held back.
 
     Args:
         objective: what the search ended on.
         poses: errors of whole poses of the same drives.
-        evidence: information of each drive, where the search ended.
+        known: errors where the search ended, and the information that each drive has there.
         cost: there.
         kept: parameters that a person chose to fit.
         robust: whether large residuals count linearly.
     """
-    space, u = objective.space, evidence.u
+    space, evidence, u = objective.space, known.evidence, known.evidence.u
+    free = set(kept) | contradicted(known, space)
     groups = {group: some for group, names in GROUPS.items()
-              if (some := set(names) & set(space.names)) and not some & set(kept)}
+              if (some := set(names) & set(space.names)) and not some & free}
     options = [tuple(one) for count in range(len(groups), -1, -1) for one in combinations(groups, count)]
     held = np.array([[any(name in groups[group] for group in one) for name in space.names] for one in options])
     follow = _Follow(objective, evidence, space.to_unit(space.initial))
@@ -73,6 +78,18 @@ def chosen_sizes(
     begin = follow(held[best], np.ones(evidence.scores.shape[:2], bool))
     found = least_squares.fit(objective, space, starts=begin[None], iterations=ITERATIONS, robust=robust, frozen=names)
     return Choice(options[best], found.u, found.cost)
+
+
+def contradicted(known: Uncertainty, space: Space) -> set[str]:
+    """Parameters that are more likely free than as stated.
+
+    The ratio of both marginal likelihoods is that of posterior and prior density at the stated value (Savage and
+    Dickey; Dickey, 1971). The prior is as wide as data sheets are usually off.
+    """
+    away = np.square((known.evidence.u - space.to_unit(space.initial)) / known.deviation)
+    wider = np.square(expected_sd(space) / known.deviation)  # the prior, beside the errors
+    free = away * wider / (1 + wider) > np.log(1 + wider)
+    return {name for name, one in zip(space.names, free, strict=True) if one}
 
 
 def simplest(errors: np.ndarray, held: np.ndarray) -> int:

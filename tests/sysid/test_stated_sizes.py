@@ -17,7 +17,7 @@ from sysid.logs.log import load_log
 from sysid.pages.report import error_rows, summaries
 from sysid.search.fitting import fit_log, predict
 from sysid.search.settings import FitConfig
-from sysid.search.stated import chosen_sizes, simplest
+from sysid.search.stated import chosen_sizes, contradicted, simplest
 
 NAMES = ("body.yaw_inertia", "track_width.error", "wheel_radius_difference.common", "odometry_scale.linear")
 DRIVES, SAMPLES = 6, 80
@@ -66,7 +66,8 @@ def choice(values: tuple[float, ...], groups: np.ndarray, **options):
     scores = np.einsum("bckp,bck->bcp", parts, residual.reshape(len(groups), PIECES, -1))
     prior = bounds_alone(space)
     evidence = Evidence(u, scores, parts.swapaxes(-1, -2) @ parts, groups, 1.0, 1.0, prior.precision, 1.0)
-    found = chosen_sizes(replace(fit, prior=None), fit, evidence, 1.0, robust=False, **options)
+    known = SimpleNamespace(evidence=evidence, deviation=np.sqrt(np.diag(evidence.inverse)))
+    found = chosen_sizes(replace(fit, prior=None), fit, known, 1.0, robust=False, **options)
     return found.names, space.to_values(found.u)
 
 
@@ -107,3 +108,13 @@ def test_seven_drives_of_a_chair_of_stated_sizes_foretell_others_as_well_as_thei
     rows = error_rows(log.trials, *predict(fit, log.trials))
     one = summaries(rows, log.trials)["summary"]["held_out"]["ground_truth"]["trajectory"]
     assert one["fitted"] < 1.2 * one["noise_floor"]
+
+
+@pytest.mark.quick
+def test_what_all_drives_contradict_is_free_and_what_they_hardly_show_is_not():
+    space = Space(NAMES[:3], np.array([0.0, -0.2, -0.2]), np.array([2.0, 0.2, 0.2]), np.array([1.0, 0.0, 0.0]),
+                  np.zeros(3, bool))  # fmt: skip
+    deviation = np.array([0.01, 0.005, 0.2])
+    u = space.to_unit(np.array([1.0, -0.05, 0.02]))
+    known = SimpleNamespace(evidence=SimpleNamespace(u=u), deviation=deviation)
+    assert contradicted(known, space) == {"track_width.error"}
