@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -91,6 +91,8 @@ class Table:
 
     stem: str
     columns: dict[str, np.ndarray]  # name -> (T,)
+    odd: Mapping[str, str] = field(default_factory=dict)
+    """Name of a column -> note on its cells that are no numbers."""
 
 
 def kind_of(role: str) -> str:
@@ -290,11 +292,22 @@ def _unit(text: str) -> str:
     return SPELLED.get(text, text)
 
 
+def unit_named(text: str) -> bool:
+    """Whether a text is the name of a unit."""
+    return any(_unit(text.strip("[]()")) in units for units in UNITS.values())
+
+
+def with_unit(name: str, unit: str) -> str:
+    """The name of a column with a unit that stands below it; its own unit counts where it has one."""
+    return f"{name} [{unit.strip('[]()')}]" if unit and not _split_unit(name)[1] else name
+
+
 def _time_unit(column: Column, values: np.ndarray) -> Column:
     if column.unit in UNITS["time"] and not (column.unit == "s" and np.nanmedian(np.abs(values)) > 1e11):
         return column
     known = values[np.isfinite(values)]
-    step = float(np.median(np.diff(np.unique(known)))) if len(known) > 2 else 1.0
+    steps = np.diff(np.unique(known))
+    step = float(np.median(steps)) if len(steps) else 1.0
     first = float(np.abs(known[0])) if len(known) else 0.0
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):  # since 1970
         if first > least:

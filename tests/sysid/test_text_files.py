@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +75,36 @@ def plotted(c):
             **{f"/odom/pose/pose/orientation/{name[1]}": values for name, values in pose.items()},
             "/odom/twist/twist/linear/x": c["v"], "/odom/twist/twist/angular/z": c["w"],
             "/odom/twist/twist/linear/y": 0 * c["v"]}
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda text: text.replace(".", ","), "Are there decimal commas"),
+    (lambda text: text.replace("gt_x", "odom_x"), "two columns are named 'odom_x'"),
+    (lambda text: text.replace("cmd_v", "status"), "is the only part of a command"),
+    (lambda text: re.sub(r"(?m)^[\d.]+", "7", text), "time stands still in drive/timestamp"),
+])  # fmt: skip
+def test_a_table_that_cannot_be_read_is_refused_with_the_reason(tmp_path, change, says):
+    path = write(tmp_path / "drive.csv", without_units(columns()))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(ValueError, match=says):
+        convert(ConvertConfig(path, tmp_path / "data"))
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda lines: ['"' + line.replace(",", '","').replace(".", ",") + '"' for line in lines], ""),
+    (lambda lines: [lines[0], *(line + "," for line in lines[1:])], ""),
+    (lambda lines: [lines[0], "ms,km/h,deg/s,mm,mm,deg,km/h,deg/s", *lines[1:]], ""),
+    (lambda lines: [lines[0], *lines[:0:-1]], "newest row comes first"),
+    (lambda lines: [*lines[:9], "0x" + lines[9], *lines[10:]], "is no number .'0x.*' in line 10"),
+    (lambda lines: [*lines, lines[-1]], "1 row of .* at the time of the row before"),
+])  # fmt: skip
+def test_tables_of_other_programs_are_read_and_what_is_left_out_is_said(tmp_path, change, says):
+    table = write(tmp_path / "drive.csv", with_units(columns()))
+    table.write_text("\n".join(change(table.read_text().splitlines())))
+    log, notes = convert(ConvertConfig(table, tmp_path / "data"))
+    assert len(log.trials[0].odometry.t) >= len(DRIVE.odometry.t) - 1
+    assert any(re.search(says, note) for note in notes)
 
 
 @pytest.mark.parametrize("names", [with_units, without_units, plotted])
