@@ -230,8 +230,8 @@ def bag_drives(
     bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
     imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
     bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
-    times = stream_times(bag, config.stamp)
     said = clock_notes(bag, config.stamp)
+    times = stream_times(bag, config.stamp)
     try:
         more = stream_times(imu, config.stamp), clock_notes(imu, config.stamp)
         _check_rates(imu)
