@@ -193,7 +193,10 @@ def test_bags_of_one_folder_are_trials_and_can_be_added_later(bag, tmp_path):
     convert(ConvertConfig(bag, tmp_path / "log"))
     log, _ = convert(ConvertConfig(source, tmp_path / "log"))
     assert [trial.name for trial in log.trials] == ["figure_1", "figure_2", "figure_3"]
-    with pytest.raises(ValueError, match="figure_2: exists already"):
+    _, notes = convert(ConvertConfig(source, tmp_path / "log"))  # as after a kill
+    assert "figure_3 is there already, with the same contents" in notes
+    (tmp_path / "log" / "trials" / "figure_2" / "odometry.csv").unlink()
+    with pytest.raises(ValueError, match="figure_2: exists already, with other contents"):
         convert(ConvertConfig(source, tmp_path / "log"))
     assert not list(tmp_path.glob(".*partial*"))
 
