@@ -140,18 +140,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         notes, more = [*left, *said], more | fields
     elif bags:
         spec = _spec(config)
-        wheels = config.input == "wheels"
-        drives, notes, refused = _bags_drives(bags, config, spec, wheels)
-        if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
-            try:
-                drives, notes, refused = _bags_drives(bags, config, spec, True)
-                wheels = True
-            except ValueError:
-                drives = []
-            if not drives:
-                _, _, refused = _bags_drives(bags, config, spec, False)
-        if not drives and refused:
-            raise refused[0]
+        drives, notes, wheels = _any_drives(bags, config, spec)
         if wheels:
             more["input"] = "wheels"
     else:
@@ -174,6 +163,20 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _any_drives(
+    bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec
+) -> tuple[list[Drive], list[str], bool]:
+    """Trials of several bags, notes, and whether their input is measured wheel speeds: where no bag has commands."""
+    wheels = config.input == "wheels"
+    drives, notes, refused = _bags_drives(bags, config, spec, wheels)
+    if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
+        drives, more, _ = _bags_drives(bags, config, spec, True)
+        wheels, notes = bool(drives), more if drives else notes
+    if not drives and refused:
+        raise refused[0]
+    return drives, notes, wheels
 
 
 def _bags_drives(
@@ -454,20 +457,25 @@ def write_dataset(
                 raise ValueError(f"{folder / 'trials' / name}: exists already, with other contents; a conversion never "
                                  "replaces a trial. Choose another --out, or remove the trial.")
         notes += [f"{name} is there already, with the same contents" for name in there]
-        with WRITING:
-            if not known:
-                os.replace(partial / "dataset.toml", folder / "dataset.toml")
-            if not (folder / "trials").exists():
-                os.replace(partial / "trials", folder / "trials")
-            else:
-                for name in set(accepted) - set(there):
-                    os.replace(partial / "trials" / name, folder / "trials" / name)
+        _place(partial, folder, [name for name in accepted if name not in there])
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         with suppress(OSError):
             if made and not any(folder.iterdir()):
                 folder.rmdir()
     return notes
+
+
+def _place(partial: Path, folder: Path, trials: Sequence[str]) -> None:
+    """Move what was written to its place, in one step where the dataset is new."""
+    with WRITING:
+        if (partial / "dataset.toml").exists():
+            os.replace(partial / "dataset.toml", folder / "dataset.toml")
+        if not (folder / "trials").exists():
+            os.replace(partial / "trials", folder / "trials")
+        else:
+            for name in trials:
+                os.replace(partial / "trials" / name, folder / "trials" / name)
 
 
 def _contents(trial: Path) -> dict[str, bytes]:
