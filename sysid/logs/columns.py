@@ -61,6 +61,8 @@ NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", 
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
 SAID = "as said"  # why a column has its role where somebody gave no unit
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
+TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
+TURNED = 0.3  # rad; the same of a heading
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
 GAP = 2.0  # s without samples, over which nothing is interpolated
@@ -80,6 +82,8 @@ class Column:
     sure: bool = True
     assumed: bool = False
     """Whether neither name nor numbers show the unit, so that it is the usual one."""
+    moves: bool = True
+    """Whether its numbers change by what a moving vehicle would have in this unit."""
 
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{self.unit}"
@@ -153,20 +157,22 @@ def guess(
     found = _origin_counts(found, arrays)
     found = [one if one.why == "" else _time_unit(one, arrays[one.file, one.name]) if one.role == "time" else one
              for one in found]
-    if units:
-        open_ones = {one for one in found if one.why and one.unit not in UNITS[kind_of(one.role)]}
-        found = [replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
-                 if one in open_ones and (one.role, one.name) in units else one for one in found]
-    return _units_by_numbers(found, arrays)
+    decided = _units_by_numbers(found, arrays)
+    if not units:
+        return decided
+    open_ones = {(one.role, one.name) for one in decided if one.assumed and (one.role, one.name) in units}
+    return _units_by_numbers([replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
+                              if (one.role, one.name) in open_ones else one for one in found], arrays)
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
-    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves."""
+    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves; one that
+    shows its unit for sure counts a little more."""
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:
-            if not one.assumed and one.role != "time":
-                votes.setdefault((one.role, one.name), Counter())[one.unit] += 1
+            if (one.moves or not one.assumed) and one.role != "time":
+                votes.setdefault((one.role, one.name), Counter())[one.unit] += 100 if one.assumed else 101
     return {key: vote.most_common(1)[0][0] for key, vote in votes.items()}
 
 
@@ -357,12 +363,13 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
         if (one := known.get(role)) and one.unit not in UNITS["angle"] and (mine := raw(role)):
             degrees = bool(np.ptp(mine[1]) > 30)
             known[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
-                                  assumed=not degrees)
+                                  assumed=not degrees, moves=bool(np.ptp(mine[1]) > TURNED))
+        axes = [raw(f"{stream}.{axis}") for axis in ("x", "y")]
+        rate = max((float(np.percentile(np.abs(_rate(*one)[1]), 90)) for one in axes if one is not None), default=0.0)
         for axis in ("x", "y"):
-            if (one := known.get(f"{stream}.{axis}")) and one.unit not in UNITS["length"] and (mine := raw(one.role)):
-                fast = bool(np.percentile(np.abs(_rate(*mine)[1]), 90) > TOO_FAST)
-                known[one.role] = replace(one, unit="mm" if fast else "m", why=f"{one.why}; its rate",
-                                          assumed=not fast)
+            if (one := known.get(f"{stream}.{axis}")) and one.unit not in UNITS["length"] and raw(one.role):
+                known[one.role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
+                                          assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW)
         for quantity in ("qx", "qy", "qz", "qw"):
             if one := known.get(f"{stream}.{quantity}"):
                 known[one.role] = replace(one, unit="-")
@@ -393,7 +400,7 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
             largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
             first = next(iter(UNITS[kind_of(one.role)]))
             one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest,
-                          assumed=True)
+                          assumed=True, moves=usual > 0.05)
         settled.append(one)
     return settled
 

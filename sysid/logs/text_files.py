@@ -92,8 +92,12 @@ def read_drives(
                 refused.append(error)
         if not tables:
             continue
-        if source.is_file() or len(tables) > 1 and _each_whole(tables):
-            groups += [(table.stem, [table]) for table in tables]
+        whole = tables if source.is_file() else [table for table in tables if _is_whole(table)]
+        if source.is_file() or len(whole) > max(1, len(tables) / 2):
+            groups += [(table.stem, [table]) for table in whole]
+            refused += [ValueError(f"{files[0].parent / table.stem}: no drive by itself, as most files beside it are: "
+                                   "it lacks an input or a measurement.")
+                        for table in tables if all(table is not one for one in whole)]
         else:
             groups.append((files[0].absolute().parent.name, tables))
     if not groups and refused:
@@ -267,12 +271,9 @@ def _with_whole_stamps(numbers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return numbers
 
 
-def _each_whole(tables: Sequence[Table]) -> bool:
-    """Whether each of several files is a drive of its own: with an input and a measurement."""
-    def streams(table: Table) -> set[str]:
-        return {one.role.partition(".")[0] for one in guess([table])} - {"time"}
-
-    return all(len(streams(table)) > 1 for table in tables)
+def _is_whole(table: Table) -> bool:
+    """Whether a file is a drive of its own: with an input and a measurement."""
+    return len({one.role.partition(".")[0] for one in guess([table])} - {"time"}) > 1
 
 
 def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:

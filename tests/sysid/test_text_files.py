@@ -238,6 +238,18 @@ def foreign(c):
             "y": 1e3 * c["y"], "heading": np.rad2deg(c["yaw"]), "speed": 3.6 * c["v"], "turn": np.rad2deg(c["w"])}
 
 
+def test_one_drive_in_another_unit_does_not_change_the_others(tmp_path):
+    for k in range(4):
+        table = without_units(columns())
+        size = 1e3 if k == 2 else 1.0
+        table |= {name: size * table[name] for name in ("odom_x", "odom_y", "gt_x", "gt_y")}
+        write(tmp_path / "drives" / f"drive_{k}.csv", table)
+    write(tmp_path / "drives" / "pose.csv", {"t": DRIVE.odometry.t, "gt_x": DRIVE.odometry.x, "gt_y": DRIVE.odometry.y})
+    log, notes = convert(ConvertConfig(tmp_path / "drives", tmp_path / "log"))
+    assert [np.ptp(one.odometry.x) for one in log.trials] == pytest.approx(4 * [np.ptp(DRIVE.odometry.x)], abs=0.01)
+    assert any("pose: no drive by itself" in note for note in notes)
+
+
 def test_drives_in_which_a_unit_does_not_show_have_that_of_the_others(tmp_path):
     names = ("random_1", "straight_1", "turn_1")
     for name in names:
