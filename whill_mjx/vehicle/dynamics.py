@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.devices import runs_triton
 from whill_mjx.effects.base import (
     apply_chain,
     contact_wrench,
@@ -18,7 +19,7 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
-from whill_mjx.vehicle.kernel import Roll, held_in_registers, suits_device
+from whill_mjx.vehicle.kernel import Roll, held_in_registers
 from whill_mjx.vehicle.kinematics import (
     body_twist,
     heading,
@@ -116,7 +117,7 @@ def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, comma
     def plain(params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
         return substeps(model, params, state, jnp.broadcast_to(command, (config.substeps, 2)))
 
-    wanted = suits_device() if config.kernel is None else config.kernel
+    wanted = runs_triton() if config.kernel is None else config.kernel
     if config.dynamics != "fused" or not wanted:
         return plain(params, state, command)
     roll = Roll(partial(one_step, model), config.substeps, plain)
