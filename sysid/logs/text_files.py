@@ -344,6 +344,8 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         return "the odometry has only one of v and omega."
     if not inputs and not _has(roles, "odometry", "v", "omega"):
         return "there are neither commands (v, omega) nor wheel speeds."
+    if not commands and not _has(roles, "ground_truth", "x", "y"):
+        return "there are measured speeds, and neither commands nor an outside pose to compare them with."
     if not measured and not (_wheels(roles) and _has(roles, "command", "v", "omega")):
         return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
     if unsure := [one for one in columns if not one.sure]:
