@@ -6,9 +6,10 @@
     python -m benchmarks.reliability --parts ctrl_c               # an hour
 
 Damaged files and mistaken commands are those of the tests, more of them. Kills and Ctrl-C meet the commands as users
-start them, at random moments. A run is lost work where its newest step is older than a minute, different where its
-results are not those of a run left alone, and half written where a file with its final name cannot be read. The run
-left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
+start them, at random moments. A run is lost work where it computed for more than a minute since its newest step,
+different where its results are not those of a run left alone, and half written where a file with its final name cannot
+be read. The run left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
+Both are processor time, which does not depend on what else the computer does.
 
 What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms, commands
 and seeds that it holds, each with its commit, so parts may run side by side on machines of one kind.
@@ -148,12 +149,20 @@ def mistaken_commands() -> Figures:
     return {"option_tracebacks": {**figure([float(len(failed))], "count"), "command_lines": cases}}
 
 
-def started(words: list[str], out: Path) -> subprocess.Popen[str]:
+class Started(subprocess.Popen[str]):
     """A command at work in a folder."""
-    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
-                            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                            env={**os.environ, "PYTHONPATH": path})  # fmt: skip
+
+    def __init__(self, words: list[str], out: Path):
+        path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._said = tempfile.TemporaryFile("w+")
+        super().__init__([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
+                         stdout=subprocess.DEVNULL, stderr=self._said, env={**os.environ, "PYTHONPATH": path})
+
+    def said(self) -> str:
+        """Wait for the end; what it wrote to stderr."""
+        self.wait()
+        self._said.seek(0)
+        return self._said.read()
 
 
 def half_written(out: Path) -> list[Path]:
@@ -181,18 +190,38 @@ def newest(out: Path) -> float:
     return max(times)
 
 
+class Watch:
+    """How long a run computes without saving anything [s of processor time]."""
+
+    def __init__(self, child: Started, out: Path):
+        self._child, self._out = child, out
+        self._saved_at, self._used, self.longest = newest(out), 0.0, 0.0
+
+    def unsaved(self) -> float:
+        """Since the newest step; to be asked often."""
+        with contextlib.suppress(FileNotFoundError, IndexError):  # it has ended
+            words = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
+            used = sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
+            if (saved_at := newest(self._out)) > self._saved_at:
+                self._saved_at, self._used = saved_at, used
+            self.longest = max(self.longest, used - self._used)
+            return used - self._used
+        return 0.0
+
+
 def left_alone(name: str, words: list[str], kept: Kept) -> None:
-    """Keep how long a run takes when nobody ends it [s], the longest time for which it saved nothing, and its bits."""
+    """Keep how long a run takes when nobody ends it [s], for how long it computed without saving, and its bits."""
     out = kept.runs / f"{name}_left"
     shutil.rmtree(out, ignore_errors=True)
-    began, child, longest = time.time(), started(words, out), 0.0
+    began, child = time.time(), Started(words, out)
+    watch = Watch(child, out)
     while child.poll() is None:
         time.sleep(0.2)
-        longest = max(longest, time.time() - max(newest(out), began))
-    said = child.communicate()[1]
+        watch.unsaved()
+    said = child.said()
     if child.returncode:
         raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
-    found = {"words": words, "seconds": round(time.time() - began), "unsaved_s": round(longest, 1),
+    found = {"words": words, "seconds": round(time.time() - began), "unsaved_s": round(watch.longest, 1),
              "bits": digest(name, out), "device": device_name()}  # fmt: skip
     kept.write(f"alone_{name}", found)
     print(f"{name}: {found}", flush=True)
@@ -207,18 +236,21 @@ def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], lon
     """Start a run or go on with it, end it at a random moment within `longest` seconds, and count what went wrong."""
     number = SIGNALS[found["kills"] % len(SIGNALS)]
     chosen = random.Random(f"{found['seed']} {found['kills']} {len(found['bits'])}")
-    child, begun = started(words, out), time.time()
-    try:
-        said = child.communicate(timeout=chosen.uniform(1.0, longest))[1]
-    except subprocess.TimeoutExpired:
-        found["lost"] += time.time() - max(newest(out), begun) > MINUTE
+    child, until = Started(words, out), time.monotonic() + chosen.uniform(1.0, longest)
+    watch = Watch(child, out)
+    while child.poll() is None and time.monotonic() < until:
+        time.sleep(0.2)
+        watch.unsaved()
+    if child.poll() is None:
+        found["lost"] += watch.unsaved() > MINUTE
         child.send_signal(number)
-        said = child.communicate()[1]
+        said = child.said()
         found["kills"] += 1
         found["half_written"] += len(half_written(out))
-        found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
+        if "Traceback" in said or child.returncode not in (-number, 130, 0):
+            found["wrong_ends"].append(f"exit code {child.returncode}: {said[-1000:]}")
     else:
-        settle(name, out, found, child.returncode, said)
+        settle(name, out, found, child.returncode, child.said())
 
 
 def settle(name: str, out: Path, found: dict[str, Any], code: int, said: str) -> None:
@@ -239,14 +271,14 @@ def kill_again_and_again(name: str, words: list[str], kills: int, seed: int, kep
     found, out = kept.read(label), kept.runs / f"{name}_{seed}"
     if found.get("words") != words:
         shutil.rmtree(out, ignore_errors=True)
-        found = {"words": words, "seed": seed, "lost": 0, "half_written": 0, "wrong_ends": 0, "kills": 0, "bits": []}
+        found = {"words": words, "seed": seed, "lost": 0, "half_written": 0, "wrong_ends": [], "kills": 0, "bits": []}
     while found["kills"] < kills:
         kill_once(name, words, out, found, 600.0 / kills + 5.0)
         kept.write(label, found)
         print(f"{name}: {found['kills']} of {kills} kills", flush=True)
     if out.exists() or not found["bits"]:
-        child = started(words, out)
-        said = child.communicate()[1]
+        child = Started(words, out)
+        said = child.said()
         settle(name, out, found, child.returncode, said)
     kept.write(label, {**found, "device": device_name()})
     print(f"{name}: {found}", flush=True)
@@ -259,6 +291,7 @@ def killed_figures(kept: Kept) -> Figures:
     for name, left in alone.items():
         for path in sorted(kept.folder.glob(f"kills_{name}_*.json")):
             one = kept.read(path.stem, any_commit=True)
+            one["wrong_ends"] = len(one["wrong_ends"])
             if one["bits"] and one["words"] == left["words"] and one["commit"] == left["commit"]:
                 runs.append({**one, "name": name, "different": sum(bits != left["bits"] for bits in one["bits"])})
     if not runs:
@@ -270,7 +303,7 @@ def killed_figures(kept: Kept) -> Figures:
     counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in runs))], "count", device), **about}
               for what in ("lost", "different", "half_written", "wrong_ends")}
     unsaved = [found["unsaved_s"] for found in alone.values()]
-    longest = figure(unsaved, "s, longest time in which a run saved nothing, its start included", device)
+    longest = figure(unsaved, "s of processor time that a run computed without saving, at most", device)
     return {**counts, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
 
 
@@ -280,11 +313,11 @@ def interrupted(commands: dict[str, list[str]], count: int, seed: int) -> Figure
     for name, words in commands.items():
         for _ in range(count):
             with tempfile.TemporaryDirectory() as folder:
-                child = started(words, Path(folder) / "run")
+                child = Started(words, Path(folder) / "run")
                 time.sleep(chosen.uniform(0.5, 40.0))
                 began = time.monotonic()
                 child.send_signal(signal.SIGINT)
-                said = child.communicate()[1]
+                said = child.said()
                 seconds.append(time.monotonic() - began)
                 wrong += child.returncode != 130 or "Traceback" in said
                 print(f"{name}: {seconds[-1]:.2f} s, exit code {child.returncode}", flush=True)
