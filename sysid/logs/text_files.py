@@ -218,7 +218,8 @@ def _without_preamble(path: Path, data: list[tuple[int, str]], split: str | None
     if not 0 < first <= PREAMBLE:
         return data
     names, row = _cells(data[first - 1][1], split), _cells(data[first][1], split)
-    if len(names) > 1 and all(names) and _is_numbers(row) and not any(map(_is_numbers, ([one] for one in names))):
+    texts = all(names) and not any(_is_numbers([one]) for one in names)
+    if texts and _is_numbers(row) and 1 < len(names) and usual <= 2 * len(names):
         if not any(row[len(names) :]) and len(row) > len(names):
             return data[first - 1 :]
         cause = " Are there decimal commas in it? Write decimals with a point, or part the cells by semicolons." if (
@@ -273,7 +274,8 @@ def _with_whole_stamps(numbers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _is_whole(table: Table) -> bool:
     """Whether a file is a drive of its own: with an input and a measurement."""
-    return len({one.role.partition(".")[0] for one in guess([table])} - {"time"}) > 1
+    streams = {one.role.partition(".")[0] for one in guess([table])} - {"time"}
+    return len(streams) > 1 and bool(streams & {"command", "ground_truth"})
 
 
 def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
@@ -456,7 +458,7 @@ def _check_clock(file: str, t: np.ndarray) -> list[str]:
     """Notes on a stream's time (T,), or a refusal where it goes back by more than rows out of order do: sorted, it
     would mix two moments."""
     steps = np.diff(t)
-    if (steps <= 0).all():
+    if (steps < 0).sum() > len(steps) / 2:
         return [f"{file}: its newest row comes first; its rows are turned round"]
     least = max(BACK[0] * float(np.median(np.abs(steps))), BACK[1])
     if len(back := np.flatnonzero(steps < -least)):
