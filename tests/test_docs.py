@@ -54,6 +54,16 @@ def test_links_between_pages_lead_somewhere(page):
             assert anchor in anchors(linked.read_text()), f"{page.name}: {target} has no such heading."
 
 
+@pytest.mark.parametrize("page", ["reliability.md", "reliability_files.md"])
+def test_every_promise_names_tests_that_exist(page):
+    files = {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+    tests = set(re.findall(r"^def test_(\w+)", "\n".join(files.values()), re.MULTILINE))
+    text = (ROOT / "docs" / page).read_text()
+    named = set(re.findall(r"`(?:test_)?([a-z]+(?:_[a-z0-9]+){4,})`", text))
+    assert len(named) > 10 and not named - tests
+    assert not set(re.findall(r"`(?:[\w/]+/)?(test_\w+\.py)`", text)) - set(files)
+
+
 def test_pages_identify_and_report_instead_of_telling():
     count = sum(len(re.findall(r"\b(?:tell|tells|told|telling)\b", page.read_text(), re.IGNORECASE)) for page in PAGES)
     assert count <= 10
