@@ -33,4 +33,5 @@ def draw(
 
     position, rotation, intrinsics, scene = jax.lax.stop_gradient((position, rotation, intrinsics, scene))
     arguments = position, rotation, intrinsics, scene, height, width, quality
-    return jax.lax.platform_dependent(cuda=partial(render_pallas, *arguments), default=partial(render, *arguments))
+    kernel = partial(render_pallas, *arguments)
+    return jax.lax.platform_dependent(cuda=kernel, default=partial(render, *arguments))

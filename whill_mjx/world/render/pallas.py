@@ -118,13 +118,14 @@ def render_pallas(
     Args:
         position, rotation, intrinsics, scene, height, width, quality: as `render`; `quality.keep` has no meaning here,
             for nothing is left out.
-        tiling: how the image is cut.
+        tiling: how the image is cut; None takes larger tiles for plain looks, and for rich ones a pixel per thread, whose
+            many numbers then fit into its registers.
         interpret: run on any device, slowly, to test.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
-    tiling = tiling or Tiling()
+    tiling = tiling or (Tiling() if scene.rich is None else Tiling(8, 4))
     inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
     static = _static(scene, tiling, interpret)
