@@ -31,7 +31,7 @@ def assert_equal(a, b):
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    return train(ENV, CONFIG, tmp_path_factory.mktemp("learned"), 1200, 0, dataclasses.replace(QUIET, log_every_s=1.0))
+    return train(ENV, CONFIG, tmp_path_factory.mktemp("learned"), 600, 0, dataclasses.replace(QUIET, log_every_s=1.0))
 
 
 @pytest.fixture(scope="module")

@@ -99,8 +99,8 @@ def test_episodes_of_the_host_arrive_whole_and_begin_anew():
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gym")
-    train(from_gym(Corridor, 4), CONFIG, folder / "run", 400, 0, QUIET)
-    return folder, train(from_gym(Corridor, 4), CONFIG, folder / "run", 1000, 0, QUIET)  # resumed with new instances
+    train(from_gym(Corridor, 4), CONFIG, folder / "run", 300, 0, QUIET)
+    return folder, train(from_gym(Corridor, 4), CONFIG, folder / "run", 500, 0, QUIET)  # resumed with new instances
 
 
 def test_an_environment_of_the_host_is_learned_also_across_a_resume(learned):

@@ -180,7 +180,7 @@ def test_imagined_classes_are_one_hot_and_the_model_gets_no_gradient_of_the_acto
 def learned(tmp_path_factory):
     config = tiny_config(lr=1e-3, train_ratio=64.0)
     quiet = TrainingOptions(progress=False, log_every_s=1.0, checkpoint_every_s=1e9)
-    return config, train(choice_env(4), config, tmp_path_factory.mktemp("choice"), 1200, 0, quiet)
+    return config, train(choice_env(4), config, tmp_path_factory.mktemp("choice"), 600, 0, quiet)
 
 
 def test_a_corridor_with_classes_and_three_senses_is_learned_to_its_best_return(learned):
