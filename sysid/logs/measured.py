@@ -29,7 +29,9 @@ from sysid.logs.log import hash_files, load_log
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
+from sysid.logs.standing import without_standing
 from sysid.logs.streams import without_held
+from sysid.logs.windows import in_windows
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
@@ -55,6 +57,9 @@ HELD = 1e-9
 """Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
+START_SPAN = 0.15
+"""Time before and after the start of an MRCLAM window [s] over which the speeds there are measured: its robots follow
+their commands later than that."""
 MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
 
 
@@ -391,7 +396,7 @@ def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
 def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
     command = _read_gz(folder, robot, "Odometry", 3)
     truth = _read_gz(folder, robot, "Groundtruth", 4)
-    yaw = np.unwrap(truth[:, 3])
+    path = np.column_stack([truth[:, :3], np.unwrap(truth[:, 3])])
     begin, end = max(command[0, 0], truth[0, 0]), min(command[-1, 0], truth[-1, 0])
     trials = []
     for number, start_time in enumerate(np.arange(begin, end - window, window)):
@@ -407,14 +412,20 @@ def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial],
         keep = np.append(np.diff(t) > 0, True)
         if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
             continue
-        pose = only_changes(truth[inside, 0] - t0, truth[inside, 1], truth[inside, 2], yaw[inside])
-        trials.append(Trial(
-            f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
-            thin(pose, MRCLAM_SPACING),
-            Start(float(truth[first, 1]), float(truth[first, 2]), float(yaw[first]), float(v[0]), float(omega[0]),
-                  measured=True),
-            group=f"robot{robot}"))
-    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are the commands in force"
+        pose = only_changes(path[inside, 0] - t0, *path[inside, 1:].T)
+        start = Start(*path[first, 1:].tolist(), *_speeds(path, t0), measured=True)
+        trials.append(Trial(f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
+                            thin(pose, MRCLAM_SPACING), start, group=f"robot{robot}"))
+    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are those of the outside pose"
+
+
+def _speeds(path: np.ndarray, at: float) -> tuple[float, float]:
+    """Speed [m/s] and yaw rate [rad/s] of a path (T, 4) of time, x, y and yaw around a time: its slopes."""
+    near = path[np.abs(path[:, 0] - at) <= START_SPAN]
+    t = near[:, 0] - near[:, 0].mean()
+    vx, vy, omega = t @ near[:, 1:] / max(float(t @ t), HELD)
+    yaw = near[:, 3].mean()
+    return float(vx * np.cos(yaw) + vy * np.sin(yaw)), float(omega)
 
 
 def thin(pose: PoseStream, spacing: float) -> PoseStream:
@@ -491,7 +502,7 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
         log: Log = with_own_timeout(_without_held(load_log(path)))
-        return split(log, train, held_out) if train else log
+        return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
                          + ("warthog_sand_1" if form == "drive_norlab" else "robot1 robot2 robot3")
