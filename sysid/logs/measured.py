@@ -413,19 +413,19 @@ def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial],
         if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
             continue
         pose = only_changes(path[inside, 0] - t0, *path[inside, 1:].T)
-        start = Start(*path[first, 1:].tolist(), *_speeds(path, t0), measured=True)
+        start = replace(_speeds(path, t0), x=float(path[first, 1]), y=float(path[first, 2]), yaw=float(path[first, 3]))
         trials.append(Trial(f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
                             thin(pose, MRCLAM_SPACING), start, group=f"robot{robot}"))
     return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are those of the outside pose"
 
 
-def _speeds(path: np.ndarray, at: float) -> tuple[float, float]:
-    """Speed [m/s] and yaw rate [rad/s] of a path (T, 4) of time, x, y and yaw around a time: its slopes."""
+def _speeds(path: np.ndarray, at: float) -> Start:
+    """A start with the speeds that a path (T, 4) of time, x, y and yaw shows around a time: its slopes."""
     near = path[np.abs(path[:, 0] - at) <= START_SPAN]
     t = near[:, 0] - near[:, 0].mean()
     vx, vy, omega = t @ near[:, 1:] / max(float(t @ t), HELD)
     yaw = near[:, 3].mean()
-    return float(vx * np.cos(yaw) + vy * np.sin(yaw)), float(omega)
+    return Start(v=float(vx * np.cos(yaw) + vy * np.sin(yaw)), omega=float(omega), measured=True)
 
 
 def thin(pose: PoseStream, spacing: float) -> PoseStream:

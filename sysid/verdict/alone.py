@@ -52,7 +52,7 @@ def search_alone(
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
     against, unseen = "what stands out in a linear scan does not hold in a refit", ""
-    for _ in range(thresholds.rounds):
+    while len(found.accepted) < thresholds.rounds and len(found.rounds) < 2 * thresholds.rounds:
         candidates = candidates_of(asked, found, found.final, far)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
