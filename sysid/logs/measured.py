@@ -1,8 +1,8 @@
 """Loaders of two published measured datasets, in their original form, into the same in-memory log.
 
 `drive_norlab`: commanded wheel speeds against lidar ICP motion of skid-steered robots (Baril et al., "DRIVE", ICRA
-2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping,
-Dataset 6 (Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
+2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping
+(Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
 
 Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
 both systems repeat the last value between updates.
@@ -33,12 +33,13 @@ from sysid.logs.standing import without_standing
 from sysid.logs.streams import without_held
 from sysid.logs.windows import in_windows
 from whill_mjx.io.fields import counted, shown
-from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
+from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, csv_rows, read_arrays, read_gzip, read_text
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
 DRIVE_ROWS = 40  # samples of one window (2 s)
 DRIVE_COLUMNS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
+TERRAINS = ("asphalt", "grass", "gravel", "ice", "mud", "sand", "snow", "tile")
 MAX_NANOSECONDS = 86_400 * 10**9
 CONTINUOUS_COLUMNS = (
     *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
@@ -70,11 +71,16 @@ def detect_format(path: str | Path) -> str:
         raise (ValueError if path.exists() else FileNotFoundError)(f"{path}: {about(path)}")
     if (path / "dataset.toml").exists() or (path / "trials").exists():
         return "dataset"
-    if any(path.glob("MRCLAM_*_Odometry.dat.gz")):
+    if mrclam_files(path, "[1-5]", "Odometry"):
         return "mrclam"
     if any(path.glob("*.npz")) and not (path / "report.json").exists():  # a fit keeps its series so
         return "drive_norlab"
     raise ValueError(f"{path}: {about(path)}")
+
+
+def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
+    """Files of MRCLAM robots in a folder: as in its archives, or with the data set in front, packed or not."""
+    return sorted(path for end in ("", ".gz") for path in folder.glob(f"*Robot{robot}_{kind}.dat{end}"))
 
 
 def is_known(path: Path) -> bool:
@@ -93,10 +99,7 @@ def drive_spec(run: str) -> VehicleSpec:
 
 def drive_group(run: str) -> str:
     """Terrain of a run: warthog_sand_1 -> sand; the run's own name where the terrain is not stated."""
-    for terrain in ("asphalt", "gravel", "sand", "grass"):
-        if terrain in run:
-            return terrain
-    return run
+    return next((word for word in run.split("_") if word in TERRAINS), run)
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
@@ -394,8 +397,8 @@ def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
 
 
 def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
-    command = _read_gz(folder, robot, "Odometry", 3)
-    truth = _read_gz(folder, robot, "Groundtruth", 4)
+    command = _read_table(folder, robot, "Odometry", 3)
+    truth = _read_table(folder, robot, "Groundtruth", 4)
     path = np.column_stack([truth[:, :3], np.unwrap(truth[:, 3])])
     begin, end = max(command[0, 0], truth[0, 0]), min(command[-1, 0], truth[-1, 0])
     trials = []
@@ -438,10 +441,15 @@ def thin(pose: PoseStream, spacing: float) -> PoseStream:
     return PoseStream(pose.t[keep], pose.x[keep], pose.y[keep], pose.yaw[keep])
 
 
-def _read_gz(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
-    path = folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz"
-    text = read_gzip(path, "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam and "
-                           "compress them with gzip.", ORIGINAL)
+def _read_table(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
+    """The table (T, columns) of a robot as published, packed or not, whatever the number of the data set."""
+    found = mrclam_files(folder, str(robot), kind)
+    path = found[0] if found else folder / f"Robot{robot}_{kind}.dat"
+    if len(found) > 1:
+        raise ValueError(f"{path}: there is another one, {found[1].name}. Give a folder with one data set.")
+    missing = "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam."
+    packed = path.suffix == ".gz"
+    text = read_gzip(path, missing, ORIGINAL) if packed else read_text(path, ARRAY_BYTES, missing)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused below

@@ -148,6 +148,20 @@ def test_mrclam_windows_intersect_commands_and_truth_and_start_at_the_command_in
     assert trial.command.t[0] == 0.0 and np.diff(trial.ground_truth.t).min() > 0.09
 
 
+def test_mrclam_files_are_read_as_they_are_published_whatever_the_data_set(tmp_path):
+    write_mrclam(tmp_path)
+    expected = load_mrclam(tmp_path, (1,)).trials[1].ground_truth.x
+    for path in list(tmp_path.iterdir()):
+        kind = path.name.removesuffix(".dat.gz").rpartition("_")[2]
+        (tmp_path / f"Robot1_{kind}.dat").write_bytes(gzip.decompress(path.read_bytes()))
+    with pytest.raises(ValueError, match="there is another one"):
+        load_mrclam(tmp_path, (1,))
+    for path in tmp_path.glob("*.gz"):
+        path.unlink()
+    assert detect_format(tmp_path) == "mrclam"
+    np.testing.assert_array_equal(load_mrclam(tmp_path, (1,)).trials[1].ground_truth.x, expected)
+
+
 def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
     with pytest.raises(ValueError, match="no dataset.toml"):
         detect_format(tmp_path)
