@@ -167,32 +167,13 @@ def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) ->
 
 def _drive_windows(path: Path, run: str, chained: bool
                    ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
-    missing = {"data", "columns"} - set(arrays)
-    if missing:
-        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
-    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
-    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
-        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
-                         f"of the {len(columns)} names in `columns`. {CONVERT}")
-    index = {name: i for i, name in enumerate(columns)}
-
-    def block(name: str) -> np.ndarray:
-        try:
-            return data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
-        except KeyError as error:
-            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
-
+    blocks = _drive_blocks(path)
     spec = drive_spec(run)
-    command_v, command_omega = twist_from_wheels(spec, block("cmd_left"), block("cmd_right"))
-    wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
-    x, y, yaw = in_first_frame(block("icp_x"), block("icp_y"), block("icp_yaw"))
-    gyro = block("imu_yaw")
-    for name in DRIVE_COLUMNS:
-        if not (np.abs(block(name)) < LARGEST).all():
-            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
-                             "incomplete windows.")
-    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(len(data))])
+    command_v, command_omega = twist_from_wheels(spec, blocks["cmd_left"], blocks["cmd_right"])
+    wheel_v, wheel_omega = twist_from_wheels(spec, blocks["left_wheel_vel"], blocks["right_wheel_vel"])
+    x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
+    gyro, count = blocks["imu_yaw"], len(x)
+    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
     gyro *= sign or 1.0
     joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
     length = DRIVE_STEP_ROWS if chained else 1
@@ -200,7 +181,7 @@ def _drive_windows(path: Path, run: str, chained: bool
     trials: list[Trial] = []
     missed: list[tuple[float, float]] = []
     rates = {}
-    for row in range(0, len(data) - length + 1, length):
+    for row in range(0, count - length + 1, length):
         rows = slice(row, row + length)
         step, window = divmod(row, DRIVE_STEP_ROWS)
         name = f"{run}/{step:03d}.{window}"
@@ -228,13 +209,39 @@ def _drive_windows(path: Path, run: str, chained: bool
     if sign != 1.0:
         note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
                  ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
-    if chained:
-        likely, way = np.array(missed or [(0.0, 0.0)]).T
-        late = way[likely > 0.5] if (likely > 0.5).any() else np.zeros(1)
-        note += (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an "
-                 f"ICP update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), "
-                 f"{late.max():.2f} m at most")
-    return trials, note, rates
+    return trials, note + (_said_missed(missed) if chained else ""), rates
+
+
+def _drive_blocks(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a DRIVE file that are used, each (N, 40) of N windows, checked."""
+    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
+    missing = {"data", "columns"} - set(arrays)
+    if missing:
+        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
+    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
+    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
+        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
+                         f"of the {len(columns)} names in `columns`. {CONVERT}")
+    index = {name: i for i, name in enumerate(columns)}
+    blocks = {}
+    for name in DRIVE_COLUMNS:
+        try:
+            blocks[name] = data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
+        except KeyError as error:
+            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
+        if not (np.abs(blocks[name]) < LARGEST).all():
+            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
+                             "incomplete windows.")
+    return blocks
+
+
+def _said_missed(missed: list[tuple[float, float]]) -> str:
+    """How often a joint lost an update of the pose, and how much: of each joint its probability and the way [m]."""
+    likely, way = np.array(missed or [(0.0, 0.0)]).T
+    late = way[likely > BREAK] if (likely > BREAK).any() else np.zeros(1)
+    return (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an ICP "
+            f"update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), {late.max():.2f} m "
+            "at most")
 
 
 def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
