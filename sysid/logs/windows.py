@@ -27,6 +27,8 @@ TINY = 1e-9
 def in_windows(log: Log) -> Log:
     """The log with its long drives in windows, and a note where there are any. Drives that are repeated stay whole:
     they show the noise."""
+    if all(trial.duration < LONG for trial in log.trials):
+        return log
     again = {log.trials[i].name for group in same_course(log.trials) if len(group) > 1 for i in group}
     trials: list[Trial] = []
     notes = list(log.notes)
@@ -38,7 +40,7 @@ def in_windows(log: Log) -> Log:
         trials += parts
         notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of {WINDOW:g} s, "
                      "each from where it was measured to be")
-    return log if len(trials) == len(log.trials) else replace(log, trials=tuple(trials), notes=tuple(notes))
+    return replace(log, trials=tuple(trials), notes=tuple(notes))
 
 
 def windows_of(trial: Trial) -> list[Trial]:

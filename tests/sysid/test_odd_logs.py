@@ -66,7 +66,7 @@ def test_the_start_of_a_window_is_a_line_through_noisy_poses():
 
 def test_a_long_drive_that_is_repeated_stays_whole():
     log = log_of(drive("a_1", seconds=130.0), drive("a_2", seconds=130.0))
-    assert in_windows(log) is log
+    assert in_windows(log) == log
 
 
 def test_a_trial_in_which_the_vehicle_stands_is_left_out_and_a_dead_zone_is_not():
