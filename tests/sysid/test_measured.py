@@ -130,17 +130,17 @@ def test_a_staircase_is_reduced_to_its_steps_and_yaw_is_unwrapped():
     np.testing.assert_allclose(pose.yaw, [2 * np.pi - 3.1])
 
 
-def write_mrclam(folder, robot=1):
+def write_mrclam(folder, robot=1, commanded=0.08):
     time = 1248444175.0 + np.arange(0.0, 40.0, 0.05)
-    command = np.column_stack([time, np.full_like(time, 0.08), np.zeros_like(time)])
+    command = np.column_stack([time, np.full_like(time, commanded), np.zeros_like(time)])
     truth = np.column_stack([time + 3.0, 0.08 * (time - time[0]), np.zeros_like(time), np.zeros_like(time)])
     for kind, table in (("Odometry", command), ("Groundtruth", truth)):
         with gzip.open(folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz", "wt") as file:
             np.savetxt(file, table, header="as published")
 
 
-def test_mrclam_windows_intersect_commands_and_truth_and_start_at_the_command_in_force(tmp_path):
-    write_mrclam(tmp_path)
+def test_mrclam_windows_intersect_commands_and_truth_and_start_as_fast_as_the_pose_shows(tmp_path):
+    write_mrclam(tmp_path, commanded=0.1)
     log = load_mrclam(tmp_path, (1,))
     assert log.spec == CREATE and len(log.trials) == 2
     trial = log.trials[1]
