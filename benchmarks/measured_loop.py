@@ -465,8 +465,8 @@ def is_false(loop: dict[str, Any], fastest: float) -> bool:
     """Whether a verdict on a nearly ideal robot, whose fastest command is so many m/s, names what it cannot have."""
     for one in loop["effects"]:
         sizes = {name.partition(".")[2]: abs(value[0]) for name, value in one["parameters"].items()}
-        if one["name"] in TIMES:
-            wrong = max(sizes.values()) > LONGEST
+        if one["name"] in TIMES:  # a cascade is a share
+            wrong = max(size for name, size in sizes.items() if name != "cascade") > LONGEST
         elif one["name"] in SCALES:
             wrong = max(min(size, abs(size - 1)) for size in sizes.values()) > LARGEST
         elif one["name"] in DEAD:
