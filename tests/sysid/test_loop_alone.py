@@ -113,6 +113,8 @@ def test_what_stands_beside_an_effect_without_a_name_has_one():
     ([(9.0, 11.0, 10.0), (8.0, 11.0, 10.0), (2.0, 2.0, 2.0)], "command_delay"),  # as good, and simpler
     ([(9.0, 11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "acceleration_limit"),  # surely better
     ([(9.0, -11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "command_delay"),  # wrong about a block
+    ([(2.0, 3.0, 4.0), (2.0, 2.0, 1.0), (900.0, 1100.0, 1000.0)], "slope"),  # which explains 20 in all
+    ([(19.0, 20.0, 21.0), (2.0, 2.0, 1.0), (900.0, 1100.0, 1000.0)], "acceleration_limit"),
 ])
 def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(monkeypatch, gains, result):
     def candidate(effect, axes, gain):
@@ -139,13 +141,6 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
     found = search_alone(evidence, EFFECTS, linear, asked.wander, asked.thresholds)
     assert named(found) == ("named", [result])
     assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
-
-
-@pytest.mark.parametrize(("gains", "expected"), [
-    ((900.0, 1100.0), (9.0, 11.0)), ((4.0, 6.0), (4.0, 6.0)), ((30.0, -80.0), (30.0, -80.0))])
-def test_a_prediction_counts_as_much_as_the_refit_gains_at_most(monkeypatch, gains, expected):
-    monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(gains))
-    np.testing.assert_allclose(alone.predicted(None, SimpleNamespace(refit=None, gain=20.0)), expected)
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():
