@@ -17,8 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
 from sysid.missing.catalogue import Hypothesis
@@ -27,7 +25,7 @@ from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import LARGEST, Candidate, Search, Thresholds, missing
+from sysid.verdict.found import LARGEST, Search, Thresholds, missing
 from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
@@ -56,7 +54,7 @@ def search_alone(
     against, unseen = "what stands out in a linear scan does not hold in a refit", ""
     while len(found.accepted) < thresholds.rounds and len(found.rounds) < 2 * thresholds.rounds:
         candidates = candidates_of(asked, found, found.final, far)
-        likely = [(one, predicted(asked, one)) for one in candidates if one.p < thresholds.alpha]
+        likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
         if not standing:
             if likely:
@@ -85,15 +83,6 @@ def search_alone(
     if unseen or missing(found.p_value, 1.0, thresholds):
         found.verdict = "unexplained"
     return _said(asked, found, told or against)
-
-
-def predicted(asked: Asked, one: Candidate) -> np.ndarray:
-    """(G,) what a candidate gains in each block, fitted to the others; all of it at most what its refit gains.
-
-    Predictions are linear. Without an effect whose base parameters moved far they promise many times what is there.
-    """
-    gains = held_back(asked, one.refit)
-    return np.asarray(gains * min(1.0, one.gain / max(float(gains.sum()), 1e-9)) if gains.sum() > 0 else gains)
 
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:

@@ -113,8 +113,6 @@ def test_what_stands_beside_an_effect_without_a_name_has_one():
     ([(9.0, 11.0, 10.0), (8.0, 11.0, 10.0), (2.0, 2.0, 2.0)], "command_delay"),  # as good, and simpler
     ([(9.0, 11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "acceleration_limit"),  # surely better
     ([(9.0, -11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "command_delay"),  # wrong about a block
-    ([(2.0, 3.0, 4.0), (2.0, 2.0, 1.0), (900.0, 1100.0, 1000.0)], "slope"),  # which explains 20 in all
-    ([(19.0, 20.0, 21.0), (2.0, 2.0, 1.0), (900.0, 1100.0, 1000.0)], "acceleration_limit"),
 ])
 def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(monkeypatch, gains, result):
     def candidate(effect, axes, gain):
