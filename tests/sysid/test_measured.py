@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import shared_folder
 
+from sysid.close_loop import Arguments, load
 from sysid.logs.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
 from whill_mjx.vehicle.specs import CREATE, WARTHOG
 
@@ -180,6 +182,20 @@ def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
     assert detect_format(tmp_path) == "mrclam"
     with pytest.raises(FileNotFoundError, match="Robot2_Odometry"):
         load_mrclam(tmp_path, (2,))
+
+
+def test_the_loop_takes_parts_of_a_measured_set_and_its_reference_another(tmp_path):
+    for run in ("warthog_sand_1", "warthog_gravel"):
+        write_drive(tmp_path / f"{run}.npz", rows=9)
+    given = Arguments(dataset=tmp_path, train=("warthog_sand_1:0-0.6",), held_out=("warthog_sand_1:0.6-1",),
+                      reference=(tmp_path,), reference_train=("warthog_gravel",))
+    log, [reference], _ = load(given)
+    assert (len(log.training), len(log.held_out), len(reference.training)) == (6, 3, 9)
+    assert {trial.group for trial in reference.trials} == {"gravel"}
+    with pytest.raises(ValueError, match="the drives in question themselves"):
+        load(replace(given, reference_train=("warthog_sand_1",)))
+    with pytest.raises(ValueError, match="Give --train"):
+        load(Arguments(dataset=tmp_path))
 
 
 def test_selections_split_a_run_by_share_and_must_be_disjoint(tmp_path):
