@@ -10,9 +10,9 @@ each law of skid-steered robots adds to the base, named or not. `peers` (`measur
 what models of the commands that know nothing of the vehicle predict of the same steps. `change`: the vehicle of the
 asphalt run is the reference, gravel and both sand runs are asked whether the floor is another one. Each third of a run
 is then predicted by the reference vehicle with what changed fitted to the other two, and by that vehicle itself.
-`floors` asks the same of gyro and wheels without a model, and of halves of one run how often that is false. `mrclam`
-(five nearly ideal robots): verdicts with the base model's delay held at 0; one with an effect of another class, or
-larger than such a robot has, is false.
+`floors` asks the same of gyro and wheels without a model, and of halves of one run how often that is false. `halves`
+asks the whole loop that of the asphalt run. `mrclam` (five nearly ideal robots): verdicts with the base model's delay
+held at 0; one with an effect of another class, or larger than such a robot has, is false.
 
 Writes benchmarks/results/measured.json. Every loop is kept as a file under `out`, and an interrupted run goes on there.
 """
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -66,7 +66,7 @@ RUNS = ("warthog_asphalt_a", "warthog_gravel", "warthog_sand_1", "warthog_sand_2
 TRAIN = {"asphalt": "warthog_asphalt_a:0-0.667", "gravel": "warthog_gravel:0-0.667", "sand": "warthog_sand_1"}
 HELD_OUT = {"asphalt": "warthog_asphalt_a:0.667-1", "gravel": "warthog_gravel:0.667-1", "sand": "warthog_sand_2"}
 OTHER_RUNS = ("warthog_2023", "husky_steps_000_133")
-ROBOTS = (1, 2, 3, 4, 5)
+TENTHS = 10
 BLOCK = 5  # steps that follow one another and are drawn together
 DRAWS = 4000
 MANY = 10**6  # steps: all
@@ -84,14 +84,18 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/measured."""
-    parts: tuple[Literal["ladder", "laws", "peers", "floors", "change", "mrclam"], ...] = (
-        "ladder", "laws", "peers", "floors", "change", "mrclam")
+    parts: tuple[Literal["ladder", "laws", "peers", "floors", "halves", "change", "mrclam"], ...] = (
+        "ladder", "laws", "peers", "floors", "halves", "change", "mrclam")
     out: Path = Path("runs/measured_loop")
     """Folder that keeps each loop."""
     windows: Annotated[int, COUNT] = 96
     """Training steps of drive_norlab, spread evenly over each terrain; all held-out ones are scored."""
-    robot_windows: Annotated[int, COUNT] = 16
-    """Windows of 15 s of each robot of mrclam."""
+    robots: tuple[Literal[1, 2, 3, 4, 5], ...] = (1, 2, 3, 4, 5)
+    """Robots of mrclam."""
+    robot_windows: Annotated[int, COUNT] = MANY
+    """Windows of 15 s of each of them."""
+    cuts: tuple[int, ...] = tuple(range(TENTHS))
+    """Cuts of the asphalt run into halves: each begins at one of its tenths."""
     rounds: Annotated[int, COUNT] = 3
     """Loops at most, one after the other."""
     floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "acceleration_limit", "pose_delay")
@@ -331,16 +335,39 @@ def floors(settings: Benchmark) -> None:
     figures["floor_named"] = figure([float(sum(named))], f"of {len(named)} runs")
     false = {run: 0 for run in sums}
     for run, each in sums.items():
-        for cut in range(10):
-            second = (10 * np.arange(len(each)) // len(each) - cut) % 10 >= 5
-            first, other = (in_blocks([one for one, inside in zip(each, second == side, strict=True) if inside])
-                            for side in (False, True))
+        for cut in range(TENTHS):
+            first, other = (in_blocks(half) for half in cut_at(each, cut))
             false[run] += between(first, other, alpha).named
     print(f"halves of one run taken for two floors, of 10: {false}", flush=True)
     figures["floor_false_asphalt"] = figure([float(false[RUNS[0]])], "of 10 halves of the asphalt run")
     figures["floor_false"] = figure([float(sum(false.values()))], f"of {10 * len(false)} halves of {len(false)} runs")
     show(figures)
     record("measured", CLAIM, figures, replacing="floor_")
+
+
+def cut_at(drives: Sequence[Any], cut: int) -> tuple[list[Any], list[Any]]:
+    """Two halves of a run, five consecutive tenths each, the first from tenth `cut` on, the last followed by the
+    first."""
+    second = (TENTHS * np.arange(len(drives)) // len(drives) - cut) % TENTHS >= TENTHS // 2
+    return ([one for one, inside in zip(drives, second, strict=True) if not inside],
+            [one for one, inside in zip(drives, second, strict=True) if inside])
+
+
+def halves(settings: Benchmark) -> None:
+    """What the whole loop names in one half of the asphalt run against the other, of which nothing differs."""
+    log = run_log(replace(settings, windows=MANY), RUNS[0])
+    loops = []
+    for cut in settings.cuts:
+        first, other = (replace(log, trials=tuple(half)) for half in cut_at(log.trials, cut))
+        given = {"references": (first,), "start": floor_start(settings, first)}
+        loops.append(one_loop(settings, f"half_{cut}", other, change_config(settings), False, **given))
+    report(loops)
+    named = [loop["verdict"] == "named" or bool(loop["floor"] and loop["floor"]["name"]) for loop in loops]
+    figures = {"half_false": figure([float(sum(named))], f"of {len(named)} halves of the asphalt run"),
+               "half_unexplained": figure([float(sum(loop["verdict"] == "unexplained" for loop in loops))],
+                                          f"of {len(named)} halves of the asphalt run")}
+    show(figures)
+    record("measured", CLAIM, figures)
 
 
 def between(theirs: Measured | None, mine: Measured | None, alpha: float) -> FloorChange:
@@ -438,8 +465,8 @@ def is_false(loop: dict[str, Any], fastest: float) -> bool:
     """Whether a verdict on a nearly ideal robot, whose fastest command is so many m/s, names what it cannot have."""
     for one in loop["effects"]:
         sizes = {name.partition(".")[2]: abs(value[0]) for name, value in one["parameters"].items()}
-        if one["name"] in TIMES:
-            wrong = max(sizes.values()) > LONGEST
+        if one["name"] in TIMES:  # a cascade is a share
+            wrong = max(size for name, size in sizes.items() if name != "cascade") > LONGEST
         elif one["name"] in SCALES:
             wrong = max(min(size, abs(size - 1)) for size in sizes.values()) > LARGEST
         elif one["name"] in DEAD:
@@ -454,7 +481,7 @@ def is_false(loop: dict[str, Any], fastest: float) -> bool:
 def mrclam(settings: Benchmark) -> None:
     """Verdicts on five nearly ideal robots: the question is what the model family, without its delay, lacks."""
     false, delays = [], []
-    for robot in ROBOTS:
+    for robot in settings.robots:
         log = load_mrclam(settings.shared / "data" / "measured" / "mrclam", (robot,))
         log = split(log, (f"robot{robot}:0-0.667",), (f"robot{robot}:0.667-1",))
         fastest = max(float(np.abs(trial.command.v).max()) for trial in log.trials)
@@ -465,8 +492,8 @@ def mrclam(settings: Benchmark) -> None:
         report([loop])
         false.append(float(is_false(loop, fastest)))
         delays.append(float(any(TIMES & {one["name"], *one["class"]} for one in loop["effects"])))
-    figures = {"mrclam_false": figure([sum(false)], f"of {len(ROBOTS)} robots"),
-               "mrclam_delay_found": figure([sum(delays)], f"of {len(ROBOTS)} robots")}
+    figures = {"mrclam_false": figure([sum(false)], f"of {len(settings.robots)} robots"),
+               "mrclam_delay_found": figure([sum(delays)], f"of {len(settings.robots)} robots")}
     show(figures)
     record("measured", CLAIM, figures)
 
@@ -483,7 +510,8 @@ def report(loops: list[dict[str, Any]]) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"ladder": ladder, "laws": laws, "peers": peers, "floors": floors, "change": change, "mrclam": mrclam}
+    parts = {"ladder": ladder, "laws": laws, "peers": peers, "floors": floors, "halves": halves,
+             "change": change, "mrclam": mrclam}
     for name in settings.parts:
         part, folder = parts[name], "mrclam" if name == "mrclam" else "drive_norlab"
         if not (settings.shared / "data" / "measured" / folder).is_dir():

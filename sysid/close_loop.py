@@ -48,6 +48,14 @@ class Arguments:
     """Folder with the drives in question."""
     reference: tuple[Path, ...] = ()
     """Folders with drives of the same vehicle on other days."""
+    train: tuple[str, ...] = ()
+    """Trials in question of a measured set: RUN, GROUP or RUN:FROM-TO, e.g. warthog_gravel or robot1:0-0.667."""
+    held_out: tuple[str, ...] = ()
+    """Trials of a measured set that are opened after the verdict, in the same form."""
+    reference_train: tuple[str, ...] = ()
+    """Trials of a reference that is a measured set, in the same form."""
+    chained: bool = False
+    """DRIVE: 6 s steps, chained from 2 s windows, instead of the windows."""
     vehicle: Path | None = None
     """Vehicle file fitted before, kept as it is. With a reference too, the fit to these drives starts at it."""
     out: Path = Path("runs/close_loop")
@@ -73,7 +81,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         config = LoopConfig(quick=arguments.quick, seed=arguments.seed, iterations=arguments.iterations,
                             without=arguments.without, refit_nulls=arguments.refit_nulls)
     chosen = {"data": log.sha256, "references": [one.sha256 for one in references],
-              "vehicle": file_label(arguments.vehicle), **settings_of(config, ("thresholds",))}
+              "train": [one.name for one in log.training], "held_out": [one.name for one in log.held_out],
+              "reference_train": arguments.reference_train, "vehicle": file_label(arguments.vehicle),
+              **settings_of(config, ("thresholds",))}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen):
         found = watched(log, references, config, vehicle)
         command_line.stage(WRITING)
@@ -86,11 +96,13 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     from sysid.missing.fit_statistics import load_fitted
     from whill_mjx.vehicle.presets import preset_params
 
-    log = load_any(arguments.dataset)
-    references = [load_any(path) for path in arguments.reference]
+    log = load_any(arguments.dataset, "auto", arguments.train, arguments.held_out, arguments.chained)
+    references = [load_any(path, "auto", arguments.reference_train, (), arguments.chained)
+                  for path in arguments.reference]
     check_logs(log, references)
+    mine = {trial.name for trial in log.trials}
     for path, other in zip(arguments.reference, references, strict=True):
-        if other.sha256 == log.sha256:
+        if other.sha256 == log.sha256 and mine & {trial.name for trial in other.training}:
             raise ValueError(f"--reference {path}: has the drives in question themselves. Give drives of other days.")
     vehicle = None
     if arguments.vehicle is not None:

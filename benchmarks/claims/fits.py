@@ -229,7 +229,7 @@ CLAIMS = (
             ("ideal replay [m]", "{rmse_mrclam_physical_ideal}", "{rmse_mrclam_paper_ideal}"),
             ("gain, position", "{gain_mrclam_physical|%}", "{gain_mrclam_paper|%}"),
             ("false names, of 5 robots", "{mrclam_false}", "-"),
-            ("late pose found, of 5 robots", "{mrclam_delay_found}", "-"),
+            ("delay found, of 5 robots", "{mrclam_delay_found}", "-"),
         ),
     ),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import Log, Trial, command_in_force
+from sysid.logs.standing import said, stood
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import time_faults, uncommanded
 
@@ -19,6 +20,9 @@ SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static
 SLOW_SECONDS = 1.0  # s of such commands that are enough
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
+SETTLED = 1.0  # s after which a vehicle has reached what it makes of a constant command
+FEW = 50  # instants at which a vehicle must follow a command, and fall short of one, to show its limit
+TOP = 0.98  # quantile of what is measured that counts as the most
 FOLLOWS = 0.5  # correlation with the command below which no gain shows a sign or a unit
 Responses = Mapping[str, Mapping[str, Mapping[str, Shift]]]
 """Channel -> trial -> "v" or "omega" -> how late it follows the command."""
@@ -118,6 +122,11 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
         responses: `response_shift` of every trial by channel, where it is known.
     """
     trials, skid = log.trials, log.spec.drive == "skid"
+    standing = stood(trials, log.spec.track / 2)
+    if standing:
+        found = [f"{said(standing)}. A fit leaves such trials out."]
+        trials = tuple(trial for trial in trials if trial.name not in standing)
+        return found + sanity(replace(log, trials=trials)) if trials else found
     found = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
@@ -141,6 +150,9 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
             elif gain < 0:
                 said.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
+            elif odd and (limit := _limit(trials, channel, index)) is not None:
+                found.append(f"{where}, but follows commands below {limit:.2g} {unit}: it is limited to about that. "
+                             "State it as command_limits, so that replays take commands as the vehicle does.")
             elif odd:
                 said.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
@@ -188,6 +200,28 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
     measured = rates[index] - rates[index].mean()
     norm = np.sqrt((centred @ centred) * (measured @ measured))
     return float(centred @ measured / (centred @ centred)), float(centred @ measured / norm) if norm > 1e-12 else 0.0
+
+
+def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:
+    """Size of a measured speed (1) or yaw rate (2) that larger commands do not raise, while it follows smaller ones;
+    None where nothing shows such a limit."""
+    rows = []
+    for trial in trials:
+        rates = speeds(trial, channel)
+        if rates is not None:
+            command = (trial.command.v, trial.command.omega)[index - 1]
+            now, before = (command[np.maximum(command_in_force(trial.command, rates[0] - ago), 0)]
+                           for ago in (0.0, SETTLED))
+            rows.append(np.abs(np.column_stack([now, rates[index]])[now == before]))
+    asked, seen = np.concatenate(rows).T if rows else np.zeros((2, 0))
+    if len(asked) < FEW:
+        return None
+    limit = float(np.quantile(seen, TOP))
+    small, large = (asked > 0.1 * limit) & (asked < 0.8 * limit), asked > 1.5 * limit
+    if min(small.sum(), large.sum()) < FEW:
+        return None
+    follows = float(asked[small] @ seen[small] / (asked[small] @ asked[small]))
+    return limit if 0.5 < follows < 2.0 else None
 
 
 def _length(trial: Trial, channel: str) -> float:

@@ -63,7 +63,7 @@ def inspect(log: Log) -> dict[str, Any]:
                 "seconds": float(sum(trial.duration for trial in log.trials)), "notes": list(log.notes),
                 "geometry": {key: getattr(log.spec, key) for key in ("wheel_radius", "track", "wheelbase", "mass")}},
         "streams": {name: _over_trials([found[name] for found in qualities.values() if name in found])
-                    for name in ("command", "odometry", "ground_truth")
+                    for name in ("command", "odometry", "ground_truth", "gyro")
                     if any(name in found for found in qualities.values())},
         "clocks": {
             **{f"{channel} after command": _pooled(list(found.values())) for channel, found in responses.items()

@@ -76,7 +76,23 @@ def load_log(folder: str | Path) -> Log:
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
+    elif "command_limits" in fields:
+        trials, said = _within_limits(trials, *fields["command_limits"])
+        notes += said
     return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
+
+
+def _within_limits(trials: tuple[Trial, ...], v: float, omega: float) -> tuple[tuple[Trial, ...], list[str]]:
+    """Trials with commands as a vehicle takes them that limits them to so much [m/s, rad/s], and a note where it
+    does."""
+    over = sum(int(((np.abs(one.command.v) > v) | (np.abs(one.command.omega) > omega)).sum()) for one in trials)
+    if not over:
+        return trials, []
+    every = sum(len(one.command.t) for one in trials)
+    limited = tuple(replace(one, command=replace(one.command, v=np.clip(one.command.v, -v, v),
+                                                 omega=np.clip(one.command.omega, -omega, omega))) for one in trials)
+    return limited, [f"{over} of {every} commands are beyond command_limits: they are taken as the limits, {v:g} m/s "
+                     f"and {omega:g} rad/s"]
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
@@ -95,7 +111,9 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
         columns = read_csv(folder / "ground_truth.csv", POSE_COLUMNS)
         ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
     if odometry is None and ground_truth is None:
-        raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them.")
+        gyro = " imu.csv alone shows no speed." * (folder / "imu.csv").exists()
+        raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them."
+                         f"{gyro}")
     _check_seconds(folder, {name: one.t for name, one in (("command.csv", command), ("odometry.csv", odometry), (
         "ground_truth.csv", ground_truth)) if one is not None})
     for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):

@@ -1,8 +1,8 @@
 """Loaders of two published measured datasets, in their original form, into the same in-memory log.
 
 `drive_norlab`: commanded wheel speeds against lidar ICP motion of skid-steered robots (Baril et al., "DRIVE", ICRA
-2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping,
-Dataset 6 (Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
+2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping
+(Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
 
 Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
 both systems repeat the last value between updates.
@@ -29,14 +29,17 @@ from sysid.logs.log import hash_files, load_log
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
+from sysid.logs.standing import without_standing
 from sysid.logs.streams import without_held
+from sysid.logs.windows import in_windows
 from whill_mjx.io.fields import counted, shown
-from whill_mjx.io.reading import LONGEST_REASON, csv_rows, read_arrays, read_gzip
+from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, csv_rows, read_arrays, read_gzip, read_text
 from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
 
 DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
 DRIVE_ROWS = 40  # samples of one window (2 s)
 DRIVE_COLUMNS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
+TERRAINS = ("asphalt", "grass", "gravel", "ice", "mud", "sand", "snow", "tile")
 MAX_NANOSECONDS = 86_400 * 10**9
 CONTINUOUS_COLUMNS = (
     *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
@@ -55,6 +58,9 @@ HELD = 1e-9
 """Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
+START_SPAN = 0.15
+"""Time before and after the start of an MRCLAM window [s] over which the speeds there are measured: its robots follow
+their commands later than that."""
 MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
 
 
@@ -65,11 +71,16 @@ def detect_format(path: str | Path) -> str:
         raise (ValueError if path.exists() else FileNotFoundError)(f"{path}: {about(path)}")
     if (path / "dataset.toml").exists() or (path / "trials").exists():
         return "dataset"
-    if any(path.glob("MRCLAM_*_Odometry.dat.gz")):
+    if mrclam_files(path, "[1-5]", "Odometry"):
         return "mrclam"
     if any(path.glob("*.npz")) and not (path / "report.json").exists():  # a fit keeps its series so
         return "drive_norlab"
     raise ValueError(f"{path}: {about(path)}")
+
+
+def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
+    """Files of MRCLAM robots in a folder: as in its archives, or with the data set in front, packed or not."""
+    return sorted(path for end in ("", ".gz") for path in folder.glob(f"*Robot{robot}_{kind}.dat{end}"))
 
 
 def is_known(path: Path) -> bool:
@@ -88,10 +99,7 @@ def drive_spec(run: str) -> VehicleSpec:
 
 def drive_group(run: str) -> str:
     """Terrain of a run: warthog_sand_1 -> sand; the run's own name where the terrain is not stated."""
-    for terrain in ("asphalt", "gravel", "sand", "grass"):
-        if terrain in run:
-            return terrain
-    return run
+    return next((word for word in run.split("_") if word in TERRAINS), run)
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
@@ -159,32 +167,13 @@ def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) ->
 
 def _drive_windows(path: Path, run: str, chained: bool
                    ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
-    missing = {"data", "columns"} - set(arrays)
-    if missing:
-        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
-    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
-    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
-        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
-                         f"of the {len(columns)} names in `columns`. {CONVERT}")
-    index = {name: i for i, name in enumerate(columns)}
-
-    def block(name: str) -> np.ndarray:
-        try:
-            return data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
-        except KeyError as error:
-            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
-
+    blocks = _drive_blocks(path)
     spec = drive_spec(run)
-    command_v, command_omega = twist_from_wheels(spec, block("cmd_left"), block("cmd_right"))
-    wheel_v, wheel_omega = twist_from_wheels(spec, block("left_wheel_vel"), block("right_wheel_vel"))
-    x, y, yaw = in_first_frame(block("icp_x"), block("icp_y"), block("icp_yaw"))
-    gyro = block("imu_yaw")
-    for name in DRIVE_COLUMNS:
-        if not (np.abs(block(name)) < LARGEST).all():
-            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
-                             "incomplete windows.")
-    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(len(data))])
+    command_v, command_omega = twist_from_wheels(spec, blocks["cmd_left"], blocks["cmd_right"])
+    wheel_v, wheel_omega = twist_from_wheels(spec, blocks["left_wheel_vel"], blocks["right_wheel_vel"])
+    x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
+    gyro, count = blocks["imu_yaw"], len(x)
+    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
     gyro *= sign or 1.0
     joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
     length = DRIVE_STEP_ROWS if chained else 1
@@ -192,7 +181,7 @@ def _drive_windows(path: Path, run: str, chained: bool
     trials: list[Trial] = []
     missed: list[tuple[float, float]] = []
     rates = {}
-    for row in range(0, len(data) - length + 1, length):
+    for row in range(0, count - length + 1, length):
         rows = slice(row, row + length)
         step, window = divmod(row, DRIVE_STEP_ROWS)
         name = f"{run}/{step:03d}.{window}"
@@ -220,13 +209,39 @@ def _drive_windows(path: Path, run: str, chained: bool
     if sign != 1.0:
         note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
                  ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
-    if chained:
-        likely, way = np.array(missed or [(0.0, 0.0)]).T
-        late = way[likely > 0.5] if (likely > 0.5).any() else np.zeros(1)
-        note += (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an "
-                 f"ICP update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), "
-                 f"{late.max():.2f} m at most")
-    return trials, note, rates
+    return trials, note + (_said_missed(missed) if chained else ""), rates
+
+
+def _drive_blocks(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a DRIVE file that are used, each (N, 40) of N windows, checked."""
+    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
+    missing = {"data", "columns"} - set(arrays)
+    if missing:
+        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
+    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
+    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
+        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
+                         f"of the {len(columns)} names in `columns`. {CONVERT}")
+    index = {name: i for i, name in enumerate(columns)}
+    blocks = {}
+    for name in DRIVE_COLUMNS:
+        try:
+            blocks[name] = data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
+        except KeyError as error:
+            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
+        if not (np.abs(blocks[name]) < LARGEST).all():
+            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
+                             "incomplete windows.")
+    return blocks
+
+
+def _said_missed(missed: list[tuple[float, float]]) -> str:
+    """How often a joint lost an update of the pose, and how much: of each joint its probability and the way [m]."""
+    likely, way = np.array(missed or [(0.0, 0.0)]).T
+    late = way[likely > BREAK] if (likely > BREAK).any() else np.zeros(1)
+    return (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an ICP "
+            f"update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), {late.max():.2f} m "
+            "at most")
 
 
 def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -389,9 +404,9 @@ def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
 
 
 def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
-    command = _read_gz(folder, robot, "Odometry", 3)
-    truth = _read_gz(folder, robot, "Groundtruth", 4)
-    yaw = np.unwrap(truth[:, 3])
+    command = _read_table(folder, robot, "Odometry", 3)
+    truth = _read_table(folder, robot, "Groundtruth", 4)
+    path = np.column_stack([truth[:, :3], np.unwrap(truth[:, 3])])
     begin, end = max(command[0, 0], truth[0, 0]), min(command[-1, 0], truth[-1, 0])
     trials = []
     for number, start_time in enumerate(np.arange(begin, end - window, window)):
@@ -407,14 +422,20 @@ def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial],
         keep = np.append(np.diff(t) > 0, True)
         if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
             continue
-        pose = only_changes(truth[inside, 0] - t0, truth[inside, 1], truth[inside, 2], yaw[inside])
-        trials.append(Trial(
-            f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
-            thin(pose, MRCLAM_SPACING),
-            Start(float(truth[first, 1]), float(truth[first, 2]), float(yaw[first]), float(v[0]), float(omega[0]),
-                  measured=True),
-            group=f"robot{robot}"))
-    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are the commands in force"
+        pose = only_changes(path[inside, 0] - t0, *path[inside, 1:].T)
+        start = replace(_speeds(path, t0), x=float(path[first, 1]), y=float(path[first, 2]), yaw=float(path[first, 3]))
+        trials.append(Trial(f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
+                            thin(pose, MRCLAM_SPACING), start, group=f"robot{robot}"))
+    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are those of the outside pose"
+
+
+def _speeds(path: np.ndarray, at: float) -> Start:
+    """A start with the speeds that a path (T, 4) of time, x, y and yaw shows around a time: its slopes."""
+    near = path[np.abs(path[:, 0] - at) <= START_SPAN]
+    t = near[:, 0] - near[:, 0].mean()
+    vx, vy, omega = t @ near[:, 1:] / max(float(t @ t), HELD)
+    yaw = near[:, 3].mean()
+    return Start(v=float(vx * np.cos(yaw) + vy * np.sin(yaw)), omega=float(omega), measured=True)
 
 
 def thin(pose: PoseStream, spacing: float) -> PoseStream:
@@ -427,10 +448,15 @@ def thin(pose: PoseStream, spacing: float) -> PoseStream:
     return PoseStream(pose.t[keep], pose.x[keep], pose.y[keep], pose.yaw[keep])
 
 
-def _read_gz(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
-    path = folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz"
-    text = read_gzip(path, "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam and "
-                           "compress them with gzip.", ORIGINAL)
+def _read_table(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
+    """The table (T, columns) of a robot as published, packed or not, whatever the number of the data set."""
+    found = mrclam_files(folder, str(robot), kind)
+    path = found[0] if found else folder / f"Robot{robot}_{kind}.dat"
+    if len(found) > 1:
+        raise ValueError(f"{path}: there is another one, {found[1].name}. Give a folder with one data set.")
+    missing = "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam."
+    packed = path.suffix == ".gz"
+    text = read_gzip(path, missing, ORIGINAL) if packed else read_text(path, ARRAY_BYTES, missing)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused below
@@ -491,7 +517,7 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
         log: Log = with_own_timeout(_without_held(load_log(path)))
-        return split(log, train, held_out) if train else log
+        return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
                          + ("warthog_sand_1" if form == "drive_norlab" else "robot1 robot2 robot3")

@@ -64,7 +64,7 @@ def _about_folder(path: Path) -> str:
                 f"{packed.name} is {_about_file(packed)}")
     if text := next((one for one in files if one.suffix in (".csv", ".txt", ".tum")), None):
         return f"a folder of text files ({text.name}), not a dataset. {convert}"
-    return ("no dataset.toml, no *.npz and no MRCLAM_*_Odometry.dat.gz in it. Name the folder that holds one of them; "
+    return ("no dataset.toml, no *.npz and no *Robot1_Odometry.dat in it. Name the folder that holds one of them; "
             "the formats are in docs/log_format.md.")
 
 

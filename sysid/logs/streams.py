@@ -77,6 +77,8 @@ def trial_quality(trial: Trial) -> dict[str, StreamQuality]:
     found = {}
     if len(trial.command.t) > 1:
         found["command"] = quality(trial.command.t)
+    if trial.gyro is not None and len(trial.gyro.t) > 1:
+        found["gyro"] = quality(trial.gyro.t)
     for name, stream in (("odometry", trial.odometry), ("ground_truth", trial.ground_truth)):
         if stream is None or len(stream.t) < 2:
             continue
@@ -176,11 +178,14 @@ def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
     rates = speeds(trial, stream)
     if rates is None:
         return {}
-    t, v, omega = rates
-    held = command_in_force(trial.command, t)
+    pose = trial.ground_truth if stream == "ground_truth" else None
+    when = rates[0] if pose is None else np.arange(pose.t[0], pose.t[-1] + GRID_DT, GRID_DT)
+    held = command_in_force(trial.command, when)
     found = {}
-    for name, command, measured in (("v", trial.command.v, v), ("omega", trial.command.omega, omega)):
+    for name, command, measured in (("v", trial.command.v, rates[1]), ("omega", trial.command.omega, rates[2])):
         commanded = np.where(held >= 0, command[np.maximum(held, 0)], 0.0)
+        if pose is not None:
+            commanded = _as_seen(when, commanded, pose, rates[0])
         if commanded.std() > MIN_SIGNAL[name] and (shift := find_shift(commanded, measured, lags=LAGS)) is not None:
             found[name] = shift
     return found
@@ -188,15 +193,16 @@ def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
 
 def clock_shift(trial: Trial) -> dict[str, Shift]:
     """How much later the outside pose shows "v" and "omega" than the odometry does."""
-    ours, theirs = speeds(trial, "odometry", smooth=True), speeds(trial, "ground_truth")
-    if ours is None or theirs is None:
+    odometry, pose, theirs = trial.odometry, trial.ground_truth, speeds(trial, "ground_truth")
+    if odometry is None or len(odometry.t) < 2 or pose is None or theirs is None:
         return {}
-    begin, end = max(ours[0][0], theirs[0][0]), min(ours[0][-1], theirs[0][-1])
-    grid = np.arange(begin, end, GRID_DT)
-    found = {}
-    for column, name in ((1, "v"), (2, "omega")):
-        reference, signal = np.interp(grid, ours[0], ours[column]), np.interp(grid, theirs[0], theirs[column])
-        if reference.std() > MIN_SIGNAL[name] and (shift := find_shift(reference, signal, reach=0.6)) is not None:
+    half = _half_span(pose)
+    inside = (theirs[0] >= odometry.t[0] + half) & (theirs[0] <= odometry.t[-1] - half)
+    grid, found = theirs[0][inside], {}
+    for name, rate, signal in (("v", odometry.v, theirs[1]), ("omega", odometry.omega, theirs[2])):
+        reference = _as_seen(odometry.t, rate, pose, grid)
+        if (inside.sum() > 1 and reference.std() > MIN_SIGNAL[name]
+                and (shift := find_shift(reference, signal[inside], reach=0.6)) is not None):
             found[name] = shift
     return found
 
@@ -205,7 +211,7 @@ def speeds(trial: Trial, stream: str, smooth: bool = False) -> tuple[np.ndarray,
     """Times (G,) [s] every GRID_DT with speed (G,) [m/s] and yaw rate (G,) [rad/s] of a stream; None where it has none.
 
     Args:
-        smooth: average the odometry over the time that a pose is differenced over, so that both can be compared.
+        smooth: average the odometry over the time that a usual pose is differenced over.
     """
     source = trial.odometry if stream == "odometry" else trial.ground_truth
     if source is None or len(source.t) < 8 or source.t[-1] - source.t[0] < 4 * SMOOTHING:
@@ -248,8 +254,20 @@ def standstill(command: Command, end: float) -> tuple[float, float]:
     return float(max(command.t[moving[0]], 0.0)), float(max(end - after, 0.0))
 
 
+def _half_span(pose: PoseStream) -> float:
+    """Half of the time over which a pose is differenced [s]."""
+    return max(SMOOTHING / 2, float(np.median(np.diff(pose.t))))
+
+
+def _as_seen(when: np.ndarray, rate: np.ndarray, pose: PoseStream, grid: np.ndarray) -> np.ndarray:
+    """A rate (T,) at times `when` (T,) as `_pose_speeds` would show it (G,) on its grid (G,): what it adds up to, known
+    at the times of the pose alone. A pose that comes seldom shows everything smoother, and so it must be compared."""
+    way, half = added_up(when, rate, pose.t), _half_span(pose)
+    return np.asarray(np.interp(grid + half, pose.t, way) - np.interp(grid - half, pose.t, way)) / (2 * half)
+
+
 def _pose_speeds(pose: PoseStream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    half = max(SMOOTHING / 2, float(np.median(np.diff(pose.t))))
+    half = _half_span(pose)
     grid = np.arange(pose.t[0] + half, pose.t[-1] - half, GRID_DT)
 
     def at(t: np.ndarray, column: np.ndarray) -> np.ndarray:

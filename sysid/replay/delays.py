@@ -32,15 +32,22 @@ def without(params: Any, name: str) -> tuple[Any, Any]:
     return replace(params, effects=tuple(effect for effect in effects if effect is not last[0])), last[0]
 
 
-def delayed(params: Any, command: jax.Array, dt: float) -> tuple[Any, jax.Array]:
-    """The vehicle without the first of its effects on commands, where that is a delay, and commands (R, K, 2) that are
-    delayed by its law: every step would carry the changes under way, on an accelerator as a kernel for each number."""
+def delay_apart(params: Any) -> tuple[Any, CommandDelay | None]:
+    """The vehicle without the first of its effects on commands, where that is a delay, and that delay or None: every
+    step would carry the changes under way, of which it knows a few only, on an accelerator as a kernel for each number.
+    """
     effects = getattr(params, "effects", ())
     first = next((effect for effect in effects if hasattr(effect, "command")), None)
     if not isinstance(first, CommandDelay):
-        return params, command
-    kept = replace(params, effects=tuple(effect for effect in effects if effect is not first))
-    return kept, first.ahead(command.reshape(-1, 2), dt).reshape(command.shape)
+        return params, None
+    return replace(params, effects=tuple(effect for effect in effects if effect is not first)), first
+
+
+def delayed(delay: CommandDelay | None, command: jax.Array, dt: float, before: jax.Array | None = None) -> jax.Array:
+    """Commands (R, K, 2) delayed by its law; `before` (2,) is the one in force until they begin, by default none."""
+    if delay is None:
+        return command
+    return delay.ahead(command.reshape(-1, 2), dt, before).reshape(command.shape)
 
 
 @struct.dataclass

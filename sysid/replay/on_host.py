@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.replay.cores import on_processor
-from sysid.replay.delays import delayed
+from sysid.replay.delays import delay_apart, delayed
 from sysid.replay.records import Batch, Plant, Simulated
 from sysid.replay.rollout import Replay, simulate_one
 
@@ -46,8 +46,9 @@ class HostReplay:
             command = one.command.reshape(-1, 2)
             if one.warm_up:  # it came with these
                 command = jnp.concatenate([jnp.broadcast_to(start[3:], (one.warm_up, 2)), command])
-            params, command = delayed(params, command[:, None], plant.dt)
-            return params.values, host.place(params, begin), host.commands(params, command[:, 0]), begin
+            params, delay = delay_apart(params)
+            command = delayed(delay, command, plant.dt)
+            return params.values, host.place(params, begin), host.commands(params, command), begin
 
         def after(values: jax.Array, one: Batch, motion: jax.Array) -> Simulated:
             params, start = set_values(values), one.start

@@ -23,7 +23,7 @@ import numpy as np
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
 from sysid.replay import odometry, pieces
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.delays import delayed, reached, without
+from sysid.replay.delays import delay_apart, delayed, reached, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
@@ -219,8 +219,7 @@ def path_of(
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "reference"):  # the start is that of a tracked point
             start = effect.reference(start)
-    if not warm_up:  # which finds its commands on the way
-        params, command = delayed(params, command, plant.dt)
+    params, delay = delay_apart(params)
 
     in_one = as_one_function if few and plant.arithmetic else lambda function: function
 
@@ -229,9 +228,11 @@ def path_of(
         return state, plant.observe(state)
 
     def drive(start: jax.Array, command: jax.Array) -> jax.Array:
-        state = plant.place(params, start)
+        state, before = plant.place(params, start), None
         if warm_up:
-            state = plant.move(_settle(plant, params, state, start[3:], warm_up, command.shape[1]), start)
+            state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
+            state = plant.move(state, start)
+        command = delayed(delay, command, plant.dt, before)
         if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
             later = in_one(partial(jax.lax.scan, after))(state, command)[1]
         else:
@@ -323,9 +324,12 @@ def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
     return jax.lax.scan(lambda state, command: (plant.substep(params, state, command), None), state, commands)[0]
 
 
-def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int) -> Any:
-    """State after driving so that the odometry reports `speeds` (2,): where the vehicle falls short of its command, as
-    a skid-steered one does, the command, which is held for a few steps, is raised until it does not.
+def _settle(
+    plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int
+) -> tuple[Any, jax.Array]:
+    """State after driving so that the odometry reports `speeds` (2,), and the command (2,) that does it: where the
+    vehicle falls short of its command, as a skid-steered one does, the command, which is held for a few steps, is
+    raised until it does not.
 
     Effects on commands have reached what they make of it at once: a lag or a limit that began at rest would last longer
     than this, and the vehicle would begin its drive with a command on the way from 0.
@@ -337,7 +341,7 @@ def _settle(plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int
         state = _advance(plant, params, state, jnp.broadcast_to(command, (held, 2)))
         return (state, command + WARM_UP_GAIN * held * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
 
-    return jax.lax.scan(body, (state, speeds), None, length=max(steps // held, 1))[0][0]
+    return jax.lax.scan(body, (state, speeds), None, length=max(steps // held, 1))[0]
 
 
 def _turns(angle: jax.Array) -> jax.Array:

@@ -8,7 +8,8 @@ predict these blocks as well as the best, the one with the fewest parameters is 
 
 Where there is no odometry either, nothing shows whether wheels fell short of the command or the vehicle of its wheels,
 while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
-acceleration and drag bend to the same few speeds.
+acceleration and drag bend to the same few speeds. The one that predicts best stays in the fit without a name, and what
+still stands out beside it may have one.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ def search_alone(
     found = Search("none", asked.base, asked.base, asked.scan)
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
-    against, unseen = "what stands out in a linear scan does not hold in a refit", False
-    for _ in range(thresholds.rounds):
+    against, unseen = "what stands out in a linear scan does not hold in a refit", ""
+    while len(found.accepted) < thresholds.rounds and len(found.rounds) < 2 * thresholds.rounds:
         candidates = candidates_of(asked, found, found.final, far)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
@@ -63,11 +64,10 @@ def search_alone(
         best, most = max(standing, key=lambda one: float(one[1].sum()))
         as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
         shown = [one for one in as_good if wheels or card_of(one.hypothesis.effect).shown_by_pose]
-        unseen = not shown
-        if unseen:
-            first = best.hypothesis.effect
-            against = f"{first} stands out, but without odometry nothing shows what the wheels did: log their speeds"
-            break
+        if not shown:
+            unseen = unseen or best.hypothesis.effect
+            found.final = best.refit
+            continue
         taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
         mine = taken_on.hypothesis.effect
         members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
@@ -75,12 +75,14 @@ def search_alone(
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
         found.final, found.share = taken_on.refit, taken_on.share
+    told = unseen and f"{unseen} stands out, but without odometry nothing shows what the wheels did: log their speeds"
     if found.accepted:
         found.verdict = "named"
-        return _said(asked, found, "predicts blocks of drives that were held back")
+        return _said(asked, found, "; ".join(filter(None, ("predicts blocks of drives that were held back", told))))
+    found.final = found.base
     if unseen or missing(found.p_value, 1.0, thresholds):
         found.verdict = "unexplained"
-    return _said(asked, found, against)
+    return _said(asked, found, told or against)
 
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:

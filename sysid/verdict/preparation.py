@@ -66,7 +66,7 @@ def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     base = 0 if fitted else iterations + max(iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 4 + 3 * (config.thresholds.rounds + 1) + config.refit_nulls
+    return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * config.thresholds.rounds + 1) + config.refit_nulls
 
 
 def days_of(references: Sequence[Log]) -> tuple[Log, ...]:

@@ -37,6 +37,7 @@ def verdict(name, **parameters):
     ({"verdict": "none", "effects": []}, False),
     (verdict("command_delay", delay=0.12), False),
     (verdict("command_delay", delay=0.42), True),
+    (verdict("actuator_lag", time_constant=0.17, cascade=0.5), False),
     (verdict("command_scale", linear=0.97, angular=1.08), False),
     (verdict("wheel_radius_difference", difference=-0.01, common=0.15), True),
     (verdict("command_dead_zone", linear=0.02, angular=0.0), True),

@@ -102,6 +102,13 @@ def test_an_effect_of_the_wheels_has_a_name_only_where_the_wheels_were_seen(plac
     assert ("log their speeds" in found.reason) == (result == "unexplained")
 
 
+def test_what_stands_beside_an_effect_without_a_name_has_one():
+    """The unseen one stays in the fit, so that another does not stand for it."""
+    found = verdict((0.0, 0.0, 1.0, 0.4), wheels=False)
+    assert named(found) == ("named", ["command_scale"]) and "side_force stands out" in found.reason
+    assert [one.effect for one in found.final.hypotheses] == ["side_force", "command_scale"]
+
+
 @pytest.mark.parametrize(("gains", "result"), [
     ([(9.0, 11.0, 10.0), (8.0, 11.0, 10.0), (2.0, 2.0, 2.0)], "command_delay"),  # as good, and simpler
     ([(9.0, 11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "acceleration_limit"),  # surely better

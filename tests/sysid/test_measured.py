@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import shared_folder
 
+from sysid.close_loop import Arguments, load
 from sysid.logs.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
 from whill_mjx.vehicle.specs import CREATE, WARTHOG
 
@@ -130,22 +132,36 @@ def test_a_staircase_is_reduced_to_its_steps_and_yaw_is_unwrapped():
     np.testing.assert_allclose(pose.yaw, [2 * np.pi - 3.1])
 
 
-def write_mrclam(folder, robot=1):
+def write_mrclam(folder, robot=1, commanded=0.08):
     time = 1248444175.0 + np.arange(0.0, 40.0, 0.05)
-    command = np.column_stack([time, np.full_like(time, 0.08), np.zeros_like(time)])
+    command = np.column_stack([time, np.full_like(time, commanded), np.zeros_like(time)])
     truth = np.column_stack([time + 3.0, 0.08 * (time - time[0]), np.zeros_like(time), np.zeros_like(time)])
     for kind, table in (("Odometry", command), ("Groundtruth", truth)):
         with gzip.open(folder / f"MRCLAM_Dataset6_Robot{robot}_{kind}.dat.gz", "wt") as file:
             np.savetxt(file, table, header="as published")
 
 
-def test_mrclam_windows_intersect_commands_and_truth_and_start_at_the_command_in_force(tmp_path):
-    write_mrclam(tmp_path)
+def test_mrclam_windows_intersect_commands_and_truth_and_start_as_fast_as_the_pose_shows(tmp_path):
+    write_mrclam(tmp_path, commanded=0.1)
     log = load_mrclam(tmp_path, (1,))
     assert log.spec == CREATE and len(log.trials) == 2
     trial = log.trials[1]
     assert trial.start.v == pytest.approx(0.08) and trial.start.x == pytest.approx(0.08 * 15, abs=0.01)
     assert trial.command.t[0] == 0.0 and np.diff(trial.ground_truth.t).min() > 0.09
+
+
+def test_mrclam_files_are_read_as_they_are_published_whatever_the_data_set(tmp_path):
+    write_mrclam(tmp_path)
+    expected = load_mrclam(tmp_path, (1,)).trials[1].ground_truth.x
+    for path in list(tmp_path.iterdir()):
+        kind = path.name.removesuffix(".dat.gz").rpartition("_")[2]
+        (tmp_path / f"Robot1_{kind}.dat").write_bytes(gzip.decompress(path.read_bytes()))
+    with pytest.raises(ValueError, match="there is another one"):
+        load_mrclam(tmp_path, (1,))
+    for path in tmp_path.glob("*.gz"):
+        path.unlink()
+    assert detect_format(tmp_path) == "mrclam"
+    np.testing.assert_array_equal(load_mrclam(tmp_path, (1,)).trials[1].ground_truth.x, expected)
 
 
 def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
@@ -166,6 +182,20 @@ def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
     assert detect_format(tmp_path) == "mrclam"
     with pytest.raises(FileNotFoundError, match="Robot2_Odometry"):
         load_mrclam(tmp_path, (2,))
+
+
+def test_the_loop_takes_parts_of_a_measured_set_and_its_reference_another(tmp_path):
+    for run in ("warthog_sand_1", "warthog_gravel"):
+        write_drive(tmp_path / f"{run}.npz", rows=9)
+    given = Arguments(dataset=tmp_path, train=("warthog_sand_1:0-0.6",), held_out=("warthog_sand_1:0.6-1",),
+                      reference=(tmp_path,), reference_train=("warthog_gravel",))
+    log, [reference], _ = load(given)
+    assert (len(log.training), len(log.held_out), len(reference.training)) == (6, 3, 9)
+    assert {trial.group for trial in reference.trials} == {"gravel"}
+    with pytest.raises(ValueError, match="the drives in question themselves"):
+        load(replace(given, reference_train=("warthog_sand_1",)))
+    with pytest.raises(ValueError, match="Give --train"):
+        load(Arguments(dataset=tmp_path))
 
 
 def test_selections_split_a_run_by_share_and_must_be_disjoint(tmp_path):

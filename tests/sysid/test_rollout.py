@@ -168,10 +168,8 @@ def test_a_replay_reads_late_odometry_off_the_path(speeds):
     np.testing.assert_allclose(late[0, :3], 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("effect", [("turn_lag", {"time_constant": 2.0}), ("jerk_limit", {"angular": 0.05}),
-                                    ("acceleration_limit", {"linear": 0.1, "angular": 0.05})])
-def test_a_slow_effect_on_commands_has_been_under_way_for_long_where_a_drive_starts_in_motion(effect):
-    """A window of a longer drive: what lags by seconds does not begin with a command on the way from 0."""
+def path_under_way(effect, command, start):
+    """Path of a vehicle that moves as its command says, and starts in motion."""
     import jax
     import jax.numpy as jnp
 
@@ -188,9 +186,25 @@ def test_a_slow_effect_on_commands_has_been_under_way_for_long_where_a_drive_sta
     plant = with_surroundings(lambda params, start: start, moved, lambda state: state,
                               lambda state, start: state.at[:3].set(start[:3]), 0.01)
     params = VehicleParams(None, (make_effect(effect[0], **effect[1]),))
-    command = jnp.broadcast_to(jnp.array([0.5, 0.4]), (100, 1, 2)).at[50:].set(0.0)
-    start = jnp.array([1.0, 2.0, 0.3, 0.5, 0.4])
-    path = jax.jit(lambda start: path_of(plant, params, command, start, round(WARM_UP / plant.dt)))(start)
-    speeds = path[:, 6:8]
+    warm_up = round(WARM_UP / plant.dt)
+    return np.asarray(jax.jit(lambda start: path_of(plant, params, jnp.asarray(command), start, warm_up))(
+        jnp.asarray(start)))
+
+
+@pytest.mark.parametrize("effect", [("turn_lag", {"time_constant": 2.0}), ("jerk_limit", {"angular": 0.05}),
+                                    ("acceleration_limit", {"linear": 0.1, "angular": 0.05})])
+def test_a_slow_effect_on_commands_has_been_under_way_for_long_where_a_drive_starts_in_motion(effect):
+    """A window of a longer drive: what lags by seconds does not begin with a command on the way from 0."""
+    command = np.broadcast_to([0.5, 0.4], (100, 1, 2)).copy()
+    command[50:] = 0.0
+    speeds = path_under_way(effect, command, [1.0, 2.0, 0.3, 0.5, 0.4])[:, 6:8]
     np.testing.assert_allclose(speeds[:51], np.broadcast_to([0.5, 0.4], (51, 2)), atol=1e-3)
     assert 0.3 < speeds[60, 1] < 0.4  # only now it slows down, by the law of the effect
+
+
+def test_a_drive_that_starts_in_motion_is_late_by_the_whole_delay_however_often_its_command_changes():
+    """A ramp changes in every step: more changes are under way than a vehicle's memory holds."""
+    command = np.linspace([0.5, 0.4], [0.9, -0.4], 80)[:, None]
+    speeds = path_under_way(("command_delay", {"delay": 0.2}), command, [1.0, 2.0, 0.3, 0.5, 0.4])[:, 6:8]
+    np.testing.assert_allclose(speeds[:21], np.broadcast_to([0.5, 0.4], (21, 2)), atol=1e-3)
+    np.testing.assert_allclose(speeds[21:], command[:-20, 0], atol=1e-3)

@@ -59,14 +59,16 @@ class CommandDelay(Effect):
             delayed = jnp.where(arrived[slot] >= 1.0, value[slot], blend)  # exact, not only to rounding
         return CommandMemory(value, age + motion.dt), delayed
 
-    def ahead(self, commands: jax.Array, dt: float) -> jax.Array:
+    def ahead(self, commands: jax.Array, dt: float, before: jax.Array | None = None) -> jax.Array:
         """The command (S, 2) in force in each of S physics steps of `dt` [s], from the commands (S, 2) sent in them.
 
-        The same as `command` step by step, but for any number of changes under way. Before the first step none is sent.
+        The same as `command` step by step, but for any number of changes under way. Before the first step `before` (2,)
+        was sent for long; by default none.
         """
         steps = self.delay / dt
         whole = jnp.floor(steps)
-        sent = jnp.concatenate([jnp.zeros((1, 2), commands.dtype), commands])
+        first = jnp.zeros(2, commands.dtype) if before is None else before
+        sent = jnp.concatenate([first[None], commands])
         at = jnp.arange(1, len(sent)) - whole.astype(int)
         newer, older = (sent[jnp.clip(index, 0, None)] for index in (at, at - 1))
         return newer + (steps - whole) * (older - newer)

@@ -1,0 +1,81 @@
+"""Drives in which a vehicle stands though it is commanded to move as it did elsewhere: its emergency stop was pressed,
+its motors were off, or its wheels were blocked. They say nothing of how it drives, and would be fitted as a drive that
+hardly follows its commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.logs.records import Log, Trial, command_in_force
+from sysid.logs.streams import speeds
+
+STANDS = 0.1
+"""Share of the commanded speeds (root mean square) below which a vehicle stands: what is left is noise."""
+RESPONSE = 0.3  # s, of a usual vehicle
+STILL = 0.01  # m/s of commands that ask for nothing
+FOLLOWS = 0.5  # share of a commanded speed at which a vehicle moves
+SLOWEST = 0.1  # quantile of the commands at which it does, below which its dead zone may lie
+
+
+def stood(trials: Sequence[Trial], reach: float) -> list[str]:
+    """Names of the trials in which the vehicle stands, though commanded to move as fast as where it moves in others.
+    Smaller commands that do not move it show its dead zone.
+
+    Args:
+        reach: of a wheel from the middle [m], by which yaw rates count as speeds.
+    """
+    seen = {trial.name: sizes_of(trial, reach) for trial in trials}
+    asked = {name: _size(one[0]) for name, one in seen.items()}
+    stands = {name: _size(one[1]) < STANDS * asked[name] for name, one in seen.items()}
+    moved = [told[(told > STILL) & (size > FOLLOWS * told)] for name, (told, size) in seen.items() if not stands[name]]
+    instants = np.concatenate(moved) if moved else np.zeros(0)
+    least = float(np.quantile(instants, SLOWEST)) if len(instants) else 0.0
+    return [name for name in seen if stands[name] and asked[name] > max(STILL, least)]
+
+
+def sizes_of(trial: Trial, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Commanded and measured speeds (T,) [m/s], of odometry or outside pose, whichever moves more; none where neither
+    shows any."""
+    found = []
+    for channel in ("odometry", "ground_truth"):
+        rates = speeds(trial, channel)
+        if rates is not None:
+            held = command_in_force(trial.command, rates[0] - RESPONSE)
+            v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0)
+                        for one in (trial.command.v, trial.command.omega))
+            found.append((np.hypot(v, reach * omega), np.hypot(rates[1], reach * rates[2])))
+    return max(found, key=lambda one: _size(one[1]), default=(np.zeros(0), np.zeros(0)))
+
+
+def _size(values: np.ndarray) -> float:
+    """Root mean square of values (T,); 0 of none."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def without_standing(log: Log, place: str) -> Log:
+    """The log without training trials in which the vehicle stands though commanded to move, and a note that names them.
+
+    Args:
+        place: the log, for an error.
+
+    Raises:
+        ValueError: it moves in no training trial.
+    """
+    gone = {name for name in stood(log.trials, log.spec.track / 2)} & {trial.name for trial in log.training}
+    if not gone:
+        return log
+    kept = tuple(trial for trial in log.trials if trial.name not in gone)
+    if all(trial.held_out for trial in kept):
+        raise ValueError(f"{place}: the vehicle stands in all training trials, though it is commanded to move. Release "
+                         "its emergency stop, switch its motors on, or check which streams were recorded.")
+    return replace(log, trials=kept, notes=(*log.notes, said(sorted(gone)) + ": left out"))
+
+
+def said(names: Sequence[str]) -> str:
+    """What these trials show, in words."""
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"{names[0]}{more}: the vehicle stands though commanded to move (an emergency stop?)"

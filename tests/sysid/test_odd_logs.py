@@ -1,0 +1,128 @@
+"""Logs of strangers: long drives, a vehicle that stands, commands beyond its limits, a pose that comes seldom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.logs.coverage import sanity
+from sysid.logs.log import load_log
+from sysid.logs.measured import load_any
+from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
+from sysid.logs.standing import stood, without_standing
+from sysid.logs.streams import clock_shift, response_shift
+from sysid.logs.windows import WINDOW, in_windows
+from whill_mjx.vehicle.specs import WHILL_CR
+
+pytestmark = pytest.mark.quick
+DT, HELD = 0.02, 100
+
+
+def drive(name="a", seconds=30.0, seed=0, size=1.0, gain=1.0, limit=9.0, delay=0.2, pose=0.1):
+    """Random steps that a vehicle follows late and exactly, or by a gain, or up to a limit."""
+    rng, count = np.random.default_rng(seed), int(seconds / DT)
+    told = np.repeat(size * rng.uniform(-1, 1, (count // HELD + 1, 2)), HELD, axis=0)[:count]
+    t, late = np.arange(count) * DT, round(delay / DT)
+    seen = np.clip(gain * np.concatenate([np.zeros((late, 2)), told[: count - late]]), -limit, limit)
+    yaw = DT * np.cumsum(seen[:, 1])
+    x, y = (DT * np.cumsum(seen[:, 0] * one(yaw)) for one in (np.cos, np.sin))
+    rows = np.arange(0, count, round(pose / DT))
+    return Trial(name, manoeuvre_of(name), Command(t, *told.T), OdometryStream(t, x, y, yaw, *seen.T),
+                 PoseStream(t[rows], x[rows], y[rows], yaw[rows]), Start(), gyro=GyroStream(t, yaw))
+
+
+def log_of(*trials):
+    return Log("odd", WHILL_CR, trials, "")
+
+
+def test_a_long_drive_is_cut_into_windows_that_begin_where_it_was():
+    whole = drive(seconds=130.0)
+    log = in_windows(log_of(whole, drive("short", seed=1)))
+    assert len(log.trials) == 7 and log.trials[-1].name == "short" and "130 s" in log.notes[-1]
+    for number, trial in enumerate(log.trials[:-1]):
+        begin = number * WINDOW
+        assert trial.name == f"a/{number:03d}" and trial.duration <= WINDOW and trial.command.t[0] == 0.0
+        first = np.searchsorted(whole.odometry.t, begin - 1e-9)
+        np.testing.assert_allclose(trial.command.v[0], whole.command.v[first])
+        np.testing.assert_allclose(trial.odometry.v[0], whole.odometry.v[first])
+        if number:
+            moved, start = trial.ground_truth, trial.start
+            far = np.hypot(trial.odometry.x, trial.odometry.y)[::5][: len(moved.t)]
+            np.testing.assert_allclose(np.hypot(moved.x - start.x, moved.y - start.y), far, atol=0.1)
+            assert trial.start.measured and abs(trial.gyro.turn[-1]) > 0
+
+
+def test_the_start_of_a_window_is_a_line_through_noisy_poses():
+    rng, whole = np.random.default_rng(1), drive(seconds=130.0, size=0.0, gain=0.0)
+    t = np.arange(0.0, 130.0, 0.05)
+    noisy = PoseStream(t, 0.5 * t + rng.normal(0, 0.01, len(t)), rng.normal(0, 0.01, len(t)),
+                       rng.normal(0, 0.01, len(t)))
+    starts = [one.start for one in in_windows(log_of(replace(whole, ground_truth=noisy, odometry=None))).trials[1:]]
+    assert max(abs(one.y) for one in starts) < 0.01
+    assert all(0 < one.position_sigma < 0.008 and abs(one.v - 0.5) < 0.1 for one in starts)
+
+
+def test_a_long_drive_that_is_repeated_stays_whole():
+    log = log_of(drive("a_1", seconds=130.0), drive("a_2", seconds=130.0))
+    assert in_windows(log) == log
+
+
+def test_a_trial_in_which_the_vehicle_stands_is_left_out_and_a_dead_zone_is_not():
+    moving = [drive(f"m_{i}", seed=i) for i in range(3)]
+    stopped, slow = drive("stopped", seed=4, gain=0.0), drive("slow", seed=5, size=0.03, gain=0.0)
+    assert stood([*moving, stopped, slow], 0.25) == ["stopped"]
+    log = without_standing(log_of(*moving, stopped, slow), "odd")
+    assert "stopped" not in [one.name for one in log.trials] and "stopped" in log.notes[-1]
+    assert "stands" in sanity(log_of(*moving, stopped))[0] and not sanity(log_of(*moving))
+    held = replace(stopped, held_out=True)
+    assert without_standing(log_of(*moving, held), "odd").trials[-1] is held
+
+
+def test_a_log_in_which_the_vehicle_never_moves_is_refused():
+    with pytest.raises(ValueError, match="stands in all training trials"):
+        without_standing(log_of(drive("a", gain=0.0), drive("b", seed=1, gain=0.0)), "odd")
+
+
+def test_commands_beyond_what_the_vehicle_reaches_are_told_from_a_wrong_unit():
+    found = sanity(log_of(*(drive(f"l_{i}", seed=i, size=4.0, limit=0.6) for i in range(3))))
+    assert any("limited to about that" in one and "command_limits" in one for one in found)
+    found = sanity(log_of(*(drive(f"g_{i}", seed=i, gain=0.2) for i in range(3))))
+    assert found and not any("limited" in one for one in found)
+
+
+@pytest.mark.parametrize("pose", [0.1, 0.5, 1.0])
+def test_how_late_a_pose_is_does_not_depend_on_how_often_it_comes(pose):
+    trial = drive(seconds=60.0, pose=pose)
+    for shift in response_shift(trial, "ground_truth").values():
+        assert shift.delay + shift.lag == pytest.approx(0.2, abs=0.06)
+    for shift in clock_shift(trial).values():
+        assert shift.delay == pytest.approx(0.0, abs=0.04) and shift.gain == pytest.approx(1.0, abs=0.12)
+
+
+FIELDS = 'schema = 1\nvehicle = "whill_cr"\n'
+
+
+def write(folder, fields, trial, *streams):
+    place = folder / "trials" / trial.name
+    place.mkdir(parents=True)
+    (folder / "dataset.toml").write_text(FIELDS + fields)
+    for name, header, table in (("command", "t,v,omega", trial.command.table), *streams):
+        np.savetxt(place / f"{name}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
+    return folder
+
+
+def test_commands_beyond_stated_limits_are_taken_as_the_vehicle_takes_them(tmp_path):
+    trial = drive(size=4.0, limit=0.6)
+    pose = "ground_truth", "t,x,y,yaw", np.column_stack([trial.ground_truth.t, trial.ground_truth.values])
+    log = load_any(write(tmp_path, "command_limits = [0.6, 9.0]\n", trial, pose))
+    assert np.abs(log.trials[0].command.v).max() == 0.6 and np.abs(log.trials[0].command.omega).max() > 2.0
+    assert any("beyond command_limits" in one for one in log.notes)
+
+
+def test_a_gyro_alone_is_refused_with_the_reason(tmp_path):
+    trial = drive()
+    folder = write(tmp_path, "", trial, ("imu", "t,gyro", np.column_stack([trial.gyro.t, trial.gyro.turn])))
+    with pytest.raises(ValueError, match="imu.csv alone shows no speed"):
+        load_log(folder)
