@@ -25,11 +25,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from benchmarks.loop_direct import drive_directly, write_answers
 from benchmarks.loop_drives import Plan, StageError, drive_plans, last_line, station
 from benchmarks.loop_figures import collect, summary
 from benchmarks.loop_page import write_page
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.commands import nine
+from benchmarks.plant.draw import draw_effect
 from whill_mjx.io.command_line import COUNT, SEED, OptionError, Range, run
 from whill_mjx.io.folders import claim_folder, write_whole
 
@@ -72,6 +74,8 @@ class Options:
     """Episodes that the policy drives on the plant."""
     until: Literal["days", "fit", "drives", "loop", "proposed", "loop_again", "train", "drive", "report"] = "report"
     """Last stage to do; the report is written after it."""
+    direct: bool = False
+    """Drive the plant in this process, without topics: the same drives in seconds, on a computer without ROS."""
     domain: Annotated[int | None, Range(0, 101)] = None
     """ROS domain; none takes one by the process's number."""
     collect: tuple[Path, ...] = ()
@@ -137,6 +141,12 @@ class Loop:
             plant += ["--draw", str(draw), "--answers", str(self.out / "answers.json")]
         nominal = VEHICLES["chair"].nominal
         held_out = [f"{plan.name}_{n + 1}" for plan in plans[-1:] if len(plans) > 1 for n in range(plan.replicates)]
+        if self.options.direct:
+            effects = {} if draw is None else draw_effect(draw)
+            drive_directly(plans, dataset, effects, seed, nominal, held_out)
+            if draw is not None:
+                write_answers(self.out / "answers.json", effects, seed)
+            return
         saying = ["--vehicle", "contact plant", "--wheel-radius", str(nominal.radius), "--track", str(nominal.track),
                   "--wheelbase", str(nominal.wheelbase), "--mass", str(nominal.mass)]
         if held_out:

@@ -84,6 +84,10 @@ class TrialWriter:
             raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
         return folder
 
+    def begin(self, t: float) -> None:
+        """Let times count from t [s] instead of the first pose, so that repeats of a drive have the same times."""
+        self._origin = t
+
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
         if self._origin is None:
@@ -300,11 +304,13 @@ class RecordNode:
     def _flush(self) -> None:
         self._write(lambda writer: writer.flush())
 
+    def now(self) -> float:
+        """Return the present time of what is recorded [s]."""
+        return float(self._node.get_clock().now().nanoseconds * 1e-9) if self._by_stamp else time.monotonic()
+
     def _time(self, stamp: float) -> float:
         """Return the time that a message of this stamp gets."""
-        if not self._by_stamp:
-            return time.monotonic()
-        return believed(stamp, float(self._node.get_clock().now().nanoseconds * 1e-9))
+        return believed(stamp, self.now()) if self._by_stamp else self.now()
 
     def _on_command(self, message: Any, stamp: float, v: float, omega: float) -> None:
         t = self._time(stamp)
