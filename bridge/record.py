@@ -85,8 +85,13 @@ class TrialWriter:
         return folder
 
     def begin(self, t: float) -> None:
-        """Let times count from t [s] instead of the first pose, so that repeats of a drive have the same times."""
+        """Let times count from t [s] instead of the first pose, so that repeats of a drive have the same times.
+
+        What was measured up to then is left out: it may come late, and be of the time before the vehicle was put to its
+        start.
+        """
         self._origin = t
+        self._last = {stream: 0.0 for stream in COLUMNS if stream != "command"}
 
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
@@ -100,6 +105,8 @@ class TrialWriter:
 
         `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
         """
+        if self._is_early("odometry", t):
+            return
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
         x0, y0, yaw0 = self._first_pose
@@ -168,6 +175,13 @@ class TrialWriter:
         self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
         return self.close()
 
+    def _is_early(self, stream: str, t: float) -> bool:
+        """Return whether a time is before the start of the trial, or no later than the last row of the stream."""
+        if self._origin is None:
+            return False
+        since = round(t - self._origin, 6)
+        return since < 0 or since <= self._last.get(stream, -math.inf)
+
     def _add(self, stream: str, t: float, *values: float) -> None:
         if not all(math.isfinite(value) for value in (t, *values)):
             return  # a log holds measurements; a fit cannot use a hole with a number's name
@@ -178,9 +192,9 @@ class TrialWriter:
             self._origin = t
             if self._waiting is not None:
                 self._add("command", t, *self._waiting)
+        if self._is_early(stream, t):
+            return  # stamped before the start, or two messages within a microsecond
         t = round(t - self._origin, 6)
-        if t < 0 or t <= self._last.get(stream, -math.inf):
-            return  # stamped before the first pose, or two messages within a microsecond
         self._last[stream] = t
         self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1
