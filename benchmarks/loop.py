@@ -75,7 +75,8 @@ class Options:
     until: Literal["days", "fit", "drives", "loop", "proposed", "loop_again", "train", "drive", "report"] = "report"
     """Last stage to do; the report is written after it."""
     direct: bool = False
-    """Drive the plant in this process, without topics: the same drives in seconds, on a computer without ROS."""
+    """Drive the plant in this process, without topics: the same drives in seconds, on a computer without ROS. A run may
+    go on so that was driven over topics; its stages say which."""
     domain: Annotated[int | None, Range(0, 101)] = None
     """ROS domain; none takes one by the process's number."""
     collect: tuple[Path, ...] = ()
@@ -180,7 +181,7 @@ class Loop:
             replicates = self.options.replicates if number == 0 else 1
             self.drive(f"day_{number + 1}", day, self.plans(replicates), FIRST_DAY + number, None)
             print(f"  day {number + 1} of {len(self.days)} is driven", flush=True)
-        return f"{len(self.days)} days"
+        return f"{len(self.days)} days{self._how}"
 
     def do_fit(self) -> str:
         """Fit the vehicle to the first reference day."""
@@ -192,7 +193,7 @@ class Loop:
     def do_drives(self) -> str:
         """Drive the vehicle with the undeclared effect."""
         self.drive("drives", self.out / "drives", self.plans(self.options.replicates), self.seed, self.options.draw)
-        return f"{len(list((self.out / 'drives' / 'trials').iterdir()))} trials"
+        return f"{len(list((self.out / 'drives' / 'trials').iterdir()))} trials{self._how}"
 
     def do_loop(self) -> str:
         """Close the loop on these drives."""
@@ -214,7 +215,8 @@ class Loop:
         check = ("--vehicle-file", str(fitted)) if fitted.exists() else ()
         plan = Plan("proposed", commands, min(proposed["replicates"], 3), place, check)
         self.drive("proposed", more, [plan], self.seed, self.options.draw)
-        return f"{proposed['name']}, {plan.replicates} times, to separate {' and '.join(proposed['splits'])}"
+        what = f"{proposed['name']}, {plan.replicates} times{self._how}"
+        return f"{what}, to separate {' and '.join(proposed['splits'])}"
 
     def do_loop_again(self) -> str:
         """Close the loop on all drives."""
@@ -255,6 +257,10 @@ class Loop:
         names = [one["name"] for one in report["effects"]]
         return f"{report['verdict']}{': ' + ', '.join(names) if names else ''}"
 
+    @property
+    def _how(self) -> str:
+        return ", without topics" if self.options.direct else ""
+
     def _quick(self) -> tuple[str, ...]:
         return ("--quick",) if self.options.quick else ()
 
@@ -273,7 +279,7 @@ def main(options: Options) -> None:
         if name not in nine(0):
             raise OptionError(f"--manoeuvres {name}: unknown (known: {', '.join(nine(0))}). Correct the name.")
     loop = Loop(options)
-    where = ("out", "until", "domain", "speed", "collect", "episodes")
+    where = ("out", "until", "domain", "speed", "collect", "episodes", "direct")
     identity = {name: str(value) for name, value in asdict(options).items() if name not in where}
     with claim_folder(options.out, KIND, ("stages", "drives")) as claim:
         claim.settle(identity, (options.out / "stages").exists())
