@@ -193,7 +193,11 @@ class Loop:
     def do_drives(self) -> str:
         """Drive the vehicle with the undeclared effect."""
         self.drive("drives", self.out / "drives", self.plans(self.options.replicates), self.seed, self.options.draw)
-        return f"{len(list((self.out / 'drives' / 'trials').iterdir()))} trials{self._how}"
+        from sysid.logs.inspection import inspect
+        from sysid.logs.log import load_log
+
+        log = load_log(self.out / "drives")
+        return ". ".join([f"{len(log.trials)} trials{self._how}", *inspect(log)["sanity"]])
 
     def do_loop(self) -> str:
         """Close the loop on these drives."""
