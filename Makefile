@@ -92,7 +92,7 @@ release: $(VENV)/.installed-dev
 # The site in build/site: every link and picture is checked, and a broken one fails.
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "Open build/site/index.html."
+	@echo "Open build/site/index.html. With its search: python3 -m http.server -d build/site"
 
 # The tutorials as notebooks in build/notebooks.
 notebooks: $(VENV)/.installed-docs

@@ -1,6 +1,6 @@
 """How well vehicles are identified: planted truth, the shared plant logs, and two published measured sets.
 
-    python -m benchmarks.fit --shared ../shared --parts planted plant chair contact speed drive mrclam
+    python -m benchmarks.fit --shared ../shared --parts planted plant chair contact few speed drive mrclam
 
     python -m benchmarks.fit --parts coverage --part 3/32 --work runs/fit       # one of 32 processes; the same with
     python -m benchmarks.fit --parts starts tpe searches --part 3/40 --work runs/fit          # these parts; restart
@@ -46,6 +46,8 @@ from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, mak
 from sysid.search.settings import FitConfig
 from whill_mjx.io.command_line import run
 
+CHAIR = Path(__file__).parents[1] / "sysid" / "data" / "chair"
+
 
 def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
@@ -63,7 +65,7 @@ def plant(settings: Benchmark) -> None:
 
 def chair(settings: Benchmark) -> None:
     """The log that ships with the package."""
-    log = load_log(Path(__file__).parents[1] / "sysid" / "data" / "chair")
+    log = load_log(CHAIR)
     fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
     figures, ratio = against_replicates(fit, log, f"chair{settings.tag}")
     figures[f"chair_replicate_ratio{settings.tag}"] = ratio
@@ -74,18 +76,29 @@ def chair(settings: Benchmark) -> None:
 
 def contact(settings: Benchmark) -> None:
     """Days of the contact plant, each fitted by itself: is the shared log an exception?"""
+    days(settings, "contact")
+
+
+def few(settings: Benchmark) -> None:
+    """The same with as few drives as the log that ships has."""
+    days(settings, "few", {path.name for path in (CHAIR / "trials").iterdir()})
+
+
+def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None:
+    """Held-out error of fits to days of the contact plant, over replicates; of these trials only, if they are given."""
     from benchmarks.plant.make import make_log
 
     ratios, seconds = [], []
     for seed in settings.seeds:
         with tempfile.TemporaryDirectory() as folder:
             make_log(Path(folder) / "log", seed=seed)
-            log = load_log(Path(folder) / "log")
+            log = load_log(Path(folder) / "log").select(lambda one: trials is None or one.name in trials)
         fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
-        ratios.append(against_replicates(fit, log, "contact")[1]["value"])
+        ratios.append(against_replicates(fit, log, name)[1]["value"])
         seconds.append(fit.seconds)
-    figures = {f"contact_replicate_ratio{settings.tag}": figure(ratios, "-"),
-               f"seconds_contact{settings.tag}": figure(seconds, "s")}
+        print(f"day {seed}: {ratios[-1]:.3f}; as stated: {', '.join(fit.stated) or 'nothing'}", flush=True)
+    figures = {f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
+               f"seconds_{name}{settings.tag}": figure(seconds, "s")}
     record("fit", CLAIM, figures)
     show(figures)
 
@@ -297,7 +310,7 @@ def searches(settings: Benchmark) -> None:
 
 def main(settings: Benchmark) -> None:
     """Measure the parts whose data is at hand."""
-    parts = {"planted": planted, "plant": plant, "chair": chair, "contact": contact, "speed": speed,
+    parts = {"planted": planted, "plant": plant, "chair": chair, "contact": contact, "few": few, "speed": speed,
              "many_starts": many_starts, "starts": starts, "coverage": coverage, "tpe": tpe500, "searches": searches,
              "drive": drive, "mrclam": mrclam}
     for name in settings.parts:

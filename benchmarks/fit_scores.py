@@ -51,5 +51,6 @@ def show(figures: dict[str, dict[str, Any]]) -> None:
 
 
 def show_parameters(fit: Fit) -> None:
+    print(f"  as stated: {', '.join(fit.stated) or 'nothing'}")
     for one in fit.uncertainty.estimates:
         print(f"  {one.name:32} {one.value:10.4g}  [{one.low:.4g}, {one.high:.4g}] {one.remark}", flush=True)

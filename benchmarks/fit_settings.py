@@ -16,8 +16,8 @@ class Benchmark:
 
     shared: Path = Path(os.environ.get("WHILL_SHARED", Path(__file__).parents[2] / "shared"))
     """Folder that holds data/plant and data/measured."""
-    parts: tuple[Literal["planted", "plant", "chair", "contact", "speed", "many_starts", "starts", "coverage", "tpe",
-                         "searches", "drive", "mrclam"], ...] = (
+    parts: tuple[Literal["planted", "plant", "chair", "contact", "few", "speed", "many_starts", "starts", "coverage",
+                         "tpe", "searches", "drive", "mrclam"], ...] = (
         "planted", "plant", "chair", "contact", "drive", "mrclam")
     part: str = "1/1"
     """I/N: of coverage, starts, tpe and searches, every N-th job, where several processes share them."""
@@ -57,8 +57,8 @@ class Benchmark:
     iterations: int = 20
     """Iterations of the gradient search on poses."""
     calibrate: bool = True
-    """Of plant, chair and contact: fit true wheel sizes and the tracked point too. Without, figures have another name:
-    what do these parameters cost on logs that do not need them?"""
+    """Of plant, chair, contact and few: fit true wheel sizes and the tracked point too. Without, figures have another
+    name: what do these parameters cost on logs that do not need them?"""
     repeats: int = 3
     """Timed fits."""
     seeds: tuple[int, ...] = (2000, 2001, 2002)

@@ -318,6 +318,22 @@ def _pose_late(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     return [{**drive, "ground_truth": drive["ground_truth"] + [size, 0, 0, 0]} for drive in drives]
 
 
+def _commands_late(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """Commands of another clock."""
+    return [{**drive, "command": drive["command"] + [size, 0, 0]} for drive in drives]
+
+
+def _commands_cut(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """Commands of which only the first part was recorded; that of the vehicle's last motion is lost."""
+    made = []
+    for drive in drives:
+        t, v, omega = drive["odometry"][:, [0, 4, 5]].T
+        moving = t[(np.abs(v) > 0.05) | (np.abs(omega) > 0.1)]
+        end = moving[-1] - size * (moving[-1] - moving[0]) if len(moving) else t[-1]
+        made.append({**drive, "command": drive["command"][drive["command"][:, 0] <= end]})
+    return made
+
+
 def _set_back(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     """Times of receipt of all streams by a recorder whose clock is set back; messages keep their order of receipt."""
     made = []
@@ -351,4 +367,6 @@ FAULTS: Sequence[Fault] = (
     Fault("mirrored", (6.0, 1.0, 0.02), "rad", _mirrored, "left-handed|mirrored", 1.0),
     Fault("tracked body turned", (20.0, 6.0, 1.0), "deg", _body_turned, "of its own heading"),
     Fault("outside pose late", (4.0, 1.5, 0.1), "s", _pose_late, "another clock"),
+    Fault("commands late", (5.0, 2.5, 0.1), "s", _commands_late, "another clock|check its clock", 1.0),
+    Fault("commands cut", (0.7, 0.5, 0.0), "share", _commands_cut, "commands end", 1.0),
 )

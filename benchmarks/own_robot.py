@@ -43,7 +43,8 @@ TESTED = ("command_delay", "command_dead_zone", "acceleration_limit", "command_s
 TIMES = 2.0  # of the base size
 SPEEDS = {"m/s": SLOWER, "s^2/m": 1 / SLOWER}
 """By unit, of a size on a vehicle that drives at other speeds."""
-DRIVES = (*MANOEUVRES, "random", "reverse")
+DRIVES = (*MANOEUVRES, "random", "reverse", "creep")
+"""Creeping shows dead zones and dry friction; no wheel of the others is ever told to turn so slowly."""
 FIRST_SEED, LOG_SEED = 300, 400
 
 

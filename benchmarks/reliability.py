@@ -2,16 +2,17 @@
 
     python -m benchmarks.reliability --parts files --rooms sysid  # minutes a room; that of the bridge takes an hour
     python -m benchmarks.reliability --parts options              # minutes
-    python -m benchmarks.reliability --parts kills --commands fit # hours: each command is killed --kills times
+    python -m benchmarks.reliability --parts alone kills --commands fit --kills 10 --seed 1  # 15 minutes on two cores
     python -m benchmarks.reliability --parts ctrl_c               # an hour
 
 Damaged files and mistaken commands are those of the tests, more of them. Kills and Ctrl-C meet the commands as users
-start them, at random moments. A run is lost work where its newest step is older than a minute, different where its
-results are not those of a run left alone, and half written where a file with its final name cannot be read. The run
-left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
+start them, at random moments. A run is lost work where it computed for more than a minute since its newest step,
+different where its results are not those of a run left alone, and half written where a file with its final name cannot
+be read. The run left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
+Both are processor time, which does not depend on what else the computer does.
 
-What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms that it
-holds, each with its commit, and of all commands that it holds of this commit.
+What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms, commands
+and seeds that it holds, each with its commit, so parts may run side by side on machines of one kind.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ from whill_mjx.io.folders import write_whole
 
 CLAIM = "No file, mistake, kill or full disk ends in a traceback, lost work or half-written results"
 ROOT = Path(__file__).parents[1]
-PARTS = ("files", "options", "kills", "ctrl_c")
+PARTS = ("files", "options", "alone", "kills", "ctrl_c")
 CHAIR = "sysid/data/chair"
 COMMANDS = {
-    "fit": ["sysid.fit", CHAIR, "--starts", "4"],
-    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "100"],
-    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "6000",
+    "fit": ["sysid.fit", CHAIR, "--starts", "8"],
+    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "20"],
+    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "100000",
               "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "20"],
 }  # fmt: skip
-"""Runs of about five minutes on two cores."""
+"""Runs of five to eight minutes on two cores."""
 QUICK = {
     "fit": ["sysid.fit", CHAIR, "--quick"],
     "close_loop": ["sysid.close_loop", CHAIR, "--quick"],
@@ -87,10 +88,10 @@ def tested(words: list[str], **environment: str) -> tuple[int, list[str]]:
 
 
 class Kept:
-    """What was measured of this commit, a JSON file each."""
+    """What was measured of this commit, a JSON file each, and the folders of the runs."""
 
-    def __init__(self, folder: Path):
-        self.folder, self._commit = folder, provenance()["commit"]
+    def __init__(self, folder: Path, runs: Path):
+        self.folder, self.runs, self._commit = folder, runs, provenance()["commit"]
 
     def read(self, name: str, any_commit: bool = False) -> dict[str, Any]:
         """What is known; empty where nothing is, or it is of another commit."""
@@ -116,14 +117,21 @@ def damaged_room(room: str, count: int, jobs: int) -> dict[str, Any]:
 
 
 def damaged_files(rooms: list[str], count: int, jobs: int, kept: Kept) -> Figures:
-    """Readers that let out another exception, hang or need too much, of `count` damaged files each."""
+    """Try `count` damaged files on each reader of some rooms, where fewer are kept."""
     for room in rooms:
         if kept.read(f"files_{room}").get("count", 0) < count:
             found = damaged_room(room, count, jobs)
             kept.write(f"files_{room}", found)
             said = [one[:300] for one in found["failed"]]
             print(f"{room}: {found['readers']} readers, {len(said)} failed {said}", flush=True)
+    return damaged_figures(kept)
+
+
+def damaged_figures(kept: Kept) -> Figures:
+    """Readers that let out another exception, hang or need too much, of all rooms that are kept."""
     known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}", any_commit=True))}
+    if not known:
+        return {}
     failed = [one for found in known.values() for one in found["failed"]]
     hangs = [one for one in failed if "SECONDS" in one or "process_time" in one]
     memory = [one for one in failed if "BYTES" in one or "_peak" in one or "MemoryError" in one]
@@ -141,12 +149,20 @@ def mistaken_commands() -> Figures:
     return {"option_tracebacks": {**figure([float(len(failed))], "count"), "command_lines": cases}}
 
 
-def started(words: list[str], out: Path) -> subprocess.Popen[str]:
+class Started(subprocess.Popen[str]):
     """A command at work in a folder."""
-    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return subprocess.Popen([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
-                            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                            env={**os.environ, "PYTHONPATH": path})  # fmt: skip
+
+    def __init__(self, words: list[str], out: Path):
+        path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._said = tempfile.TemporaryFile("w+")
+        super().__init__([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
+                         stdout=subprocess.DEVNULL, stderr=self._said, env={**os.environ, "PYTHONPATH": path})
+
+    def said(self) -> str:
+        """Wait for the end; what it wrote to stderr."""
+        self.wait()
+        self._said.seek(0)
+        return self._said.read()
 
 
 def half_written(out: Path) -> list[Path]:
@@ -174,17 +190,41 @@ def newest(out: Path) -> float:
     return max(times)
 
 
-def left_alone(name: str, words: list[str], out: Path) -> dict[str, Any]:
-    """Seconds that a run takes when nobody ends it, and the longest time for which it saved nothing."""
+class Watch:
+    """How long a run computes without saving anything [s of processor time]."""
+
+    def __init__(self, child: Started, out: Path):
+        self._child, self._out = child, out
+        self._saved_at, self._used, self.longest = newest(out), 0.0, 0.0
+
+    def unsaved(self) -> float:
+        """Since the newest step; to be asked often."""
+        with contextlib.suppress(FileNotFoundError, IndexError):  # it has ended
+            words = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
+            used = sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
+            if (saved_at := newest(self._out)) > self._saved_at:
+                self._saved_at, self._used = saved_at, used
+            self.longest = max(self.longest, used - self._used)
+            return used - self._used
+        return 0.0
+
+
+def left_alone(name: str, words: list[str], kept: Kept) -> None:
+    """Keep how long a run takes when nobody ends it [s], for how long it computed without saving, and its bits."""
+    out = kept.runs / f"{name}_left"
     shutil.rmtree(out, ignore_errors=True)
-    began, child, longest = time.time(), started(words, out), 0.0
+    began, child = time.time(), Started(words, out)
+    watch = Watch(child, out)
     while child.poll() is None:
         time.sleep(0.2)
-        longest = max(longest, time.time() - max(newest(out), began))
-    said = child.communicate()[1]
+        watch.unsaved()
+    said = child.said()
     if child.returncode:
         raise RuntimeError(f"{name} ended with {child.returncode}: {said.strip().splitlines()[-1:]}")
-    return {"seconds": round(time.time() - began), "unsaved_s": round(longest, 1), "bits": digest(name, out)}
+    found = {"words": words, "seconds": round(time.time() - began), "unsaved_s": round(watch.longest, 1),
+             "bits": digest(name, out), "device": device_name()}  # fmt: skip
+    kept.write(f"alone_{name}", found)
+    print(f"{name}: {found}", flush=True)
 
 
 def digest(name: str, out: Path) -> str:
@@ -192,21 +232,25 @@ def digest(name: str, out: Path) -> str:
     return hashlib.sha256((out / RESULT[name]).read_bytes()).hexdigest()
 
 
-def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], kills: int) -> None:
-    """Start a run or go on with it, end it at a random moment, and count what went wrong."""
-    number, chosen = SIGNALS[found["kills"] % len(SIGNALS)], random.Random(found["kills"] + 1000 * len(found["bits"]))
-    child, begun = started(words, out), time.time()
-    try:
-        said = child.communicate(timeout=chosen.uniform(1.0, 600.0 / kills + 5.0))[1]
-    except subprocess.TimeoutExpired:
-        found["lost"] += time.time() - max(newest(out), begun) > MINUTE
+def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], longest: float) -> None:
+    """Start a run or go on with it, end it at a random moment within `longest` seconds, and count what went wrong."""
+    number = SIGNALS[found["kills"] % len(SIGNALS)]
+    chosen = random.Random(f"{found['seed']} {found['kills']} {len(found['bits'])}")
+    child, until = Started(words, out), time.monotonic() + chosen.uniform(1.0, longest)
+    watch = Watch(child, out)
+    while child.poll() is None and time.monotonic() < until:
+        time.sleep(0.2)
+        watch.unsaved()
+    if child.poll() is None:
+        found["lost"] += watch.unsaved() > MINUTE
         child.send_signal(number)
-        said = child.communicate()[1]
+        said = child.said()
         found["kills"] += 1
         found["half_written"] += len(half_written(out))
-        found["wrong_ends"] += "Traceback" in said or child.returncode not in (-number, 130, 0)
+        if "Traceback" in said or child.returncode not in (-number, 130, 0):
+            found["wrong_ends"].append(f"exit code {child.returncode}: {said[-1000:]}")
     else:
-        settle(name, out, found, child.returncode, said)
+        settle(name, out, found, child.returncode, child.said())
 
 
 def settle(name: str, out: Path, found: dict[str, Any], code: int, said: str) -> None:
@@ -217,60 +261,63 @@ def settle(name: str, out: Path, found: dict[str, Any], code: int, said: str) ->
     """
     if code and not out.exists():
         raise RuntimeError(f"{name} ended with {code}: {said.strip().splitlines()[-1:]}")
-    found["bits"].append(digest(name, out) if code == 0 else f"exit code {code}")
+    found["bits"].append(digest(name, out) if code == 0 else f"exit code {code}: {said[-300:]}")
     shutil.rmtree(out)
 
 
-def kill_again_and_again(name: str, words: list[str], kills: int, kept: Kept) -> dict[str, Any]:
-    """What `kills` kills of one run do, each signal in turn, beside a run that is left alone."""
-    found, straight, broken = kept.read(f"kills_{name}"), *(kept.folder / f"{name}_{one}" for one in ("left", "killed"))
+def kill_again_and_again(name: str, words: list[str], kills: int, seed: int, kept: Kept) -> None:
+    """Keep what `kills` kills of one run do, each signal in turn, and the bits in which it ends."""
+    label = f"kills_{name}_{seed}"
+    found, out = kept.read(label), kept.runs / f"{name}_{seed}"
     if found.get("words") != words:
-        shutil.rmtree(broken, ignore_errors=True)
-        found = {"words": words, "lost": 0, "half_written": 0, "wrong_ends": 0, "kills": 0, "bits": []}
-    with ThreadPoolExecutor(1) as pool:
-        alone = None if "alone" in found else pool.submit(left_alone, name, words, straight)
-        while found["kills"] < kills:
-            kill_once(name, words, broken, found, kills)
-            kept.write(f"kills_{name}", found)
-            print(f"{name}: {found['kills']} of {kills} kills", flush=True)
-        if broken.exists() or not found["bits"]:
-            child = started(words, broken)
-            said = child.communicate()[1]
-            settle(name, broken, found, child.returncode, said)
-        if alone is not None:
-            found["alone"] = alone.result()
-    found["different"] = sum(bits != found["alone"]["bits"] for bits in found["bits"])
-    kept.write(f"kills_{name}", {**found, "device": device_name()})
+        shutil.rmtree(out, ignore_errors=True)
+        found = {"words": words, "seed": seed, "lost": 0, "half_written": 0, "wrong_ends": [], "kills": 0, "bits": []}
+    while found["kills"] < kills:
+        kill_once(name, words, out, found, 600.0 / kills + 5.0)
+        kept.write(label, found)
+        print(f"{name}: {found['kills']} of {kills} kills", flush=True)
+    if out.exists() or not found["bits"]:
+        child = Started(words, out)
+        said = child.said()
+        settle(name, out, found, child.returncode, said)
+    kept.write(label, {**found, "device": device_name()})
     print(f"{name}: {found}", flush=True)
-    return found
 
 
-def killed_runs(commands: dict[str, list[str]], kills: int, kept: Kept) -> Figures:
-    """Kills of all commands, summed."""
-    for name, words in commands.items():
-        kill_again_and_again(name, words, kills, kept)
-    known = {name: found for name in COMMANDS if "different" in (found := kept.read(f"kills_{name}"))}
-    about = {"kills": {name: found["kills"] for name, found in known.items()},
-             "seconds": {name: found["alone"]["seconds"] for name, found in known.items()}}
-    device = next(iter(known.values()))["device"]
-    counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in known.values()))], "count", device), **about}
+def killed_figures(kept: Kept) -> Figures:
+    """Sums over all kills that ended in bits, of commands that were also left alone."""
+    alone = {name: found for name in COMMANDS if (found := kept.read(f"alone_{name}", any_commit=True))}
+    runs: list[dict[str, Any]] = []
+    for name, left in alone.items():
+        for path in sorted(kept.folder.glob(f"kills_{name}_*.json")):
+            one = kept.read(path.stem, any_commit=True)
+            one["wrong_ends"] = len(one["wrong_ends"])
+            if one["bits"] and one["words"] == left["words"] and one["commit"] == left["commit"]:
+                runs.append({**one, "name": name, "different": sum(bits != left["bits"] for bits in one["bits"])})
+    if not runs:
+        return {}
+    about = {"kills": {name: sum(one["kills"] for one in runs if one["name"] == name) for name in alone},
+             "ended": sum(len(one["bits"]) for one in runs), "commits": sorted({one["commit"] for one in runs}),
+             "seconds": {name: found["seconds"] for name, found in alone.items()}}  # fmt: skip
+    device = next(iter(alone.values()))["device"]
+    counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in runs))], "count", device), **about}
               for what in ("lost", "different", "half_written", "wrong_ends")}
-    unsaved = [found["alone"]["unsaved_s"] for found in known.values()]
-    longest = figure(unsaved, "s, longest time in which a run saved nothing, its start included", device)
+    unsaved = [found["unsaved_s"] for found in alone.values()]
+    longest = figure(unsaved, "s of processor time that a run computed without saving, at most", device)
     return {**counts, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
 
 
-def interrupted(commands: dict[str, list[str]], count: int, seed: int = 0) -> Figures:
+def interrupted(commands: dict[str, list[str]], count: int, seed: int) -> Figures:
     """Seconds from Ctrl-C at random moments to the end of the process, at its 95th percentile over `count` each."""
     chosen, seconds, wrong = random.Random(seed), [], 0
     for name, words in commands.items():
         for _ in range(count):
             with tempfile.TemporaryDirectory() as folder:
-                child = started(words, Path(folder) / "run")
+                child = Started(words, Path(folder) / "run")
                 time.sleep(chosen.uniform(0.5, 40.0))
                 began = time.monotonic()
                 child.send_signal(signal.SIGINT)
-                said = child.communicate()[1]
+                said = child.said()
                 seconds.append(time.monotonic() - began)
                 wrong += child.returncode != 130 or "Traceback" in said
                 print(f"{name}: {seconds[-1]:.2f} s, exit code {child.returncode}", flush=True)
@@ -283,27 +330,41 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure and record."""
     parser = Parser(prog="python -m benchmarks.reliability", description=__doc__,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--parts", nargs="+", choices=(*PARTS, "kept"), default=PARTS,
+                        help="kept: measure nothing, and record what --keep holds")
     parser.add_argument("--damaged", type=whole(), default=2000, help="damaged files for each reader")
     parser.add_argument("--rooms", nargs="+", choices=tuple(ROOMS), default=list(ROOMS), help="readers of files")
     parser.add_argument("--jobs", type=whole(), default=len(os.sched_getaffinity(0)), help="processes that read files")
-    parser.add_argument("--kills", type=whole(), default=30, help="of each command")
+    parser.add_argument("--kills", type=whole(0), default=30, help="of each command")
     parser.add_argument("--interrupts", type=whole(), default=20, help="of each command")
     parser.add_argument("--commands", nargs="+", choices=tuple(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the moments of the kills and of Ctrl-C")
     parser.add_argument("--quick", action="store_true", help="kill runs of a minute instead of five")
     parser.add_argument("--keep", type=Path, default=Path("runs/reliability"), help="folder to go on in")
+    parser.add_argument("--runs", type=Path, help="folder of the runs themselves; by default that of --keep")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of reliability.json")
     given = parser.parse_args(arguments)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; the commands need it
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    kept = Kept(given.keep)
+    kept = Kept(given.keep, given.runs or given.keep)
     commands = {name: (QUICK if given.quick else COMMANDS)[name] for name in given.commands}
+    def alone() -> Figures:
+        for name, words in commands.items():
+            left_alone(name, words, kept)
+        return killed_figures(kept)
+
+    def kills() -> Figures:
+        for name, words in commands.items():
+            kill_again_and_again(name, words, given.kills, given.seed, kept)
+        return killed_figures(kept)
+
     parts: dict[str, Callable[[], Figures]] = {
         "files": lambda: damaged_files(given.rooms, given.damaged, given.jobs, kept), "options": mistaken_commands,
-        "kills": lambda: killed_runs(commands, given.kills, kept),
-        "ctrl_c": lambda: interrupted(commands, given.interrupts)}
+        "alone": alone, "kills": kills, "kept": lambda: {**killed_figures(kept), **damaged_figures(kept)},
+        "ctrl_c": lambda: interrupted(commands, given.interrupts, given.seed)}
     for part in given.parts:
-        print(record("reliability", CLAIM, parts[part](), given.out), flush=True)
+        if figures := parts[part]():
+            print(record("reliability", CLAIM, figures, given.out), flush=True)
 
 
 if __name__ == "__main__":

@@ -106,6 +106,12 @@ def terms_of(task: Task) -> tuple[list[str], list[str]]:
     return [*jax.eval_shape(task.rewards, moment)], [*jax.eval_shape(task.endings, moment)]
 
 
+def paid(term: str, words: dict[str, Any]) -> str:
+    """What a term of the reward pays, in words."""
+    text = TERMS[term].format(**words)
+    return "nothing: its gain is 0" if text.startswith("-0 ") else text
+
+
 def page(name: str) -> str:
     """Markdown of one task's page."""
     from whill_mjx.tasks.tasks import TASKS
@@ -135,7 +141,7 @@ def page(name: str) -> str:
         f"| 1 | -1 to 1 | yaw rate, {-task.omega_max:g} to {task.omega_max:g} rad/s; positive turns left |",
         "", "One step is a control period of 0.1 s.",
         "", "## Reward", "", "The reward is the sum of these terms.", "", "| term | pays |", "|---|---|",
-        *(f"| `{term}` | {TERMS[term].format(**words)} |" for term in rewards),
+        *(f"| `{term}` | {paid(term, words)} |" for term in rewards),
         "", "## End of an episode", "", "| ending | when |", "|---|---|",
         *(f"| `{ending}` | {said[ending].format(**words)} |" for ending in [*endings, "timeout", "diverged"]),
         "", "## Drawn anew for each episode", "", f"{(inspect.getdoc(kind.sample_world) or '').splitlines()[0]}",

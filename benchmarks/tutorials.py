@@ -1,12 +1,15 @@
 """The tutorials of docs/tutorials: run their code, or write them as notebooks.
 
     python -m benchmarks.tutorials run [--out FOLDER]      all in a row, as they are written, in a folder of their own
+    python -m benchmarks.tutorials run --notebooks         the same as Jupyter notebooks (needs jupytext and nbclient)
+    python -m benchmarks.tutorials run --record            writes the seconds of each to benchmarks/results/people.json
     python -m benchmarks.tutorials notebooks --out FOLDER  Jupyter notebooks of the same pages (needs jupytext)
 
 A block ```python or ```sh of a page is run, any other is only shown. A comment before a block changes it in tests:
 
     <!-- in tests: --episodes 100 => --episodes 4 -->
     <!-- in make test: left out -->
+    <!-- in tests: left out -->
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +37,9 @@ ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "docs" / "tutorials"
 NUMBERED = "[0-9]_*.md"
 BLOCK = re.compile(r"((?:^<!--.*?-->\n)*)^```(python|sh)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+LEFT_OUT = "in tests: left out"
+CLAIM = "A newcomer gets results soon, and the tutorials run as they are written"
 
 KERNEL = """---
 jupyter:
@@ -56,6 +63,8 @@ class Block:
     """Texts that tests replace: (old, new)."""
     quick: bool = True
     """Whether the quick run of the tests has it."""
+    tested: bool = True
+    """Whether tests have it; it may need a robot, or a file of the reader's."""
 
     @property
     def in_tests(self) -> str:
@@ -78,7 +87,7 @@ def blocks(page: Path) -> list[Block]:
         changes = [
             tuple(comment.removeprefix("in tests: ").split(" => "))
             for comment in comments
-            if comment.startswith("in tests: ")
+            if comment.startswith("in tests: ") and comment != LEFT_OUT
         ]
         line = text[: match.start(3)].count("\n") + 1
         for change in changes:
@@ -91,6 +100,7 @@ def blocks(page: Path) -> list[Block]:
                 line,
                 tuple((old, new) for old, new in changes),
                 "in make test: left out" not in comments,
+                LEFT_OUT not in comments,
             )
         )
     return found
@@ -120,13 +130,13 @@ def run_page(page: Path, tests: bool = False, quick: bool = False) -> None:
     """
     names: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks(page):
-        if quick and not block.quick:
+        if quick and not block.quick or tests and not block.tested:
             continue
         code = block.in_tests if tests else block.code
         where = f"{page.name}, line {block.line}"
         try:
             if block.language == "python":
-                exec(compile("\n" * (block.line - 1) + code, str(page), "exec"), names)
+                exec(compile("\n" * (block.line - 1) + code, str(page), "exec", dont_inherit=True), names)
             elif quick:
                 for line in code.replace("\\\n", " ").splitlines():
                     run_here(line)
@@ -153,13 +163,17 @@ def run_here(line: str) -> None:
         sys.argv = arguments
 
 
-def run_shell(code: str) -> None:
-    """Run lines in bash with this Python and this repository; the first that fails ends them, and nothing stays."""
+def surroundings() -> dict[str, str]:
+    """The environment in which `python` is this Python with this repository."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     python_path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    given = {**os.environ, "PATH": path, "PYTHONPATH": python_path, "VIRTUAL_ENV": sys.prefix}
+    return {**os.environ, "PATH": path, "PYTHONPATH": python_path, "VIRTUAL_ENV": sys.prefix}
+
+
+def run_shell(code: str) -> None:
+    """Run lines in bash with this Python and this repository; the first that fails ends them, and nothing stays."""
     command = ["bash", "-e", "-o", "pipefail", "-c", code]
-    process = subprocess.Popen(command, env=given, start_new_session=True)
+    process = subprocess.Popen(command, env=surroundings(), start_new_session=True)
     try:
         status = process.wait()
     finally:
@@ -174,9 +188,12 @@ def pages() -> list[Path]:
     return sorted(TUTORIALS.glob(NUMBERED))
 
 
-def notebook_text(page: Path) -> str:
+def notebook_text(page: Path, tests: bool = False) -> str:
     """A page as jupytext reads it: without comments for tests, with pictures and links from where it lies."""
-    text = re.sub(r"^<!-- in .*?-->\n", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    text = page.read_text(encoding="utf-8")
+    for block in blocks(page) if tests else ():
+        text = text.replace(block.code, block.in_tests)
+    text = re.sub(r"^<!-- in .*?-->\n", "", text, flags=re.MULTILINE)
     parts = re.split(r"(^```.*?^```)", text, flags=re.DOTALL | re.MULTILINE)
 
     def moved(match: re.Match[str]) -> str:
@@ -215,6 +232,49 @@ def write_notebooks(out: Path) -> list[Path]:
     return written
 
 
+def run_notebook(page: Path, tests: bool = False) -> None:
+    """Run a page as a notebook in a kernel of its own, two folders below the current one.
+
+    Raises:
+        ModuleNotFoundError: jupytext, nbclient or ipykernel is not installed.
+        RuntimeError: a cell failed.
+    """
+    import ipykernel  # noqa: F401  (the kernel that nbclient starts)
+    import jupytext
+    import nbclient
+
+    folder = Path("build/notebooks")
+    folder.mkdir(parents=True, exist_ok=True)
+    notebook = jupytext.reads(notebook_text(page, tests), fmt="md")
+    client = nbclient.NotebookClient(notebook, timeout=None, resources={"metadata": {"path": str(folder)}})
+    try:
+        client.execute(env=surroundings())
+    except nbclient.exceptions.CellExecutionError as error:
+        raise RuntimeError(f"{page.name} as a notebook: {error}") from error
+    jupytext.write(notebook, folder / f"{page.stem}.ipynb")
+
+
+def run_all(given: argparse.Namespace) -> dict[str, float]:
+    """Run the pages in a row and return the seconds of each, by its number."""
+    seconds = {}
+    for page in pages():
+        if page.name[0] in given.pages:
+            print(f"== {page.name}", flush=True)
+            began = time.perf_counter()
+            (run_notebook if given.notebooks else run_page)(page, tests=given.tests)
+            seconds[page.name[0]] = time.perf_counter() - began
+            print(f"== {page.name}: {seconds[page.name[0]]:.0f} s", flush=True)
+    return seconds
+
+
+def write_figures(seconds: dict[str, float], kind: str) -> Path:
+    """Record how long each page took, and how many were run."""
+    from benchmarks.harness import figure, record
+
+    figures = {f"{kind}_{number}_s": figure([taken], "s") for number, taken in seconds.items()}
+    return record("people", CLAIM, figures)
+
+
 def main() -> None:
     """Run the tutorials or write notebooks."""
     parser = Parser(
@@ -224,20 +284,22 @@ def main() -> None:
     run = kinds.add_parser("run", help="run all in a row")
     run.add_argument("--out", type=Path, help="folder to run them in; default: one that is deleted afterwards")
     run.add_argument("--tests", action="store_true", help="with the sizes of the tests")
+    run.add_argument("--pages", nargs="+", choices=list("123456"), default=list("123456"), help="numbers of tutorials")
+    run.add_argument("--notebooks", action="store_true", help="as Jupyter notebooks")
+    run.add_argument("--record", action="store_true", help="write the seconds to benchmarks/results/people.json")
     notebooks = kinds.add_parser("notebooks", help="write them as notebooks")
     notebooks.add_argument("--out", type=Path, default=ROOT / "build" / "notebooks", help="folder of the notebooks")
     given = parser.parse_args()
-    if given.kind == "notebooks":
-        try:
-            written = write_notebooks(given.out)
-        except ModuleNotFoundError:
-            parser.error("jupytext is not installed. Install it: pip install -c constraints.txt -e '.[docs]'.")
-        print("\n".join(map(str, written)))
-        return
-    with tempfile.TemporaryDirectory() as own, workplace((given.out or Path(own)).absolute()):
-        for page in pages():
-            print(f"== {page.name}", flush=True)
-            run_page(page, tests=given.tests)
+    try:
+        if given.kind == "notebooks":
+            print("\n".join(map(str, write_notebooks(given.out))))
+            return
+        with tempfile.TemporaryDirectory() as own, workplace((given.out or Path(own)).absolute()):
+            seconds = run_all(given)
+    except ModuleNotFoundError as error:
+        parser.error(f"{error.name} is not installed. Install it: pip install -c constraints.txt -e '.[docs]'.")
+    if given.record:
+        print(write_figures(seconds, "notebook" if given.notebooks else "tutorial"))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import os
 import signal
 from collections import Counter
 from contextlib import contextmanager
+from pathlib import Path
 
 import jax
 import jaxlib
@@ -12,6 +13,9 @@ import pytest
 from whill_mjx import share_results
 
 share_results()
+ROOT = str(Path(__file__).parents[1])
+os.environ["PYTHONPATH"] = os.pathsep.join([ROOT, *filter(None, [os.environ.get("PYTHONPATH")])])
+"""Commands that tests start are of this tree; other packages stay where they were found."""
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; processes of tests need it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if jaxlib.__version__.startswith("0.10."):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -53,6 +54,16 @@ def test_links_between_pages_lead_somewhere(page):
             assert anchor in anchors(linked.read_text()), f"{page.name}: {target} has no such heading."
 
 
+@pytest.mark.parametrize("page", ["reliability.md", "reliability_files.md"])
+def test_every_promise_names_tests_that_exist(page):
+    files = {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+    tests = set(re.findall(r"^def test_(\w+)", "\n".join(files.values()), re.MULTILINE))
+    text = (ROOT / "docs" / page).read_text()
+    named = set(re.findall(r"`(?:test_)?([a-z]+(?:_[a-z0-9]+){4,})`", text))
+    assert len(named) > 10 and not named - tests
+    assert not set(re.findall(r"`(?:[\w/]+/)?(test_\w+\.py)`", text)) - set(files)
+
+
 def test_pages_identify_and_report_instead_of_telling():
     count = sum(len(re.findall(r"\b(?:tell|tells|told|telling)\b", page.read_text(), re.IGNORECASE)) for page in PAGES)
     assert count <= 10
@@ -79,6 +90,16 @@ def test_commands_that_a_page_shows_can_be_started(page):
     for module in set(re.findall(rf"python -m ({OURS}(?:\.\w+)*)", page.read_text())):
         path = ROOT / module.replace(".", "/")
         assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), f"{page.name}: python -m {module}"
+
+
+@pytest.mark.long
+def test_commands_that_pages_show_are_taken_by_their_parsers():
+    script = ROOT / "tests" / "parse_commands.py"
+    pages = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "examples" / "README.md"]
+    done = subprocess.run([sys.executable, str(script), *map(str, pages)], cwd=ROOT, capture_output=True, text=True,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    *refused, count = done.stdout.splitlines()
+    assert done.returncode == 0 and not refused and int(count.split()[0]) > 100, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,9 +16,8 @@ SMALL = {"many_chairs.py": ["--count", "8", "--steps", "2"]}
 
 
 def run_example(path, cwd):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
-        [sys.executable, str(path), *SMALL.get(path.name, [])], cwd=cwd, env=environment, capture_output=True, text=True
+        [sys.executable, str(path), *SMALL.get(path.name, [])], cwd=cwd, capture_output=True, text=True
     )
 
 

@@ -82,11 +82,32 @@ def test_the_quick_tutorials_run(name, tmp_path):
         run_page(tutorials.TUTORIALS / name, tests=True, quick=True)
 
 
+def has_ros():
+    return importlib.util.find_spec("rclpy") or os.environ.get("ROS_DISTRO")
+
+
 @pytest.mark.long
-def test_all_tutorials_run_in_a_row(tmp_path):
+@pytest.mark.parametrize("run", [run_page, tutorials.run_notebook])
+def test_all_tutorials_run_in_a_row_as_pages_and_as_notebooks(run, tmp_path):
+    if run is tutorials.run_notebook and not importlib.util.find_spec("nbclient"):
+        pytest.skip("needs nbclient: pip install -e '.[docs]'")
     with workplace(tmp_path):
         for page in pages():
-            if page.name.startswith("6") and not (importlib.util.find_spec("rclpy") or os.environ.get("ROS_DISTRO")):
+            if page.name.startswith("6") and not has_ros():
                 pytest.skip("the sixth needs rclpy: pip install -e '.[ros]'")
-            run_page(page, tests=True)
+            run(page, tests=True)
     assert list((tmp_path / "runs").glob("first/index.html"))
+
+
+CODE_PAGES = [page for page in (tutorials.ROOT / "README.md", *sorted((tutorials.ROOT / "docs").rglob("*.md")))
+              if page not in pages() and any(block.tested for block in blocks(page))]  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", CODE_PAGES, ids=lambda page: page.name)
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)  # as a program in this folder has it
+    with workplace(tmp_path):
+        map_block = blocks(tutorials.TUTORIALS / "5_my_map_my_task.md")[0]
+        exec(map_block.code, {})  # the small map that pages use
+        run_page(page, tests=True)

@@ -46,8 +46,7 @@ class Warm:
 
     def __init__(self, *modules: str):
         self._process = subprocess.Popen([sys.executable, __file__, *modules], stdin=subprocess.PIPE,
-                                         stdout=subprocess.PIPE, text=True,
-                                         env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+                                         stdout=subprocess.PIPE, text=True)  # fmt: skip
 
     def __enter__(self) -> Warm:
         return self

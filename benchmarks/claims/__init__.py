@@ -16,7 +16,7 @@ HEADLINES = (  # file, what, value
     ),
     (
         "sight",
-        "Arrivals in another simulator that no policy was trained in: furnished corridors (odd furniture and colours)",
+        "Success of a camera policy in a simulator it has never seen: furnished corridors (with unusual furniture)",
         "{foreign_furnished|%} ({foreign_unseen|%})",
     ),
     (
@@ -37,12 +37,12 @@ HEADLINES = (  # file, what, value
     ),
     (
         "fit",
-        "Error on unseen drives divided by the difference between two repeats of one drive (best possible: 1.0)",
+        "Error on unseen drives, divided by the difference of two repeats of one drive (best possible: about 1.0)",
         "{plant_replicate_ratio}",
     ),
     (
         "measured",
-        "Position error of a real skid-steered robot after 6 s on asphalt, compared with ideal replay",
+        "Position error of a real robot after 6 s on asphalt, compared with its commands replayed without a fit",
         "{drive_gain_over_ideal_asphalt|%} less",
     ),
     (

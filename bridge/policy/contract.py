@@ -302,6 +302,8 @@ def _parse_camera(camera: Fields) -> dict[str, Any]:
     for key, (limit, unit) in CAMERA_RULES.items():
         if key in camera.table:
             camera.rule(key, _is_within(limit), f"must be a number from {-limit:g} to {limit:g} [{unit}]")
+    if "fov_y" in camera.table:
+        camera.rule("fov_y", lambda value: value > 0, "must be above 0 rad: it is an angle of view")
     return {**camera.table, "frame": frame}
 
 

@@ -43,6 +43,9 @@ def find_step(received: np.ndarray, stamped: np.ndarray) -> Step | None:
         return Step("receive", by_stamp, at)
     if by_receipt > 0 and not by_stamp or by_stamp < 0 and by_receipt < 0:
         return Step("header", -by_receipt, also_at)
+    if by_stamp < 0 < by_receipt:  # set back beyond the beginning: that clock has a gap
+        gaps = [float(np.diff(np.sort(one)).max()) for one in (received, stamped)]
+        return Step("receive", by_stamp, at) if gaps[0] > gaps[1] else Step("header", -by_receipt, also_at)
     return None
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,6 +61,8 @@ NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", 
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
 SAID = "as said"  # why a column has its role where somebody gave no unit
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
+TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
+TURNED = 0.3  # rad; the same of a heading
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
 GAP = 2.0  # s without samples, over which nothing is interpolated
@@ -80,6 +82,8 @@ class Column:
     sure: bool = True
     assumed: bool = False
     """Whether neither name nor numbers show the unit, so that it is the usual one."""
+    moves: bool = True
+    """Whether its numbers change by what a moving vehicle would have in this unit."""
 
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{self.unit}"
@@ -91,6 +95,8 @@ class Table:
 
     stem: str
     columns: dict[str, np.ndarray]  # name -> (T,)
+    odd: Mapping[str, str] = field(default_factory=dict)
+    """Name of a column -> note on its cells that are no numbers."""
 
 
 def kind_of(role: str) -> str:
@@ -151,20 +157,22 @@ def guess(
     found = _origin_counts(found, arrays)
     found = [one if one.why == "" else _time_unit(one, arrays[one.file, one.name]) if one.role == "time" else one
              for one in found]
-    if units:
-        open_ones = {one for one in found if one.why and one.unit not in UNITS[kind_of(one.role)]}
-        found = [replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
-                 if one in open_ones and (one.role, one.name) in units else one for one in found]
-    return _units_by_numbers(found, arrays)
+    decided = _units_by_numbers(found, arrays)
+    if not units:
+        return decided
+    open_ones = {(one.role, one.name) for one in decided if one.assumed and (one.role, one.name) in units}
+    return _units_by_numbers([replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
+                              if (one.role, one.name) in open_ones else one for one in found], arrays)
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
-    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves."""
+    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves; one that
+    shows its unit for sure counts a little more."""
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:
-            if not one.assumed and one.role != "time":
-                votes.setdefault((one.role, one.name), Counter())[one.unit] += 1
+            if (one.moves or not one.assumed) and one.role != "time":
+                votes.setdefault((one.role, one.name), Counter())[one.unit] += 100 if one.assumed else 101
     return {key: vote.most_common(1)[0][0] for key, vote in votes.items()}
 
 
@@ -290,11 +298,22 @@ def _unit(text: str) -> str:
     return SPELLED.get(text, text)
 
 
+def unit_named(text: str) -> bool:
+    """Whether a text is the name of a unit."""
+    return any(_unit(text.strip("[]()")) in units for units in UNITS.values())
+
+
+def with_unit(name: str, unit: str) -> str:
+    """The name of a column with a unit that stands below it; its own unit counts where it has one."""
+    return f"{name} [{unit.strip('[]()')}]" if unit and not _split_unit(name)[1] else name
+
+
 def _time_unit(column: Column, values: np.ndarray) -> Column:
     if column.unit in UNITS["time"] and not (column.unit == "s" and np.nanmedian(np.abs(values)) > 1e11):
         return column
     known = values[np.isfinite(values)]
-    step = float(np.median(np.diff(np.unique(known)))) if len(known) > 2 else 1.0
+    steps = np.diff(np.unique(known))
+    step = float(np.median(steps)) if len(steps) else 1.0
     first = float(np.abs(known[0])) if len(known) else 0.0
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):  # since 1970
         if first > least:
@@ -307,82 +326,91 @@ def _time_unit(column: Column, values: np.ndarray) -> Column:
 
 def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
     """Columns with the units that their numbers agree with, in the order in which one shows the next."""
-    clocks = {one.file: one for one in found if one.role == "time"}
-    headings: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    known: dict[str, Column] = {one.role: one for one in found if one.role != "time"}
+    drive = _Known({one.role: one for one in found if one.role != "time"},
+                   {one.file: one for one in found if one.role == "time"}, arrays)  # fmt: skip
+    streams = ("ground_truth", "odometry")
+    for stream in streams:
+        drive.settle_pose(stream)
+    ways = {stream: _way(drive.signal(f"{stream}.x"), drive.signal(f"{stream}.y")) for stream in streams}
+    turns = {stream: _rate(*heading) if (heading := drive.heading(stream)) else None for stream in streams}
+    drive.settle("odometry.v", _first(ways["odometry"], ways["ground_truth"]), "as the pose moves")
+    drive.settle("odometry.omega", _first(turns["odometry"], turns["ground_truth"]), "as the pose turns")
+    for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
+        measured = _first(drive.signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
+        drive.settle(f"command.{role}", measured, why, 0.5)
+    return [one if one.role == "time" else _with_some_unit(drive.columns[one.role], arrays[one.file, one.name])
+            for one in found]
 
-    def signal(role: str) -> tuple[np.ndarray, np.ndarray] | None:
-        one = known.get(role)
-        if one is None or one.file not in clocks or one.unit not in UNITS[kind_of(role)]:
+
+def _with_some_unit(one: Column, values: np.ndarray) -> Column:
+    """The column, in SI where nothing shows its unit, if that is at all possible."""
+    wheel = one.role.rpartition(".")[2] in ("left", "right")
+    if one.unit in (UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(one.role)]):
+        return one
+    usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
+    largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
+    return replace(one, unit=next(iter(UNITS[kind_of(one.role)])), why=f"{one.why}; SI assumed",
+                   sure=one.sure and usual < largest, assumed=True, moves=usual > 0.05)
+
+
+@dataclass
+class _Known:
+    """What is known of the columns of a drive while their units are found."""
+
+    columns: dict[str, Column]  # by role
+    clocks: dict[str, Column]  # by file
+    arrays: Mapping[tuple[str, str], np.ndarray]
+
+    def signal(self, role: str, unit: str = "") -> tuple[np.ndarray, np.ndarray] | None:
+        """Times [s] and values of a role in SI units; None where there are few, or its unit is not known."""
+        one = self.columns.get(role)
+        clock = self.clocks.get(one.file) if one is not None else None
+        if one is None or clock is None or (unit or one.unit) not in UNITS[kind_of(role)]:
             return None
-        clock = clocks[one.file]
-        t = arrays[clock.file, clock.name] * UNITS["time"][clock.unit]
-        values = arrays[one.file, one.name] * UNITS[kind_of(role)][one.unit]
+        t = self.arrays[clock.file, clock.name] * UNITS["time"][clock.unit]
+        values = self.arrays[one.file, one.name] * UNITS[kind_of(role)][unit or one.unit]
         good = np.isfinite(t) & np.isfinite(values)
         return (t[good], values[good]) if good.sum() > 20 else None
 
-    def raw(role: str) -> tuple[np.ndarray, np.ndarray] | None:
-        one = known.get(role)
-        if one is None:
-            return None
-        kept = one.unit
-        known[role] = replace(one, unit=next(iter(UNITS[kind_of(role)])))
-        answer = signal(role)
-        known[role] = replace(one, unit=kept)
-        return answer
+    def raw(self, role: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """The same as if it were in SI units already."""
+        return self.signal(role, next(iter(UNITS[kind_of(role)])))
 
-    def settle(role: str, reference: tuple[np.ndarray, np.ndarray] | None, why: str, loose: float = ALIKE) -> None:
-        one, mine = known.get(role), raw(role)
+    def settle(self, role: str, reference: tuple[np.ndarray, np.ndarray] | None, why: str, loose: float = ALIKE
+               ) -> None:  # fmt: skip
+        """Find the unit in which a signal is as large as a reference."""
+        one, mine = self.columns.get(role), self.raw(role)
         if one is None or one.unit in UNITS[kind_of(role)] or mine is None:
             return
         unit = _size_of(mine, reference, UNITS[kind_of(role)], loose)
         if unit is not None:
-            known[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
+            self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
 
-    for stream in ("ground_truth", "odometry"):  # angles by their wrap or their range
+    def settle_pose(self, stream: str) -> None:
+        """Find the units of a pose: of its heading by the range, of its place by how fast it moves."""
         role = f"{stream}.yaw"
-        if (one := known.get(role)) and one.unit not in UNITS["angle"] and (mine := raw(role)):
+        if (one := self.columns.get(role)) and one.unit not in UNITS["angle"] and (mine := self.raw(role)):
             degrees = bool(np.ptp(mine[1]) > 30)
-            known[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
-                                  assumed=not degrees)
-        for axis in ("x", "y"):
-            if (one := known.get(f"{stream}.{axis}")) and one.unit not in UNITS["length"] and (mine := raw(one.role)):
-                fast = bool(np.percentile(np.abs(_rate(*mine)[1]), 90) > TOO_FAST)
-                known[one.role] = replace(one, unit="mm" if fast else "m", why=f"{one.why}; its rate",
-                                          assumed=not fast)
-        for quantity in ("qx", "qy", "qz", "qw"):
-            if one := known.get(f"{stream}.{quantity}"):
-                known[one.role] = replace(one, unit="-")
-    for stream in ("ground_truth", "odometry"):
-        parts = [signal(f"{stream}.{one}") for one in ("qw", "qx", "qy", "qz")]
-        if all(part is not None for part in parts) and len({len(part[0]) for part in parts if part}) == 1:
-            w, x, y, z = (part[1] for part in parts if part)
-            t = next(part[0] for part in parts if part)
-            headings[stream] = t, np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
-        elif yaw := signal(f"{stream}.yaw"):
-            headings[stream] = yaw[0], np.unwrap(yaw[1])
-    ways = {stream: _way(signal(f"{stream}.x"), signal(f"{stream}.y")) for stream in ("odometry", "ground_truth")}
-    turns = {stream: _rate(*headings[stream]) if stream in headings else None
-             for stream in ("odometry", "ground_truth")}
-    settle("odometry.v", _first(ways["odometry"], ways["ground_truth"]), "as the pose moves")
-    settle("odometry.omega", _first(turns["odometry"], turns["ground_truth"]), "as the pose turns")
-    for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
-        measured = _first(signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
-        settle(f"command.{role}", measured, why, 0.5)
-    settled = []
-    for one in found:
-        one = known.get(one.role, one) if one.role != "time" else one
-        wheel = one.role.rpartition(".")[2] in ("left", "right")
-        kind = UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(one.role)]
-        if one.unit not in kind:  # nothing shows it: SI, if that is at all possible
-            values = arrays[one.file, one.name]
-            usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
-            largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
-            first = next(iter(UNITS[kind_of(one.role)]))
-            one = replace(one, unit=first, why=f"{one.why}; SI assumed", sure=one.sure and usual < largest,
-                          assumed=True)
-        settled.append(one)
-    return settled
+            self.columns[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
+                                         assumed=not degrees, moves=bool(np.ptp(mine[1]) > TURNED))
+        axes = [self.raw(f"{stream}.{axis}") for axis in ("x", "y")]
+        rate = max((float(np.percentile(np.abs(_rate(*one)[1]), 90)) for one in axes if one is not None), default=0.0)
+        for role in (f"{stream}.x", f"{stream}.y"):
+            if (one := self.columns.get(role)) and one.unit not in UNITS["length"] and self.raw(role):
+                self.columns[role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
+                                             assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW)
+        for role in (f"{stream}.{one}" for one in ("qx", "qy", "qz", "qw")):
+            if one := self.columns.get(role):
+                self.columns[role] = replace(one, unit="-")
+
+    def heading(self, stream: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Times [s] and heading [rad] of a pose, without jumps."""
+        parts = [part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))]
+        if len(parts) == 4 and len({len(part[0]) for part in parts}) == 1:
+            w, x, y, z = (part[1] for part in parts)
+            return parts[0][0], np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+        yaw = self.signal(f"{stream}.yaw")
+        return (yaw[0], np.unwrap(yaw[1])) if yaw else None
 
 
 def _first(*signals: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:

@@ -70,12 +70,8 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
 def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
     if name == "odometry" and (found := [*_resets(trials), *_empty_speeds(trials)]):
         return found
-    lates = [late for trial in trials if (late := lateness(trial, name)) is not None]
-    if len(lates) > len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
-        late = float(np.median(lates))
-        return [f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the speeds "
-                f"beside it: another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s "
-                f"{'from' if late > 0 else 'to'} its t."]
+    if said := another_clock(name, trials):
+        return [said]
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
         return []
@@ -101,6 +97,21 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
         return [f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
                 f"the vehicle's. Correct them: {remedy}."]
     return []
+
+
+def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:
+    """A sentence on a stream of which most trials come later or earlier than the speeds beside it; else empty.
+
+    Args:
+        beside: "commands" compares with these, though there is an odometry.
+    """
+    lates = [late for trial in trials if (late := lateness(trial, name, beside == "commands")) is not None]
+    if len(lates) <= len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
+        return ""
+    late = float(np.median(lates))
+    return (f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the {beside}: "
+            f"another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s {'from' if late > 0 else 'to'} its "
+            "t.")
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -171,11 +182,14 @@ def _explained(signal: np.ndarray, design: np.ndarray) -> float:
     return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
 
 
-def lateness(trial: Trial, name: str) -> float | None:
+def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
     explains what nothing else does; None otherwise.
 
     Rates of turning are compared, or of motion where there is no turn: no frame changes them.
+
+    Args:
+        beside: compare with the commands, though there are measured speeds.
     """
     source, odometry = getattr(trial, name), trial.odometry
     if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
@@ -188,7 +202,7 @@ def lateness(trial: Trial, name: str) -> float | None:
                  for one in (source.x, source.y, source.yaw))
     held = command_in_force(trial.command, t - RESPONSE)
     v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    commanded = odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
+    commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
     if odometry is not None and not commanded:
         v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
     pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))

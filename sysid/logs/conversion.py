@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,7 +22,7 @@ from sysid.logs.records import Log, PoseStream, Start, Trial
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
-from whill_mjx.io.command_line import Range
+from whill_mjx.io.command_line import WRITING, Range
 from whill_mjx.io.fields import COLUMNS
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
@@ -117,6 +118,8 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         what = "a pipe or a device" if config.source.exists() else "does not exist"
         raise FileNotFoundError(f"{config.source}: {what}. Give a ROS bag, a CSV file, a folder of them, or a measured "
                                 "set.")
+    if config.out.exists() and config.out.samefile(config.source):
+        raise ValueError(f"--out {config.out}: exists already, and is the source. Choose another --out.")
     bags = find_bags(config.source)
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
@@ -137,18 +140,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         notes, more = [*left, *said], more | fields
     elif bags:
         spec = _spec(config)
-        wheels = config.input == "wheels"
-        drives, notes, refused = _bags_drives(bags, config, spec, wheels)
-        if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
-            try:
-                drives, notes, refused = _bags_drives(bags, config, spec, True)
-                wheels = True
-            except ValueError:
-                drives = []
-            if not drives:
-                _, _, refused = _bags_drives(bags, config, spec, False)
-        if not drives and refused:
-            raise refused[0]
+        drives, notes, wheels = _any_drives(bags, config, spec)
         if wheels:
             more["input"] = "wheels"
     else:
@@ -171,6 +163,20 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _any_drives(
+    bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec
+) -> tuple[list[Drive], list[str], bool]:
+    """Trials of several bags, notes, and whether their input is measured wheel speeds: where no bag has commands."""
+    wheels = config.input == "wheels"
+    drives, notes, refused = _bags_drives(bags, config, spec, wheels)
+    if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
+        drives, more, _ = _bags_drives(bags, config, spec, True)
+        wheels, notes = bool(drives), more if drives else notes
+    if not drives and refused:
+        raise refused[0]
+    return drives, notes, wheels
 
 
 def _bags_drives(
@@ -230,8 +236,8 @@ def bag_drives(
     bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
     imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
     bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
-    times = stream_times(bag, config.stamp)
     said = clock_notes(bag, config.stamp)
+    times = stream_times(bag, config.stamp)
     try:
         more = stream_times(imu, config.stamp), clock_notes(imu, config.stamp)
         _check_rates(imu)
@@ -414,18 +420,15 @@ def write_dataset(
         Notes on the trials that were left out.
 
     Raises:
-        ValueError: a trial exists already, two have one name, or none is accepted. Nothing was written then.
+        ValueError: a trial exists already with other contents, two have one name, or none is accepted. Nothing was
+            written then.
     """
     names = [drive.name for drive in drives]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"{folder}: two trials would be named {twice[0]!r}. Rename one of the bags.")
-    for name in names:
-        if (folder / "trials" / name).exists():
-            raise ValueError(f"{folder / 'trials' / name}: exists already; a conversion never replaces a trial. Choose "
-                             "another --out, or remove the trial.")
     known = (folder / "dataset.toml").exists()
-    if known and held_out:
+    if known and held_out and set(held_out) != set(read_fields(folder / "dataset.toml").get("held_out", ())):
         raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
                          "trials to its held_out by hand.")
     if known and any((folder / "trials").glob("*")):
@@ -433,7 +436,8 @@ def write_dataset(
         if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
             raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
                              "trials is another. Choose another --out.")
-    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    made, partial = not folder.exists(), folder / ".partial"
+    shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
     try:
         accepted, refused = _write_accepted(partial, drives)
         notes = [f"left out: {str(error).replace(str(partial), str(folder))}" for error in refused.values()]
@@ -445,14 +449,38 @@ def write_dataset(
         if not known:
             write_fields(partial, spec, held_out, more)
             spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
-        (folder / "trials").mkdir(parents=True, exist_ok=True)
-        if not known:
-            os.replace(partial / "dataset.toml", folder / "dataset.toml")
-        for name in accepted:
-            os.replace(partial / "trials" / name, folder / "trials" / name)
+        for name in refused:
+            shutil.rmtree(partial / "trials" / name)
+        there = [name for name in accepted if (folder / "trials" / name).exists()]
+        for name in there:
+            if _contents(folder / "trials" / name) != _contents(partial / "trials" / name):
+                raise ValueError(f"{folder / 'trials' / name}: exists already, with other contents; a conversion never "
+                                 "replaces a trial. Choose another --out, or remove the trial.")
+        notes += [f"{name} is there already, with the same contents" for name in there]
+        _place(partial, folder, [name for name in accepted if name not in there])
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            if made and not any(folder.iterdir()):
+                folder.rmdir()
     return notes
+
+
+def _place(partial: Path, folder: Path, trials: Sequence[str]) -> None:
+    """Move what was written to its place, in one step where the dataset is new."""
+    with WRITING:
+        if (partial / "dataset.toml").exists():
+            os.replace(partial / "dataset.toml", folder / "dataset.toml")
+        if not (folder / "trials").exists():
+            os.replace(partial / "trials", folder / "trials")
+        else:
+            for name in trials:
+                os.replace(partial / "trials" / name, folder / "trials" / name)
+
+
+def _contents(trial: Path) -> dict[str, bytes]:
+    """Content of each stream of a trial."""
+    return {stream: path.read_bytes() for stream in HEADERS if (path := trial / f"{stream}.csv").exists()}
 
 
 def _write_accepted(folder: Path, drives: Sequence[Drive]) -> tuple[list[str], dict[str, ValueError]]:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.contradictions import contradictions
+from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import Log, Trial, command_in_force
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
-from sysid.logs.time_faults import time_faults
+from sysid.logs.time_faults import time_faults, uncommanded
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
@@ -119,13 +119,15 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
     """
     trials, skid = log.trials, log.spec.drive == "skid"
     found = []
+    cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
+        said: list[str] = []
         shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
             gains = _gains(trials, channel, index, list(shifts.values()))
-            if not gains or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
+            if not gains or cut or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
             least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn
             gain, follows = max(gains, key=lambda one: (least < one[0] < 2.0, abs(one[1])))
@@ -134,14 +136,16 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
             where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
             odd = not least < gain < 2.0
             if odd and abs(follows) < FOLLOWS:
-                found.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
+                said.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
             elif gain < 0:
-                found.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
+                said.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
             elif odd:
-                found.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
+                said.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
+        late = another_clock(channel, trials, "commands") if said else ""
+        found += [late] if late else said  # such a log shows neither sign nor unit
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
         ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:

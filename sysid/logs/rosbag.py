@@ -8,6 +8,7 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,6 +52,7 @@ OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground
 SUFFIXES = (".db3", ".mcap", ".bag")
 PACKED = (".zst", ".zstd")
 UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
+DAY, STRAY = 86400.0, 0.01  # s from most messages, and the share of them, up to which a time of receipt is no clock's
 MAX_SET_BACK = 0.5  # s that a stamp may run back by before the clock counts as set
 
 
@@ -123,55 +125,79 @@ def read_bag(
         with AnyReader([path], default_typestore=store) as reader:
             known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
             chosen = choose_topics(path, known, topics or {}, notes, wheels)
-            rows: dict[str, list[tuple[float, float, tuple[float, ...]]]] = {stream: [] for stream in chosen}
-            names = {topic: stream for stream, topic in chosen.items()}
-            connections = [one for one in reader.connections if one.topic in names]
-            for connection, received, raw in reader.messages(connections=connections):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                stream = names[connection.topic]
-                rows[stream].append((received * 1e-9, header_time(message), read_message(
-                    stream, short_type(connection.msgtype), message)))
+            rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
             raise
         raise ValueError(f"{path}: cannot be read as a ROS bag ({str(error)[:LONGEST_REASON]}). Give the folder with "
-                         "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` "
-                         "repairs one.") from None
+                         "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` or "
+                         "`mcap recover` repairs one.") from None
+    spare = {"imu"} if (topics or {}).get("imu") is None else set()  # found by itself, and nothing depends on it
     streams = {}
     for stream, topic in chosen.items():
-        spare = stream == "imu" and (topics or {}).get(stream) is None  # found by itself, and nothing depends on it
-        if len(rows[stream]) < 2 and not spare:
-            raise _too_few(path, topic, len(rows[stream]), stream)
-        if not rows[stream]:
-            continue
-        table = np.array([values for _, _, values in rows[stream]], float)
-        unset = np.isinf(table).any(axis=1)
-        finite = np.isfinite(table).all(axis=1) | (short_type(known[topic]) == "JointState") & ~unset
-        if unset.all() and len(unset):
-            if short_type(known[topic]) == "JointState":
-                raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
-                                 "--command-topic.")
-            raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
-                             f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
-        if unset.any():
-            notes.append(f"{topic}: {unset.sum()} messages with an orientation that is all zero are left out")
-        if not (finite | unset).all():
-            notes.append(f"{topic}: {(~finite & ~unset).sum()} messages with numbers that are not finite are left out")
-        times, stamps = (np.array([row[k] for row in rows[stream]], float)[finite] for k in (0, 1))
-        if len(times) < 2 and spare:
-            notes.append(f"{topic}: {len(times)} usable messages; it is left out")
-            continue
-        if len(times) < 2:
-            raise _too_few(path, topic, len(times), stream)
-        values = table[finite]
-        if values.shape[1] != len(COLUMNS[stream]):
+        kept = _usable(path, stream, topic, short_type(known[topic]), rows[stream], notes)
+        if len(kept) >= 2:
             kind = short_type(known[topic])
-            times, stamps, values = _of_wheels(stream, kind, times, stamps, values, geometry)
-            if (step := float(np.median(np.diff(times)))) > COARSE:
-                notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. "
-                             "Ask the driver for 20 ms (publish_interval_ms)")
-        streams[stream] = BagStream(topic, known[topic], times, stamps, values)
+            times, stamps, values = kept[:, 0], kept[:, 1], kept[:, 2:]
+            if values.shape[1] != len(COLUMNS[stream]):
+                times, stamps, values = _of_wheels(stream, kind, times, stamps, values, geometry)
+                if (step := float(np.median(np.diff(times)))) > COARSE:
+                    notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not "
+                                 "show. Ask the driver for 20 ms (publish_interval_ms)")
+            streams[stream] = BagStream(topic, known[topic], times, stamps, values)
+        elif stream not in spare:
+            raise _too_few(path, topic, len(kept), stream)
+        elif len(kept):
+            notes.append(f"{topic}: {len(kept)} usable messages; it is left out")
     return Bag(path, streams, notes)
+
+
+def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
+    """Time of receipt and of the header [s] and columns of every message, by stream; damaged messages are left out.
+
+    Args:
+        names: topic -> stream.
+    """
+    rows: dict[str, list[tuple[float, ...]]] = {stream: [] for stream in names.values()}
+    broken: Counter[str] = Counter()
+    said = ""
+    for connection, received, raw in reader.messages(connections=[one for one in reader.connections
+                                                                  if one.topic in names]):
+        stream = names[connection.topic]
+        try:
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            rows[stream].append((received * 1e-9, header_time(message), *read_message(
+                stream, short_type(connection.msgtype), message)))
+        except Exception as error:  # the library lets out whatever a damaged message leads to
+            broken[connection.topic] += 1
+            said = said or str(error)
+    if broken and not any(rows.values()):
+        raise ValueError(said)
+    notes += [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()]
+    return rows
+
+
+def _usable(
+    path: Path, stream: str, topic: str, kind: str, rows: list[tuple[float, ...]], notes: list[str]
+) -> np.ndarray:
+    """The rows of a stream as a table, without those that say nothing; notes count these."""
+    if not rows:
+        return np.zeros((0, 2))
+    table = np.array(rows, float)
+    unset = np.isinf(table[:, 2:]).any(axis=1)
+    finite = np.isfinite(table[:, 2:]).all(axis=1) | (kind == "JointState") & ~unset
+    far = np.abs(table[:, 0] - np.median(table[:, 0])) > DAY
+    far &= far.mean() < STRAY
+    if unset.all():
+        if kind == "JointState":
+            raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
+                             "--command-topic.")
+        raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
+                         f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
+    notes += [f"{topic}: {which.sum()} messages {what} are left out" for which, what in (
+        (unset, "with an orientation that is all zero"), (~finite & ~unset, "with numbers that are not finite"),
+        (finite & far, "whose time is more than a day from the others'")) if which.any()]
+    return table[finite & ~far]
 
 
 def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
@@ -342,16 +368,22 @@ def stream_times(bag: Bag, stamp: str) -> dict[str, np.ndarray]:
             raise ValueError(f"{bag.path}: topic {stream.topic} is {stream.kind}, without a header. Use --stamp "
                              "receive.")
         t = stream.stamped if stamp == "header" and has_header else stream.received
+        if len(t) > 2 and np.ptp(t) == 0:
+            whose, other = ("of receipt", "header") if t is stream.received else ("in the header", "receive")
+            raise ValueError(f"{bag.path}: topic {stream.topic}: all {len(t)} messages have one time {whose}: the "
+                             "clock stood still, such as a simulation's that nobody published. "
+                             + (f"Use --stamp {other}." if has_header else "They have no other: record them again."))
         back = np.diff(t)
         if (back < -MAX_SET_BACK).any():
             k = int(np.argmin(back))
             raise ValueError(f"{bag.path}: topic {stream.topic}: its time goes back by {-back[k]:.3g} s after message "
                              f"{k + 1}; it must increase. Split the bag there, or use the other --stamp.")
         times[name] = t
-    if stamp == "header":
+    if stamp == "header" and times:
         late = {name: float(np.median(bag.streams[name].received - t)) for name, t in times.items()}
+        own = float(np.median(list(late.values()))) if all(map(_has_stamps, bag.streams.values())) else 0.0
         for name, seconds in late.items():
-            if abs(seconds) > 5.0:
+            if abs(seconds - own) > 5.0:  # from that of receipt, which commands without a header keep
                 raise ValueError(f"{bag.path}: topic {bag.streams[name].topic}: header stamps are {seconds:.3g} s from "
                                  "the time of receipt: another clock. Use --stamp receive.")
     return times

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import sys
 from collections import Counter
@@ -12,7 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.logs.columns import QUANTITIES, UNITS, Column, Table, guess, kind_of, read_decision, shown_units
+from sysid.logs.columns import (
+    QUANTITIES,
+    UNITS,
+    Column,
+    Table,
+    guess,
+    kind_of,
+    read_decision,
+    shown_units,
+    unit_named,
+    with_unit,
+)  # fmt: skip
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
@@ -25,6 +37,12 @@ DAY = 86400.0  # s
 PREAMBLE = 30  # lines above the names
 BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
 NAMED = 12  # columns that an error lists
+LEAST_OF: dict[str, list[tuple[str, ...]]] = {
+    "command": [("v",), ("left", "right")], "odometry": [("v", "omega"), ("x", "y", "yaw")],
+    "ground_truth": [("x", "y")], "wheels": [("left", "right"), ("left_angle", "right_angle")],
+}  # fmt: skip
+"""What of a stream must be there, at least one of these."""
+MISSING = ("", "nan", "na", "n/a", "null", "none", "-", "--")  # cells of samples that are missing
 
 
 @dataclass(frozen=True)
@@ -74,8 +92,12 @@ def read_drives(
                 refused.append(error)
         if not tables:
             continue
-        if source.is_file() or len(tables) > 1 and _each_whole(tables):
-            groups += [(table.stem, [table]) for table in tables]
+        whole = tables if source.is_file() else [table for table in tables if _is_whole(table)]
+        if source.is_file() or len(whole) > max(1, len(tables) / 2):
+            groups += [(table.stem, [table]) for table in whole]
+            refused += [ValueError(f"{files[0].parent / table.stem}: no drive by itself, as most files beside it are: "
+                                   "it lacks an input or a measurement.")
+                        for table in tables if all(table is not one for one in whole)]
         else:
             groups.append((files[0].absolute().parent.name, tables))
     if not groups and refused:
@@ -96,8 +118,7 @@ def join_drives(
     agreed: list[str] = list(said)
     for name, tables in groups:
         try:
-            columns, agreed = _decide(source, tables, agreed, units)
-            columns = [one for one in columns if not wheels or not one.role.startswith("command.")]
+            columns, agreed = _decide(source, tables, agreed, units, wheels)
             drives.append(_join(name, source, tables, columns, geometry))
         except ValueError as error:
             at = "" if str(source) in str(error) else f"{source}: "
@@ -117,7 +138,7 @@ def read_table(path: Path) -> Table:
     if not data:
         raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
     split = _splitter(data[len(data) // 2][1])
-    data = _without_preamble(data, split)
+    data = _without_preamble(path, data, split)
     if path.read_bytes()[:1] == b"%" and comments and len(_cells(comments[0], split)) == len(_cells(data[0][1], split)):
         header = _cells(comments[0], split)  # of `rostopic echo -p`
     elif not _is_numbers([cell.replace(",", ".") for cell in _cells(data[0][1], split)]):
@@ -125,9 +146,11 @@ def read_table(path: Path) -> Table:
     elif comments and len(_cells(comments[-1], split)) == len(_cells(data[0][1], split)):
         header = _cells(comments[-1], split)
     rows = [_cells(line, split) for _, line in data]
-    if split in ("\t", ";", None) and rows and not any("." in cell for cell in rows[0]):
+    if rows and not any("." in cell for cell in rows[0]):
         rows = [[cell.replace(",", ".") for cell in row] for row in rows]  # decimal commas
     width = len(header) if header is not None else len(rows[0]) if rows else 0
+    if rows and all(len(row) > width and not any(row[width:]) for row in rows):
+        rows = [row[:width] for row in rows]  # each row ends with a separator, and the names do not
     if rows and len(rows[-1]) != width:
         rows = rows[:-1]  # a recorder that was stopped
     for (number, _), row in zip(data, rows, strict=False):
@@ -135,18 +158,34 @@ def read_table(path: Path) -> Table:
             raise ValueError(f"{path}, line {number}: has {len(row)} cells, the first row {width}. Save it again.")
     if len(rows) < LEAST:
         raise ValueError(f"{path}: {counted(len(rows), 'row')}; at least {LEAST} are needed. Give the whole recording.")
-    numbers = {}
+    if header is not None and all(unit_named(cell) for cell in rows[0] if cell) and any(rows[0]):
+        header, data, rows = list(map(with_unit, header, rows[0])), data[1:], rows[1:]
     if header is None:
         header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
     odd = next((name for name in header if not name.isprintable() or len(name) > LONGEST_NAME), None)
     if odd is not None:
         raise ValueError(f"{path}: column {shown(odd)}: a name has at most {LONGEST_NAME} printable characters. "
                          "Correct it.")
-    for k, name in enumerate(header):
-        values = _numbers([row[k] for row in rows])
-        if np.isfinite(values).sum() > 2 and name.strip() and name.strip() not in numbers:
-            numbers[name.strip()] = values
-    return Table(path.stem, _with_whole_stamps(numbers))
+    return _table(path, header, rows, [number for number, _ in data])
+
+
+def _table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], lines: Sequence[int]) -> Table:
+    """The columns of a file that hold numbers, and notes on their cells that do not."""
+    numbers: dict[str, np.ndarray] = {}
+    odd: dict[str, str] = {}
+    for name, *cells in zip((one.strip() for one in header), *rows, strict=True):
+        values = _numbers(cells)
+        known = np.isfinite(values)
+        if known.sum() < 3 or not name:
+            continue
+        if name in numbers and not np.array_equal(numbers[name], values, equal_nan=True):
+            raise ValueError(f"{path}: two columns are named {shown(name)} and differ. Give each its own name.")
+        numbers[name] = values
+        wrong = [int(k) for k in np.flatnonzero(~known) if cells[k].lower() not in MISSING]
+        if wrong:
+            odd[name] = (f"{counted(len(wrong), 'cell')} of {name} {'is no number' if len(wrong) == 1 else 'are none'} "
+                         f"({shown(cells[wrong[0]])} in line {lines[wrong[0]]}): left out")
+    return Table(path.stem, _with_whole_stamps(numbers), odd)
 
 
 def _texts(folder: Path) -> list[Path]:
@@ -160,15 +199,33 @@ def _splitter(line: str) -> str | None:
 
 
 def _cells(line: str, split: str | None) -> list[str]:
-    return [cell.strip().strip('"').strip() for cell in (line.split(split) if split else line.split())]
+    if '"' in line and split:  # a cell in quotes may hold the separator
+        found = next(csv.reader([line], delimiter=split, skipinitialspace=True))
+    else:
+        found = line.split(split)
+    return [cell.strip().strip('"').strip() for cell in found]
 
 
-def _without_preamble(data: list[tuple[int, str]], split: str | None) -> list[tuple[int, str]]:
-    """Lines from the first that has as many cells as most: above it a logger may say who it is."""
+def _without_preamble(path: Path, data: list[tuple[int, str]], split: str | None) -> list[tuple[int, str]]:
+    """Lines from the first that has as many cells as most: above it a logger may say who it is.
+
+    Raises:
+        ValueError: above the first row stand names, but not as many as the row has cells.
+    """
     counts = [len(_cells(line, split)) for _, line in data]
     usual = Counter(counts).most_common(1)[0][0]
     first = counts.index(usual)
-    return data[first:] if first <= PREAMBLE else data
+    if not 0 < first <= PREAMBLE:
+        return data
+    names, row = _cells(data[first - 1][1], split), _cells(data[first][1], split)
+    texts = all(names) and not any(_is_numbers([one]) for one in names)
+    if texts and _is_numbers(row) and 1 < len(names) and usual <= 2 * len(names):
+        if not any(row[len(names) :]) and len(row) > len(names):
+            return data[first - 1 :]
+        cause = " Are there decimal commas in it? Write decimals with a point, or part the cells by semicolons." if (
+            split == "," and usual > len(names)) else " Save it again."
+        raise ValueError(f"{path}, line {data[first][0]}: has {usual} cells, the names above it {len(names)}.{cause}")
+    return data[first:]
 
 
 def _numbers(cells: Sequence[str]) -> np.ndarray:
@@ -194,7 +251,7 @@ def _seconds(cell: str) -> float:
 
 def _number(cell: str) -> float:
     try:
-        return float(cell)
+        return float("nan" if "_" in cell else cell)  # 1_0 is a number in Python alone
     except ValueError:
         return float("nan")
 
@@ -215,12 +272,10 @@ def _with_whole_stamps(numbers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return numbers
 
 
-def _each_whole(tables: Sequence[Table]) -> bool:
-    """Whether each of several files is a drive of its own: with an input and a measurement."""
-    def streams(table: Table) -> set[str]:
-        return {one.role.partition(".")[0] for one in guess([table])} - {"time"}
-
-    return all(len(streams(table)) > 1 for table in tables)
+def _is_whole(table: Table) -> bool:
+    """Whether a file is a drive of its own: with an input and a measurement."""
+    streams = {one.role.partition(".")[0] for one in guess([table])} - {"time"}
+    return len(streams) > 1 and bool(streams & {"command", "ground_truth"})
 
 
 def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
@@ -229,11 +284,15 @@ def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
 
 
 def _decide(
-    source: Path, tables: Sequence[Table], said: Sequence[str], units: Mapping[tuple[str, str], str]
+    source: Path, tables: Sequence[Table], said: Sequence[str], units: Mapping[tuple[str, str], str], wheels: bool
 ) -> tuple[list[Column], list[str]]:
     """What the columns hold: as said, as guessed from names and numbers, and as answered on a terminal."""
+    def guessed_now() -> list[Column]:
+        found = guess(tables, decided, units)
+        return [one for one in found if not wheels or not one.role.startswith("command.")]
+
     decided = _said_of(tables, said)
-    columns = guess(tables, decided, units)
+    columns = guessed_now()
     problem = _problem(tables, columns)
     if problem and sys.stdin.isatty() and sys.stdout.isatty():
         print(f"{source}: {problem}\nGuessed:")
@@ -242,7 +301,7 @@ def _decide(
         print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
         answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
         decided += [read_decision(text, tables) for text in answer.split()]
-        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guess(tables, decided, units)]
+        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guessed_now()]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
         names = [f"{table.stem}/{name}" for table in tables for name in table.columns]
@@ -268,6 +327,15 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     timeless = sorted(used - {one.file for one in columns if one.role == "time"})
     if timeless:
         return f"no column of {timeless[0]} is surely its time."
+    arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
+    for one in columns:
+        values = arrays[one.file, one.name]
+        if one.role == "time" and one.file in used and np.nanmin(values) == np.nanmax(values):
+            return f"time stands still in {one.file}/{one.name}."
+    commands = _has(roles, "command", "v") or _has(roles, "command", "left", "right")
+    if not commands and (found := [one for one in columns if one.role.startswith("command.")]):
+        return (f"{found[0].file}/{found[0].name} is the only part of a command: v and omega, or left and right belong "
+                "to it.")
     inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
     measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
         roles, "odometry", "x", "y")
@@ -278,6 +346,8 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         return "the odometry has only one of v and omega."
     if not inputs and not _has(roles, "odometry", "v", "omega"):
         return "there are neither commands (v, omega) nor wheel speeds."
+    if not commands and not _has(roles, "ground_truth", "x", "y"):
+        return "there are measured speeds, and neither commands nor an outside pose to compare them with."
     if not measured and not (_wheels(roles) and _has(roles, "command", "v", "omega")):
         return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
     if unsure := [one for one in columns if not one.sure]:
@@ -297,8 +367,17 @@ def _wheels(roles: set[str]) -> bool:
 def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Column],
           geometry: tuple[float, float]) -> TextDrive:
     """The streams of one drive on one clock."""
-    streams = {stream: found for stream in QUANTITIES if (found := _stream(stream, tables, columns))}
-    notes = []
+    notes = [f"{table.stem}: {table.odd[one.name]}" for table in tables for one in columns
+             if one.file == table.stem and one.name in table.odd]
+    streams: dict[str, dict[str, np.ndarray]] = {}
+    for stream in QUANTITIES:
+        found, said = _stream(stream, tables, columns)
+        if found and not any(set(one) <= set(found) for one in LEAST_OF[stream]):
+            parts = " and ".join(f"{stream}.{one}" for one in LEAST_OF[stream][0])
+            said = [f"{stream}: only {', '.join(sorted(set(found) - {'t'}))} of {parts}: left out"]
+        elif found:
+            streams[stream] = found
+        notes += said
     made: dict[str, np.ndarray] = {}
     if "command" in streams:
         made["command"] = _as_twist(streams["command"], columns, "command", geometry)
@@ -330,14 +409,18 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
         raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
+    notes = list(dict.fromkeys(note.removeprefix(f"{name}: ") for note in notes))
     return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)
 
 
-def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> dict[str, np.ndarray]:
-    """Rows of a stream in SI units in order of time, by quantity and "t"; those with an empty cell are left out."""
+def _stream(
+    stream: str, tables: Sequence[Table], columns: Sequence[Column]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Rows of a stream in SI units in order of time, by quantity and "t", and notes; those with an empty cell are left
+    out."""
     mine = [one for one in columns if one.role.startswith(f"{stream}.")]
     if not mine:
-        return {}
+        return {}, []
     files = {one.file for one in mine}
     file = max(files, key=lambda name: sum(one.file == name for one in mine))  # a stream is in one file
     mine = [one for one in mine if one.file == file]
@@ -349,13 +432,18 @@ def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> 
         size = (wheel if one.role.endswith(("left", "right")) else UNITS[kind_of(one.role)])[one.unit]
         found[one.role.partition(".")[2]] = table.columns[one.name] * size
     whole = np.isfinite(list(found.values())).all(axis=0)
-    _check_clock(file, found["t"][whole])
-    order = np.argsort(found["t"][whole], kind="stable")
-    found = {key: values[whole][order] for key, values in found.items()}
-    later = np.append(True, np.diff(found["t"]) > 1e-6) if len(found["t"]) else np.zeros(0, bool)
-    found = {key: values[later] for key, values in found.items()}
+    found = {key: values[whole] for key, values in found.items()}
+    notes = _check_clock(file, found["t"])
+    order = np.argsort(found["t"], kind="stable")
+    later = np.diff(found["t"][order], prepend=-np.inf) > 1e-6
+    found = {key: values[order][later] for key, values in found.items()}
     if len(found["t"]) < 2:
-        raise ValueError(f"{file}: {stream} needs at least 2 rows without an empty cell, and has {len(found['t'])}.")
+        raise ValueError(f"{file}: {stream} needs at least 2 rows without an empty cell, at two times, and has "
+                         f"{len(found['t'])}.")
+    if not later.all():
+        rounded = ": is its time rounded, as to whole seconds?" if later.mean() < 0.5 else ""
+        notes.append(f"{file}: {counted(int((~later).sum()), 'row')} of {len(later)} of {stream} at the time of the "
+                     f"row before left out{rounded}")
     if {"qx", "qy", "qz", "qw"} <= set(found):
         from sysid.logs.rosbag import yaw_of
 
@@ -363,19 +451,22 @@ def _stream(stream: str, tables: Sequence[Table], columns: Sequence[Column]) -> 
             found["qw"], found["qx"], found["qy"], found["qz"], strict=True)])
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
-    return found
+    return found, notes
 
 
-def _check_clock(file: str, t: np.ndarray) -> None:
-    """Refuse a stream whose time (T,) goes back by more than rows out of order do; sorted, it would mix two moments."""
+def _check_clock(file: str, t: np.ndarray) -> list[str]:
+    """Notes on a stream's time (T,), or a refusal where it goes back by more than rows out of order do: sorted, it
+    would mix two moments."""
     steps = np.diff(t)
-    if not len(steps) or (steps <= 0).mean() > 0.5:
-        return  # the newest row comes first
+    if (steps < 0).sum() > len(steps) / 2:
+        return [f"{file}: its newest row comes first; its rows are turned round"]
     least = max(BACK[0] * float(np.median(np.abs(steps))), BACK[1])
     if len(back := np.flatnonzero(steps < -least)):
         k = int(back[0])
         raise ValueError(f"{file}: its time goes back by {-steps[k]:.2f} s after row {k + 1} ({t[k] - t[0]:.1f} s into "
                          "it): the clock was set back, or the recording began again. Cut the file there.")
+    late = int((steps < 0).sum())
+    return [f"{file}: {counted(late, 'row')} out of order, sorted by time"] if late else []
 
 
 def _with_rates(wheels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -12,7 +12,9 @@ from sysid.logs.records import OdometryStream, Trial
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at
 MOVED = 0.5  # share of the way that a speed gives over a gap, below which the gap was none
-LEAST = 0.1  # m or rad of that way
+LEAST = 0.1  # m or rad of that way; m/s or rad/s of a speed that changes
+SETTLED = 3.0  # s after the last command in which a vehicle may still follow it
+CHANGED = 0.3  # of the usual range of a speed, in which it changes by itself at most
 
 
 def time_faults(trials: Sequence[Trial]) -> list[str]:
@@ -32,6 +34,11 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
                      f"({timeout.low:.2f} to {timeout.high:.2f}) after the last one: its base has a time-out. Fits "
                      f"take it from the log; to state it, write command_timeout = {max(timeout.value, 0.01):.2f} into "
                      "dataset.toml.")
+    if cut := [(trial.name, rest) for trial in trials if (rest := uncommanded(trial))]:
+        name, rest = cut[0]
+        found.append(f"command: in {len(cut)} of {len(trials)} trials ({name}) the commands end {rest:.1f} s before "
+                     "the odometry, and the vehicle goes on to change its speed: the rest of them was not recorded. "
+                     "Cut the trial where they end, or record all of them.")
     jumps = [(trial.name, *jump) for trial in trials if (jump := forward_jump(trial)) is not None]
     if jumps:
         name, at, seconds = jumps[0]
@@ -39,6 +46,21 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
                      f"{seconds:.2g} s in which the vehicle hardly moved, though it drives before and after: the clock "
                      "was set forward. Split the trial there, or take the jump out of all of its streams.")
     return found
+
+
+def uncommanded(trial: Trial) -> float:
+    """For how long a vehicle changes its speed after it had the time to follow the last command [s]; else 0."""
+    stream = trial.odometry
+    if stream is None or len(stream.t) < 20:
+        return 0.0
+    rest = stream.t > trial.command.t[-1] + SETTLED
+    if rest.sum() < 2 or np.ptp(stream.t[rest]) < SETTLED:
+        return 0.0
+    for speed in (stream.v, stream.omega):
+        whole, after = (float(np.ptp(np.percentile(one, (5, 95)))) for one in (speed, speed[rest]))
+        if after > max(CHANGED * whole, LEAST):
+            return float(stream.t[-1] - trial.command.t[-1])
+    return 0.0
 
 
 def forward_jump(trial: Trial) -> tuple[float, float] | None:

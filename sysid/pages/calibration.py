@@ -18,14 +18,25 @@ UNKNOWN = ("Without an outside pose this log does not separate errors of wheel r
            "from one another: they are taken as stated, and the odometry's path has their error.")
 
 
-def calibration_notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:
+def calibration_notes(
+    estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial], kept: Sequence[str] = ()
+) -> list[str]:
     """Sentences on radius, track, the odometry's scales and the tracked point; those that a log leaves open are named.
 
     Args:
         estimates: of all fitted parameters.
         spec: with the stated radius and track.
         trials: that were fitted.
+        kept: groups that keep their stated values (`sysid.search.stated`).
     """
+    notes = _notes(estimates, spec, trials)
+    if kept:
+        notes.append(f"Stated values are kept for {', '.join(kept)}: with free ones, drives that were held back came "
+                     "out no better.")
+    return notes
+
+
+def _notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:
     found = {one.name: one for one in estimates}
     if not any(trial.ground_truth is not None for trial in trials):
         return [UNKNOWN]

@@ -125,7 +125,7 @@ def _spoken(name: str) -> str:
 
 
 def headline(report: dict[str, Any]) -> str:
-    """One sentence: the error that the fit is judged by."""
+    """Two sentences: the error that the fit is judged by, and those it is compared with."""
     part = "held_out" if report["summary"]["held_out"] else "training"
     channels = report["summary"][part]
     channel = "ground_truth" if "trajectory" in channels.get("ground_truth", {}) else "odometry"
@@ -134,12 +134,12 @@ def headline(report: dict[str, Any]) -> str:
         return "No position was measured; see the table."
     which = "On drives that were never fitted" if part == "held_out" else "On the drives that were fitted"
     where = "" if channel == "ground_truth" else " of the odometry"
-    text = (f"{which}, the predicted position{where} is off by {_cm(one['fitted'])}, by {_cm(one['initial'])} before "
-            f"the fit, and by {_cm(one['ideal'])} for a vehicle that follows its commands at once")
+    text = f"{which}, the predicted position{where} is off by {_cm(one['fitted'])}"
     if one.get("noise_floor") and one["fitted"] is not None:
-        text += (f"; two repeats of one drive differ by {_cm(one['noise_floor'])} (ratio "
-                 f"{number(one['fitted'] / one['noise_floor'])})")
-    return text + "."
+        times = f"{one['fitted'] / one['noise_floor']:.1f}"
+        text += f", {times} times what two repeats of one drive differ by ({_cm(one['noise_floor'])})"
+    return (f"{text}. It was off by {_cm(one['initial'])} before the fit, and is off by {_cm(one['ideal'])} for a "
+            "vehicle that follows its commands at once.")
 
 
 def _cm(metres: float | None) -> str:

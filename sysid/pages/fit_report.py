@@ -49,7 +49,7 @@ def make_report(
         "schema": SCHEMA, "kind": KIND,
         "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
                     "notes": [*log.notes, *thin.notes(fit.space),
-                              *calibration_notes(fit.uncertainty.estimates, log.spec, log.training),
+                              *calibration_notes(fit.uncertainty.estimates, log.spec, log.training, fit.stated),
                               *(fit.model.notes if fit.model is not None else ())],
                     "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out],

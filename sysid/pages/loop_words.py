@@ -172,7 +172,7 @@ def _found(report: Mapping[str, Any]) -> str:
         return f"What explains these drives is {' and '.join(texts)}."
     where = [one["quantity"] for one in report["lives_in"][:2]]
     return ("These drives differ from the vehicle as it was, in a way that no effect of the catalogue has"
-            + (f"; the difference goes with {' and '.join(where)}." if where else "."))
+            + (f"; the difference depends on {' and on '.join(where)}." if where else "."))
 
 
 def _open(report: Mapping[str, Any]) -> str:

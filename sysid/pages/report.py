@@ -111,7 +111,7 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
     if series is None:
         series = load(run) if (run / FILE).is_file() else replay(run, report)
     try:
-        page = html_page(f"Fit of {report['dataset']['vehicle']} to {report['dataset']['name']}",
+        page = html_page(f"Fit of {report['dataset']['vehicle']} to the log {report['dataset']['name']}",
                          [*sections, *fit_sections(report, series)], f"data SHA-256 {report['dataset']['sha256'][:16]}",
                          kind="Fit", lead=headline(report))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, ArithmeticError) as error:

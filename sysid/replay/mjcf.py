@@ -84,6 +84,32 @@ def mjcf_model(
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     robot = load_robot(Path(path), wheels, wheel_radius, track, timestep, regulated=calibrate)
+    host = robot.host
+    bounds, entries = _searched(robot, parameters, calibrate)
+    # A mass scales its inertia: before an inertia is set by itself.
+    entries = dict(sorted(entries.items(), key=lambda one: getattr(one[1], "array", "") != "body_mass"))
+    if room_fixed is None:
+        world = host.geom_bodyid == 0
+        room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
+    params = make_parameters(bounds, room_fixed=room_fixed)
+    plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
+                              wheel_radius=robot.wheel_radius, track=robot.track, drive=RobotDrive(robot, entries))
+
+    def write(folder: Path, params: Parameters) -> Path:
+        return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
+                                  if name in entries}, Path(folder) / "model.xml")
+
+    around = AROUND_ROBOT if calibrate else ()
+    def vehicle(params: Parameters, spec: VehicleSpec) -> Twin | str:
+        return vehicle_of(robot, entries, params, spec)
+
+    return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle).with_effects(effects)
+
+
+def _searched(
+    robot: Robot, parameters: Mapping[str, tuple[float, float]] | Sequence[str] | None, calibrate: bool
+) -> tuple[dict[str, Bounds], dict[str, Entry | Size]]:
+    """Bounds of what is fitted, and its places in the model; arguments as of `mjcf_model`."""
     host, names = robot.host, default_paths(robot) if parameters is None else tuple(parameters)
     bounds: dict[str, Bounds] = {}
     entries: dict[str, Entry | Size] = {}
@@ -117,33 +143,16 @@ def mjcf_model(
             bounds[name] = (float(np.clip(value, low, high)), low, high, size.unit)
             continue
         if name in SIZES:
-            raise ValueError(f"{path}: {name} cannot be fitted: a driven wheel rolls on something that is no sphere, "
-                             "cylinder or capsule. Give it one, or leave this parameter out.")
+            raise ValueError(f"{robot.path}: {name} cannot be fitted: a driven wheel rolls on something that is no "
+                             "sphere, cylinder or capsule. Give it one, or leave this parameter out.")
         entries[name] = entry = resolve(robot, name)
         value = entry.read(host)
         if given is None and value == 0:
-            raise ValueError(f"{path}: {name} is 0 in the file, so that its bounds cannot be guessed. Give them: "
+            raise ValueError(f"{robot.path}: {name} is 0 in the file, so that its bounds cannot be guessed. Give them: "
                              f"parameters={{{name!r}: (lowest, highest)}}.")
         low, high = sorted((value / FACTOR, value * FACTOR)) if given is None else given
         bounds[name] = (float(np.clip(value, low, high)), low, high, entry.unit)
-    # A mass scales its inertia: before an inertia is set by itself.
-    entries = dict(sorted(entries.items(), key=lambda one: getattr(one[1], "array", "") != "body_mass"))
-    if room_fixed is None:
-        world = host.geom_bodyid == 0
-        room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
-    params = make_parameters(bounds, room_fixed=room_fixed)
-    plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
-                              wheel_radius=robot.wheel_radius, track=robot.track, drive=RobotDrive(robot, entries))
-
-    def write(folder: Path, params: Parameters) -> Path:
-        return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
-                                  if name in entries}, Path(folder) / "model.xml")
-
-    around = AROUND_ROBOT if calibrate else ()
-    def vehicle(params: Parameters, spec: VehicleSpec) -> Twin | str:
-        return vehicle_of(robot, entries, params, spec)
-
-    return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle).with_effects(effects)
+    return bounds, entries
 
 
 def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:

@@ -50,6 +50,7 @@ from sysid.search.settings import (
     TRIED,
     FitConfig,
 )
+from sysid.search.stated import chosen_sizes
 from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
@@ -88,6 +89,8 @@ class Fit:
     """Profile likelihoods of the parameters that `profile` names."""
     frame: float | None = None
     """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
+    stated: tuple[str, ...] = ()
+    """Groups of sizes that keep their stated values (`sysid.search.stated`)."""
 
 
 def fit_log(
@@ -106,36 +109,19 @@ def fit_log(
     began = time.perf_counter()
     log = of_earlier(log, config)
     given = make_problem(log, config, params, model)
-    if config.quick and given.plant.host is not None:
+    if given.plant.host is not None:
         config = replace(config, elsewhere=False)
-    model, plant, params, space, objective = given.model, given.plant, given.params, given.space, given.objective
-    trials = objective.trials
+    space, objective = given.space, given.objective
     wanted = profiled(space, config)
-
-    scan = coarse = search = None
-    points = least_squares.random_starts(space, config.starts, config.seed)
     iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
     stages = Stages(progress, 1 if config.method in GLOBAL else 3 if config.method == "lm" else 4)
-    if config.method in (*GLOBAL, "both"):
-        evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
-        cost = "paper" if config.method in GLOBAL else "weighted"
-        count = max(min(config.starts, 2) if config.quick else config.starts, 2)
-        problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in trials), "channels": config.channels,
-                   "model": config.preset if model is None else model.name, "step": f"{plant.dt:g}"}
-        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
-                       progress=stages.begin("global search"), storage=config.storage, study=config.study,
-                       problem=problem, method="cmaes" if config.method == "cmaes" else "tpe")
-        points = np.concatenate([points[:1], scan.starts])[:count]
-    elif config.method == "features":
-        first = stages.begin("features of motion")
-        starts.compile_ahead(objective, log.spec.track)
-        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=first)
-        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, first)
-        points = coarse.u[None]
+    scan, coarse, points = _first_points(log, given, config, stages)
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
     chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
+    robust, search = config.robust and config.method not in GLOBAL, None
+    stated: tuple[str, ...] = ()
+    profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
     if config.method in GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
@@ -144,14 +130,49 @@ def fit_log(
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
-    known = uncertainty.estimate(chosen, u, robust=config.robust and config.method not in GLOBAL)
+    known = uncertainty.estimate(chosen, u, robust=robust)
     traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    if config.calibrate and config.vehicle is None and config.method not in GLOBAL:
+        if progress is not None:
+            progress(0, "sizes: stated or free")
+        sizes = chosen_sizes(chosen, objective.renewed(u), known, final_cost, config.parameters, robust)
+        u, final_cost, stated = sizes.u, sizes.cost, sizes.names
+        # What the drives say of stated sizes counts as well, and they say it where all are free.
+        known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
-    fitted = set_parameters(params, space.names, values)
+    fitted = set_parameters(given.params, space.names, values)
     earlier = chosen.prior if config.vehicle is not None else None
-    return Fit(fitted, params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
-               profiles, time.perf_counter() - began, plant, earlier, model, tuple(traced), given.frame)
+    return Fit(fitted, given.params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
+               profiles, time.perf_counter() - began, given.plant, earlier, given.model, tuple(traced), given.frame,
+               stated)
+
+
+def _first_points(
+    log: Log, given: Problem, config: FitConfig, stages: Stages
+) -> tuple[FitResult | None, FitResult | None, np.ndarray]:
+    """Results of the global search and of the one on features, as far as the method has them, and the points (S, P)
+    from which the gradient search starts."""
+    space, objective = given.space, given.objective
+    points = least_squares.random_starts(space, config.starts, config.seed)
+    if config.method in (*GLOBAL, "both"):
+        evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
+        cost = "paper" if config.method in GLOBAL else "weighted"
+        count = max(min(config.starts, 2) if config.quick else config.starts, 2)
+        problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in objective.trials),
+                   "channels": config.channels, "model": config.preset if given.model is None else given.model.name,
+                   "step": f"{given.plant.dt:g}"}
+        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
+                       progress=stages.begin("global search"), storage=config.storage, study=config.study,
+                       problem=problem, method="cmaes" if config.method == "cmaes" else "tpe")
+        return scan, None, np.concatenate([points[:1], scan.starts])[:count]
+    if config.method == "features":
+        first = stages.begin("features of motion")
+        starts.compile_ahead(objective, log.spec.track)
+        points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=first)
+        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, first)
+        return None, coarse, coarse.u[None]
+    return None, None, points
 
 
 def choose(

@@ -55,7 +55,7 @@ class FitConfig:
     """Effects of the catalogue (docs/effects.md) that the model gets as well, fitted from where they do nothing."""
     calibrate: bool = True
     """Whether wheel radii, track, scales of the odometry and the tracked point are fitted as well, where an outside
-    pose shows them."""
+    pose shows them and drives that are held back come out better so."""
     profile: tuple[str, ...] = ()
     """Parameters whose profile likelihood is traced, or `all`: each takes a search of its own."""
     physics_dt: Annotated[float, PHYSICS_DT] = 0.0025

@@ -87,7 +87,8 @@ def refusal(path):
 @pytest.mark.quick
 @pytest.mark.parametrize("field, value", [
     ("schema", 2), ("schema", None), ("kind", "photo"), ("rate_hz", 0), ("rate_hz", "10"), ("action_repeat", 0),
-    ("action_repeat", True), ("carry", {}), ("camera", 3), ("files", {}), ("files", {"../policy.onnx": "0"}),
+    ("action_repeat", True), ("carry", {}), ("camera", 3), ("camera", {"fov_y": 0}),
+    ("files", {}), ("files", {"../policy.onnx": "0"}),
     ("carry", [{"name": "count", "shape": [-1], "dtype": "float32"}]), ("image", None),
     ("carry", [{"name": "count", "shape": [1], "dtype": "object"}]),
     ("action", {"names": ["omega", "v"], "units": ["m/s", "rad/s"], "low": [0, 0], "high": [1, 1]}),

@@ -15,7 +15,7 @@ from benchmarks.plant.first_day import SMALL, Day, Wrong, make_uncalibrated, tra
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.prior import UNKNOWN, bounds_alone
 from sysid.errors.space import make_space
-from sysid.intervals.uncertainty import Estimate
+from sysid.intervals.uncertainty import Estimate, estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
 from sysid.logs.synthetic import write_dataset
@@ -33,6 +33,7 @@ from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
+from sysid.search.stated import chosen_sizes
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import get_values, set_values
@@ -224,6 +225,23 @@ def test_the_first_calibration_of_an_own_robot_comes_out_of_two_drives_on_the_co
     assert values["pose_mount.yaw"] == pytest.approx(0.14, abs=0.01)
     assert values["odometry_scale.linear"] == pytest.approx(1.0, abs=0.01)
     assert values["drive.kp"] == pytest.approx(SMALL.kp, rel=0.4)
+
+
+@pytest.mark.long
+def test_wrong_sizes_of_an_own_robot_stay_free_although_two_drives_cannot_foretell_each_other(small_robot):
+    log, file = small_robot
+    given = make_problem(log, FitConfig(model=str(file)))
+    start = given.space.to_unit(given.space.initial)
+    features = make_features_objective(given.objective, log.spec.track)
+    found = least_squares.fit(features, given.space, starts=start[None], iterations=4)
+    binned = features.renewed(found.u)
+    known = estimate(binned, found.u, robust=True)
+    chosen = chosen_sizes(binned, given.objective.renewed(found.u), known, found.cost)
+    assert chosen.names == ("scales of the odometry",)
+    values = dict(zip(given.space.names, given.space.to_values(chosen.u), strict=True))
+    assert values["wheels.radius"] == pytest.approx(0.033 * 1.03, rel=0.01)
+    assert values["wheels.track"] == pytest.approx(0.16 * 0.95, rel=0.01)
+    assert values["odometry_scale.angular"] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("write", [write_urdf, write_mjcf])

@@ -9,7 +9,10 @@ import zipfile
 
 import numpy as np
 import pytest
+from damage import few
 from damaged_bytes import check, check_packed
+from hypothesis import given
+from hypothesis import strategies as st
 from test_convert import StoragePlugin, write_bag
 from test_models import ROBOT
 
@@ -194,6 +197,12 @@ TABLES = {
 }  # fmt: skip
 
 
+WHOLE = {"time": [t for t, *_ in DRIVE], "cmd_v": [v for _, v, _, _ in DRIVE], "cmd_w": [w for _, _, w, _ in DRIVE],
+         **{f"{stream}_{one}": [x * (one == "x") for *_, x in DRIVE] for stream in ("odom", "gt")
+            for one in ("x", "y", "yaw")}, "odom_v": [v for _, v, _, _ in DRIVE], "odom_w": [w for _, _, w, _ in DRIVE],
+         "wheel_left": [3 * v for _, v, _, _ in DRIVE], "wheel_right": [3 * v for _, v, _, _ in DRIVE]}  # fmt: skip
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_a_damaged_table_of_a_stranger(tmp_path, name):
     folder = tmp_path / "drive"
@@ -209,6 +218,20 @@ def test_a_damaged_table_of_a_stranger(tmp_path, name):
 
     path = folder / name
     check(path, path.read_bytes(), read, 15)
+
+
+@few(40)
+@given(st.sets(st.sampled_from(sorted(WHOLE))), st.booleans())
+def test_a_table_that_lacks_some_columns(tmp_path_factory, names, wheels):
+    folder = tmp_path_factory.mktemp("table")
+    path = folder / "drive.csv"
+    rows = zip(*(WHOLE[name] for name in sorted(names)), strict=True)
+    path.write_text("\n".join([",".join(sorted(names)), *(",".join(f"{one:.4f}" for one in row) for row in rows)]))
+    config = ConvertConfig(path, folder / "log", input="wheels" if wheels else "auto")
+    try:
+        assert convert(config)[0].trials
+    except ValueError as error:
+        assert str(path) in str(error)
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", "meta/tasks.parquet", "data/chunk-000/file-000.parquet"])

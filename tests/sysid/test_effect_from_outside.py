@@ -109,7 +109,7 @@ def test_an_installed_package_offers_its_effects_by_entry_points(installed):
 def test_every_program_knows_the_effects_of_installed_packages(installed):
     code = ("from drifting import HeadingDrift\nfrom whill_mjx.effects import EFFECTS, make_effect\n"
             "assert EFFECTS['heading_drift'] is HeadingDrift and make_effect('heading_drift', rate=0.1).rate > 0")
-    path = os.pathsep.join([str(installed), str(Path(__file__).parents[2])])
+    path = os.pathsep.join([str(installed), os.environ["PYTHONPATH"]])
     subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": path})
 
 

@@ -320,6 +320,16 @@ def test_a_base_that_stops_by_its_time_out_while_commands_pause_is_named_with_th
     assert float(re.search(r"command_timeout = ([\d.]+)", found)[1]) == pytest.approx(timeout, abs=0.06)
 
 
+def test_commands_of_another_clock_and_cut_off_ones_are_named_and_no_sign_or_unit_is_doubted():
+    good = trial_of(lively())
+    command = good.command
+    late = sanity(log_of(replace(good, command=replace(command, t=command.t + 5.0))))
+    assert late and all(re.search("comes (4|5).. s earlier than the commands: another clock", one) for one in late)
+    first = command.t < 6.0
+    (found,) = sanity(log_of(replace(good, command=Command(command.t[first], command.v[first], command.omega[first]))))
+    assert re.search("the commands end .* s before the odometry", found)
+
+
 def test_a_base_that_drives_on_while_commands_pause_is_fine():
     assert sanity(log_of(paused(np.inf))) == []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -103,7 +102,7 @@ class Process(subprocess.Popen):
         self.said = said
         with said.open("w") as file:
             super().__init__([sys.executable, "-m", module, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file,
-                             env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
+                             **options)  # fmt: skip
 
 
 def kept_steps(out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +75,36 @@ def plotted(c):
             **{f"/odom/pose/pose/orientation/{name[1]}": values for name, values in pose.items()},
             "/odom/twist/twist/linear/x": c["v"], "/odom/twist/twist/angular/z": c["w"],
             "/odom/twist/twist/linear/y": 0 * c["v"]}
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda text: text.replace(".", ","), "Are there decimal commas"),
+    (lambda text: text.replace("gt_x", "odom_x"), "two columns are named 'odom_x'"),
+    (lambda text: text.replace("cmd_v", "status"), "is the only part of a command"),
+    (lambda text: re.sub(r"(?m)^[\d.]+", "7", text), "time stands still in drive/timestamp"),
+])  # fmt: skip
+def test_a_table_that_cannot_be_read_is_refused_with_the_reason(tmp_path, change, says):
+    path = write(tmp_path / "drive.csv", without_units(columns()))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(ValueError, match=says):
+        convert(ConvertConfig(path, tmp_path / "data"))
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda lines: ['"' + line.replace(",", '","').replace(".", ",") + '"' for line in lines], ""),
+    (lambda lines: [lines[0], *(line + "," for line in lines[1:])], ""),
+    (lambda lines: [lines[0], "ms,km/h,deg/s,mm,mm,deg,km/h,deg/s", *lines[1:]], ""),
+    (lambda lines: [lines[0], *lines[:0:-1]], "newest row comes first"),
+    (lambda lines: [*lines[:9], "0x" + lines[9], *lines[10:]], "is no number .'0x.*' in line 10"),
+    (lambda lines: [*lines, lines[-1]], "1 row of .* at the time of the row before"),
+])  # fmt: skip
+def test_tables_of_other_programs_are_read_and_what_is_left_out_is_said(tmp_path, change, says):
+    table = write(tmp_path / "drive.csv", with_units(columns()))
+    table.write_text("\n".join(change(table.read_text().splitlines())))
+    log, notes = convert(ConvertConfig(table, tmp_path / "data"))
+    assert len(log.trials[0].odometry.t) >= len(DRIVE.odometry.t) - 1
+    assert any(re.search(says, note) for note in notes)
 
 
 @pytest.mark.parametrize("names", [with_units, without_units, plotted])
@@ -205,6 +236,18 @@ def foreign(c):
     """Units that no name says."""
     return {"ms": 1e3 * c["t"], "target speed": 3.6 * c["cv"], "target turn": np.rad2deg(c["cw"]), "x": 1e3 * c["x"],
             "y": 1e3 * c["y"], "heading": np.rad2deg(c["yaw"]), "speed": 3.6 * c["v"], "turn": np.rad2deg(c["w"])}
+
+
+def test_one_drive_in_another_unit_does_not_change_the_others(tmp_path):
+    for k in range(4):
+        table = without_units(columns())
+        size = 1e3 if k == 2 else 1.0
+        table |= {name: size * table[name] for name in ("odom_x", "odom_y", "gt_x", "gt_y")}
+        write(tmp_path / "drives" / f"drive_{k}.csv", table)
+    write(tmp_path / "drives" / "pose.csv", {"t": DRIVE.odometry.t, "gt_x": DRIVE.odometry.x, "gt_y": DRIVE.odometry.y})
+    log, notes = convert(ConvertConfig(tmp_path / "drives", tmp_path / "log"))
+    assert [np.ptp(one.odometry.x) for one in log.trials] == pytest.approx(4 * [np.ptp(DRIVE.odometry.x)], abs=0.01)
+    assert any("pose: no drive by itself" in note for note in notes)
 
 
 def test_drives_in_which_a_unit_does_not_show_have_that_of_the_others(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -30,8 +29,7 @@ class Process(subprocess.Popen):
     def __init__(self, command, words, said):
         self.said = said
         with said.open("w") as file:
-            super().__init__([*command, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file,
-                             env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+            super().__init__([*command, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file)
         while self.poll() is None and not catches(self.pid, signal.SIGTERM):
             time.sleep(0.01)
 

@@ -105,7 +105,7 @@ def test_a_damaged_or_full_folder_costs_a_compilation_and_no_word(tmp_path):
         words = [sys.executable, "-c", PROGRAM.format(add=add)]
         words = words if limit is None else ["bash", "-c", f'ulimit -f {limit}; exec "$0" "$@"', *words]
         environment = {name: value for name, value in os.environ.items() if name not in (FOLDER.upper(), LEAST.upper())}
-        environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+        environment |= {"XDG_CACHE_HOME": str(tmp_path)}
         ended = subprocess.run(words, capture_output=True, text=True, env=environment, check=True)
         assert ended.stderr == ""
         return ended.stdout.split()

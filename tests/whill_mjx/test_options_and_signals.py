@@ -180,7 +180,18 @@ SWALLOWS = """
 """
 
 
-@pytest.mark.parametrize("body", [COMPILES, SWALLOWS], ids=["XLA compiles", "the work swallows the interrupt"])
+COLLECTS = """
+    import gc
+    gc.callbacks.append(lambda phase, about: time.sleep(0.2))
+    print("begun", flush=True)
+    for _ in range(100):
+        gc.collect()
+    open("{after}", "w").close()
+"""
+
+
+@pytest.mark.parametrize("body", [COMPILES, SWALLOWS, COLLECTS],
+                         ids=["XLA compiles", "the work swallows the interrupt", "Python collects garbage"])
 def test_a_signal_ends_the_process_where_no_handler_can(body, tmp_path):
     after = tmp_path / "after"
     assert ended(started(body.format(after=after)), signal.SIGINT) == (130, "stopped; go on so. (SIGINT)")

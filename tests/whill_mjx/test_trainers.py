@@ -26,7 +26,7 @@ peer = pytest.mark.skipif(not PEER, reason="PEER_PYTHON names no Python that has
 
 
 def in_peer(*arguments: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([PEER, *arguments], env=environment, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -107,6 +107,5 @@ def test_ppo_of_another_package_learns_point_goals(learner):
 
 def test_the_environments_of_other_trainers_need_none_of_their_packages():
     code = "import whill_mjx.gym.brax, whill_mjx.gym.rsl_rl, whill_mjx.gym.sb3, sys; print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=ROOT,
-                          capture_output=True, text=True)  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.strip() == "False", done.stderr

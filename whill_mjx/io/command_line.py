@@ -259,6 +259,8 @@ class _State:
     """Name of the one that stopped the work."""
     before: dict[int, Any] = {}
     """Handlers that were there before."""
+    hook: Callable[[Any], Any] = sys.__unraisablehook__
+    """For exceptions that cannot be raised, as it was before."""
     wakeup: tuple[int, int] | None = None
     held: Any = None
     """Mask of signals before a fork that is under way."""
@@ -283,6 +285,7 @@ def listen() -> None:
         signal.signal(number, _interrupt)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     _State.wakeup = reader, writer
+    _State.hook, sys.unraisablehook = sys.unraisablehook, _unraisable
     threading.Thread(target=_watch, args=(reader,), daemon=True, name="signals").start()
 
 
@@ -291,6 +294,13 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     if not _State.working:
         leave(_State.stopped)
     raise KeyboardInterrupt
+
+
+def _unraisable(what: Any) -> None:
+    """Show an exception that Python cannot raise, such as one in a callback of its garbage collection; an interrupt is
+    no news: the watching thread ends the process."""
+    if what.exc_type is not KeyboardInterrupt:
+        _State.hook(what)
 
 
 def _watch(reader: int) -> None:
@@ -331,6 +341,7 @@ def _stop_listening() -> None:
         return
     _, writer = _State.wakeup
     signal.set_wakeup_fd(-1)
+    sys.unraisablehook = _State.hook
     for number, before in _State.before.items():
         signal.signal(number, before)
     os.write(writer, b"\0")

@@ -118,8 +118,8 @@ def render_pallas(
     Args:
         position, rotation, intrinsics, scene, height, width, quality: as `render`; `quality.keep` has no meaning here,
             for nothing is left out.
-        tiling: how the image is cut; None takes larger tiles for plain looks, and for rich ones a pixel per thread, whose
-            many numbers then fit into its registers.
+        tiling: how the image is cut; None takes larger tiles for plain looks. Rich ones take a pixel per thread,
+            whose many numbers then fit into the registers.
         interpret: run on any device, slowly, to test.
     """
     from jax.experimental import pallas as pl

@@ -1,0 +1,174 @@
+"""Sizes that need not be freed: drives that are held back are foretold as well with what data sheet and rulers say.
+
+A first calibration frees sizes of the wheels, scales of the odometry and the tracked point. Few drives determine them
+only together with slip, scrub and lags, so that freeing what was right makes other drives worse. Groups that all drives
+contradict are free. The others are judged by what counts in the end: how far whole drives are off that the fit has not
+seen. Each manoeuvre of the training drives is held back in turn, all other parameters follow the rest of the drives,
+and the groups stay free that those which were held back need. Source: Stone (1974), cross-validatory choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from sysid.errors.pose_objective import Objective, Told
+from sysid.errors.prior import expected_sd
+from sysid.errors.robust import HUBER
+from sysid.errors.space import Space
+from sysid.intervals.independence import Evidence
+from sysid.intervals.uncertainty import PIECES, Uncertainty
+from sysid.search import least_squares
+from sysid.search.gauss_newton import BoxStep
+from sysid.search.slopes import AT_ONCE
+from whill_mjx.io.steps import step
+
+GROUPS = {
+    "wheel radii": ("wheel_radius_difference.common", "wheel_radius_difference.difference", "wheels.radius",
+                    "wheels.difference"),
+    "track": ("track_width.error", "wheels.track"),
+    "scales of the odometry": ("odometry_scale.linear", "odometry_scale.angular"),
+    "tracked point": ("pose_mount.x", "pose_mount.y", "pose_mount.yaw"),
+}  # fmt: skip
+"""What is measured in one way, and so known or unknown together."""
+DAMPING = 1e-3
+ITERATIONS = 15
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Groups that keep their stated sizes, and where that leads."""
+
+    names: tuple[str, ...]
+    """Of `GROUPS`."""
+    u: np.ndarray  # (P,)
+    cost: float
+
+
+def chosen_sizes(
+    objective: Told, poses: Objective, known: Uncertainty, cost: float, kept: Sequence[str] = (), robust: bool = True
+) -> Choice:
+    """The point (P,) at which only those groups differ from what was stated that the drives need.
+
+    A group that all drives together contradict is free. Others are judged by drives that are held back.
+
+    Args:
+        objective: what the search ended on.
+        poses: errors of whole poses of the same drives.
+        known: errors where the search ended, and the information that each drive has there.
+        cost: there.
+        kept: parameters that a person chose to fit.
+        robust: whether large residuals count linearly.
+    """
+    space, evidence, u = objective.space, known.evidence, known.evidence.u
+    free = set(kept) | contradicted(known, space)
+    groups = {group: some for group, names in GROUPS.items()
+              if (some := set(names) & set(space.names)) and not some & free}
+    options = [tuple(one) for count in range(len(groups), -1, -1) for one in combinations(groups, count)]
+    held = np.array([[any(name in groups[group] for group in one) for name in space.names] for one in options])
+    follow = _Follow(objective, evidence, space.to_unit(space.initial))
+    left = _held_back(follow, poses, held, robust) if groups else np.zeros((1, 1))
+    best = simplest(np.log(np.maximum(left, 1e-300)), held.sum(1))  # noise of a manoeuvre has a size of its own
+    if not held[best].any():
+        return Choice((), u, cost)
+    names = tuple(name for name, one in zip(space.names, held[best], strict=True) if one)
+    begin = follow(held[best], np.ones(evidence.scores.shape[:2], bool))
+    found = least_squares.fit(objective, space, starts=begin[None], iterations=ITERATIONS, robust=robust, frozen=names)
+    return Choice(options[best], found.u, found.cost)
+
+
+def contradicted(known: Uncertainty, space: Space) -> set[str]:
+    """Parameters that are more likely free than as stated.
+
+    The ratio of both marginal likelihoods is that of posterior and prior density at the stated value (Savage and
+    Dickey; Dickey, 1971). The prior is as wide as data sheets are usually off.
+    """
+    away = np.square((known.evidence.u - space.to_unit(space.initial)) / known.deviation)
+    wider = np.square(expected_sd(space) / known.deviation)  # the prior, beside the errors
+    free = away * wider / (1 + wider) > np.log(1 + wider)
+    return {name for name, one in zip(space.names, free, strict=True) if one}
+
+
+def simplest(errors: np.ndarray, held: np.ndarray) -> int:
+    """The option that holds most and whose mean error is within a standard error of the least (Breiman et al., 1984).
+
+    Among as simple ones it is the best. That standard error is of gains by the best option, and its variance twice the
+    mean square of those below 0: what a right size gains in a single manoeuvre is no noise.
+
+    Args:
+        errors: (G, O) of G manoeuvres and O options.
+        held: (O,) how many parameters each option holds.
+    """
+    mean = errors.mean(0)
+    gains = errors - errors[:, [mean.argmin()]]
+    noise = np.sqrt(2 * np.square(np.minimum(gains, 0.0)).mean(0) / len(gains))
+    near = gains.mean(0) <= noise
+    return int(np.lexsort((mean, -held, ~near))[0])
+
+
+@dataclass(frozen=True)
+class _Follow:
+    """Where the minimum lies when some drives are left out and some parameters keep their stated value."""
+
+    objective: Told
+    evidence: Evidence
+    stated: np.ndarray  # (P,)
+
+    def __call__(self, held: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+        """The point (P,).
+
+        Args:
+            held: (P,) bool, parameters that are as stated.
+            fitted: (B, PIECES) bool, pieces of drives that count.
+        """
+        one, prior = self.evidence, self.objective.prior
+        hessian = (one.blocks * fitted[..., None, None]).sum((0, 1)) + one.precision
+        gradient = (one.scores * fitted[..., None]).sum((0, 1))
+        if prior is not None:
+            gradient = gradient + one.precision @ (one.u - prior.mean)
+        base = np.where(held, self.stated, one.u)
+        gradient = gradient + hessian @ (base - one.u)
+        box = BoxStep(free=~held, move=self.objective.space.moved, reach=1.0)
+        return box.points(base[None], gradient, hessian, DAMPING)[0]
+
+
+def _folds(evidence: Evidence) -> np.ndarray:
+    """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of the only
+    one."""
+    drives = len(evidence.groups)
+    numbers = evidence.groups if len(np.unique(evidence.groups)) > 1 else np.arange(drives)
+    if drives > 1:
+        return np.repeat(numbers[:, None], PIECES, axis=1)
+    return np.arange(PIECES)[None] * 2 // PIECES
+
+
+def _held_back(follow: _Follow, poses: Objective, held: np.ndarray, robust: bool) -> np.ndarray:
+    """(G, O) squared errors of whole poses in each part of the drives that is held back, of each option `held`
+    (O, P)."""
+    folds = _folds(follow.evidence)
+    numbers = np.unique(folds)
+    points = np.stack([[follow(one, folds != number) for one in held] for number in numbers])  # (G, O, P)
+    poses = replace(poses, prior=None)
+
+    def compute() -> list[np.ndarray]:
+        return [_errors(poses, points.reshape(-1, held.shape[1]), robust)]
+
+    (errors,) = step("held back", compute, points)
+    errors = errors.reshape(*points.shape[:2], *folds.shape)
+    return np.stack([(errors[k] * (folds == number)).sum((1, 2)) for k, number in enumerate(numbers)])
+
+
+def _errors(poses: Objective, points: np.ndarray, robust: bool) -> np.ndarray:
+    """(N, B, PIECES) squared errors of whole poses in pieces of drives, at points (N, P)."""
+    samples = poses.measured.pose[..., 0].size * 3 + poses.measured.odometry[..., 0].size * 5
+    piece, found, together = poses.pieces(PIECES), [], max(AT_ONCE // max(samples, 1), 1)
+    for first in range(0, len(points), together):
+        residual = poses.residuals(points[first : first + together])
+        label = np.pad(piece, (0, residual.shape[2] - len(piece)))  # errors of the start belong to the first piece
+        large = np.abs(residual)
+        loss = np.where((large > HUBER) & robust, 2 * HUBER * large - HUBER**2, large**2)
+        found.append(np.stack([loss[:, :, label == k].sum(-1) for k in range(PIECES)], axis=-1))
+    return np.concatenate(found)
