@@ -63,6 +63,10 @@ class Robot:
         self.statuses: list[dict[str, Any]] = []
         self.frames = 0
         self.clock_offset, self.encoding, self.frozen = 0.0, "rgb8", False  # of the camera
+        self.dark = False
+        """Whether the camera's images are black, but for noise."""
+        self.stamp, self.repeats_stamp = 0.0, False
+        """Stamp of the last image [s], and whether the next ones have the same."""
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -121,12 +125,34 @@ class Robot:
             self.frames += 1
             pixels[0] = 5 if self.frozen else self.frames % 250
             message = image(height=size[0], width=size[1], encoding=self.encoding, step=3 * size[1])
-            message.data = array.array("B", pixels)
-            stamp = time.time() + self.clock_offset
-            message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
+            black = bytearray([self.frames % 3]) + bytearray(len(pixels) - 1)
+            message.data = array.array("B", black if self.dark else pixels)
+            if not self.repeats_stamp:
+                self.stamp = time.time() + self.clock_offset
+            message.header.stamp.sec, message.header.stamp.nanosec = int(self.stamp), int(self.stamp % 1 * 1e9)
             return message
 
         return self.repeat(publisher, 1 / rate, make)
+
+    def joystick(self, topic: str = "joy") -> None:
+        """Publish a joystick whose first button is held while `held`."""
+        self.held = True
+        kind = message_type("sensor_msgs/Joy")
+        self.repeat(self.publisher("sensor_msgs/Joy", topic), 0.02, lambda: kind(buttons=[int(self.held)]))
+
+    def clock(self) -> None:
+        """Publish /clock as the wall clock moved by `clock_offset`, while `ticking`."""
+        self.ticking, self._clock_stood = True, 0.0
+        kind = message_type("rosgraph_msgs/Clock")
+
+        def make() -> Any:
+            if self.ticking:
+                self._clock_stood = time.time() + self.clock_offset
+            message = kind()
+            message.clock.sec, message.clock.nanosec = int(self._clock_stood), int(self._clock_stood % 1 * 1e9)
+            return message
+
+        self.repeat(self.publisher("rosgraph_msgs/Clock", "/clock"), 0.01, make)
 
     def whole(self, shade: int = 255) -> Switch:
         """Be a whole vehicle with base, camera and status; return its emergency stop."""

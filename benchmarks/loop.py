@@ -25,11 +25,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from benchmarks.loop_direct import drive_directly, write_answers
 from benchmarks.loop_drives import Plan, StageError, drive_plans, last_line, station
 from benchmarks.loop_figures import collect, summary
 from benchmarks.loop_page import write_page
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.commands import nine
+from benchmarks.plant.draw import draw_effect
 from whill_mjx.io.command_line import COUNT, SEED, OptionError, Range, run
 from whill_mjx.io.folders import claim_folder, write_whole
 
@@ -72,6 +74,9 @@ class Options:
     """Episodes that the policy drives on the plant."""
     until: Literal["days", "fit", "drives", "loop", "proposed", "loop_again", "train", "drive", "report"] = "report"
     """Last stage to do; the report is written after it."""
+    direct: bool = False
+    """Drive the plant in this process, without topics: the same drives in seconds, on a computer without ROS. A run may
+    go on so that was driven over topics; its stages say which."""
     domain: Annotated[int | None, Range(0, 101)] = None
     """ROS domain; none takes one by the process's number."""
     collect: tuple[Path, ...] = ()
@@ -137,6 +142,12 @@ class Loop:
             plant += ["--draw", str(draw), "--answers", str(self.out / "answers.json")]
         nominal = VEHICLES["chair"].nominal
         held_out = [f"{plan.name}_{n + 1}" for plan in plans[-1:] if len(plans) > 1 for n in range(plan.replicates)]
+        if self.options.direct:
+            effects = {} if draw is None else draw_effect(draw)
+            drive_directly(plans, dataset, effects, seed, nominal, held_out)
+            if draw is not None:
+                write_answers(self.out / "answers.json", effects, seed)
+            return
         saying = ["--vehicle", "contact plant", "--wheel-radius", str(nominal.radius), "--track", str(nominal.track),
                   "--wheelbase", str(nominal.wheelbase), "--mass", str(nominal.mass)]
         if held_out:
@@ -170,7 +181,7 @@ class Loop:
             replicates = self.options.replicates if number == 0 else 1
             self.drive(f"day_{number + 1}", day, self.plans(replicates), FIRST_DAY + number, None)
             print(f"  day {number + 1} of {len(self.days)} is driven", flush=True)
-        return f"{len(self.days)} days"
+        return f"{len(self.days)} days{self._how}"
 
     def do_fit(self) -> str:
         """Fit the vehicle to the first reference day."""
@@ -182,7 +193,11 @@ class Loop:
     def do_drives(self) -> str:
         """Drive the vehicle with the undeclared effect."""
         self.drive("drives", self.out / "drives", self.plans(self.options.replicates), self.seed, self.options.draw)
-        return f"{len(list((self.out / 'drives' / 'trials').iterdir()))} trials"
+        from sysid.logs.inspection import inspect
+        from sysid.logs.log import load_log
+
+        log = load_log(self.out / "drives")
+        return ". ".join([f"{len(log.trials)} trials{self._how}", *inspect(log)["sanity"]])
 
     def do_loop(self) -> str:
         """Close the loop on these drives."""
@@ -204,7 +219,8 @@ class Loop:
         check = ("--vehicle-file", str(fitted)) if fitted.exists() else ()
         plan = Plan("proposed", commands, min(proposed["replicates"], 3), place, check)
         self.drive("proposed", more, [plan], self.seed, self.options.draw)
-        return f"{proposed['name']}, {plan.replicates} times, to separate {' and '.join(proposed['splits'])}"
+        what = f"{proposed['name']}, {plan.replicates} times{self._how}"
+        return f"{what}, to separate {' and '.join(proposed['splits'])}"
 
     def do_loop_again(self) -> str:
         """Close the loop on all drives."""
@@ -245,6 +261,10 @@ class Loop:
         names = [one["name"] for one in report["effects"]]
         return f"{report['verdict']}{': ' + ', '.join(names) if names else ''}"
 
+    @property
+    def _how(self) -> str:
+        return ", without topics" if self.options.direct else ""
+
     def _quick(self) -> tuple[str, ...]:
         return ("--quick",) if self.options.quick else ()
 
@@ -263,7 +283,7 @@ def main(options: Options) -> None:
         if name not in nine(0):
             raise OptionError(f"--manoeuvres {name}: unknown (known: {', '.join(nine(0))}). Correct the name.")
     loop = Loop(options)
-    where = ("out", "until", "domain", "speed", "collect", "episodes")
+    where = ("out", "until", "domain", "speed", "collect", "episodes", "direct")
     identity = {name: str(value) for name, value in asdict(options).items() if name not in where}
     with claim_folder(options.out, KIND, ("stages", "drives")) as claim:
         claim.settle(identity, (options.out / "stages").exists())

@@ -111,7 +111,7 @@ def drive_plans(here: Station, plans: Sequence[Plan], dataset: Path, plant: Sequ
     Raises:
         StageError: a process ended early, or a replicate was stopped again and again.
     """
-    missing = [(number, plan, _recorded(dataset, plan)) for number, plan in enumerate(plans)]
+    missing = [(number, plan, recorded(dataset, plan)) for number, plan in enumerate(plans)]
     missing = [one for one in missing if one[2] < one[1].replicates]
     if not missing:
         return
@@ -184,7 +184,7 @@ def _drive(here: Station, operator: Robot, client: EpisodeClient, dataset: Path,
                          f"{here.log(name)}")
 
 
-def _recorded(dataset: Path, plan: Plan) -> int:
+def recorded(dataset: Path, plan: Plan) -> int:
     """Replicates of a plan that are recorded."""
     count = 0
     while (dataset / "trials" / f"{plan.name}_{count + 1}").is_dir():

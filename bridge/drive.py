@@ -20,12 +20,13 @@ from bridge.diagnosis import Evidence, FrameLog, causes
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import SafetyConfig
-from bridge.vehicle_node import NOT_ACTIVE, VehicleNode, add_options, limits
+from bridge.vehicle_node import NOT_ACTIVE, WATCH_PERIOD, VehicleNode, add_options, limits
 
 PAUSE = (0.01, 0.06)
 """Seconds after a frame between which there is time for housekeeping: the last command is out, the next frame far."""
 SILENCE = 0.3
 """Seconds without a frame after which there is always time."""
+CLOCK_STANDS = "simulated time stands"
 STARTING = 2.0
 """Seconds that the discovery of other nodes may take."""
 
@@ -89,6 +90,9 @@ class DriveNode(VehicleNode):
         self._image_type = CompressedImage if options.compressed else Image
         ros.subscribe_images(node, self._image_type, self._image_topic, self._on_image, self._on_incompatible,
                              self._on_lost)
+        self._ticked, self._simulated = self._started, 0
+        if ros.uses_simulated_time(node):
+            ros.steady_timer(node, WATCH_PERIOD, self._watch_simulated_time)
         if options.lifecycle:
             self.supervisor.block(NOT_ACTIVE, True)
             node.on_active_change = self._on_active_change
@@ -98,6 +102,13 @@ class DriveNode(VehicleNode):
         """Return whether the last command is out and the next frame far."""
         since = now - self._last_frame
         return PAUSE[0] <= since <= PAUSE[1] or since > SILENCE
+
+    def _watch_simulated_time(self) -> None:
+        """Hold the vehicle while /clock stands: no stamp says how old a frame is then."""
+        now, simulated = time.monotonic(), self.node.get_clock().now().nanoseconds
+        if simulated != self._simulated:
+            self._ticked, self._simulated = now, simulated
+        self.supervisor.block(CLOCK_STANDS, now - self._ticked > self.options.frame_age)
 
     def causes(self) -> list[str]:
         """Return what is wrong with camera, base and guard now, each with its remedy."""

@@ -92,6 +92,10 @@ class Player:
             return self._send(supervisor.tick(now))
         return self._send(supervisor.action(now, np.array(self.table.at(self.elapsed))))
 
+    def since_start(self, now: float) -> float:
+        """Return the seconds from the start of the replicate to the steady time `now`, by the table's clock."""
+        return self.clock(now) - self._began
+
     def farewell(self) -> bool:
         """Return whether the vehicle needs zeros before the node ends."""
         return self.supervisor.state is not State.YIELDED and self.supervisor.take_turn()
@@ -160,6 +164,7 @@ class ManoeuvreNode(VehicleNode):
             self._driven_before = player.driven
             try:
                 recorder.writer = TrialWriter(self.options.dataset, self._trial_name())
+                recorder.writer.begin(recorder.now() - player.since_start(self.now()))
             except (OSError, ValueError) as error:
                 self.supervisor.latch("the recording failed")
                 self.failure = str(error)

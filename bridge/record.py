@@ -84,6 +84,15 @@ class TrialWriter:
             raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
         return folder
 
+    def begin(self, t: float) -> None:
+        """Let times count from t [s] instead of the first pose, so that repeats of a drive have the same times.
+
+        What was measured up to then is left out: it may come late, and be of the time before the vehicle was put to its
+        start.
+        """
+        self._origin = t
+        self._last = {stream: 0.0 for stream in COLUMNS if stream != "command"}
+
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
         if self._origin is None:
@@ -96,6 +105,8 @@ class TrialWriter:
 
         `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
         """
+        if self._is_early("odometry", t):
+            return
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
         x0, y0, yaw0 = self._first_pose
@@ -164,6 +175,13 @@ class TrialWriter:
         self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
         return self.close()
 
+    def _is_early(self, stream: str, t: float) -> bool:
+        """Return whether a time is before the start of the trial, or no later than the last row of the stream."""
+        if self._origin is None:
+            return False
+        since = round(t - self._origin, 6)
+        return since < 0 or since <= self._last.get(stream, -math.inf)
+
     def _add(self, stream: str, t: float, *values: float) -> None:
         if not all(math.isfinite(value) for value in (t, *values)):
             return  # a log holds measurements; a fit cannot use a hole with a number's name
@@ -174,9 +192,9 @@ class TrialWriter:
             self._origin = t
             if self._waiting is not None:
                 self._add("command", t, *self._waiting)
+        if self._is_early(stream, t):
+            return  # stamped before the start, or two messages within a microsecond
         t = round(t - self._origin, 6)
-        if t < 0 or t <= self._last.get(stream, -math.inf):
-            return  # stamped before the first pose, or two messages within a microsecond
         self._last[stream] = t
         self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1
@@ -300,11 +318,13 @@ class RecordNode:
     def _flush(self) -> None:
         self._write(lambda writer: writer.flush())
 
+    def now(self) -> float:
+        """Return the present time of what is recorded [s]."""
+        return float(self._node.get_clock().now().nanoseconds * 1e-9) if self._by_stamp else time.monotonic()
+
     def _time(self, stamp: float) -> float:
         """Return the time that a message of this stamp gets."""
-        if not self._by_stamp:
-            return time.monotonic()
-        return believed(stamp, float(self._node.get_clock().now().nanoseconds * 1e-9))
+        return believed(stamp, self.now()) if self._by_stamp else self.now()
 
     def _on_command(self, message: Any, stamp: float, v: float, omega: float) -> None:
         t = self._time(stamp)

@@ -3,6 +3,7 @@
 Only functions import rclpy, so the package can be imported, and its pure parts tested, where ROS 2 is not installed.
 """
 
+import gc
 import json
 import math
 import os
@@ -275,17 +276,32 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
         rclpy.try_shutdown()
 
 
+def make_executor() -> Any:
+    """Return what waits for events of one thread: rclpy's own in C++ where it has one (Jazzy and later), else Python's.
+
+    The one in Python builds its list of everything to wait for anew each time, which takes longer than a callback.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+
+        return EventsExecutor()
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+
+
 def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
     """Serve callbacks until `done`, SIGTERM or Ctrl-C. The node needs a timer, which bounds the reaction time."""
-    from rclpy.executors import SingleThreadedExecutor
-
     stopping = []
 
     def stop(number: int, _: FrameType | None) -> None:
         stopping.append(number)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    executor = SingleThreadedExecutor()
+    executor = make_executor()
+    gc.collect()
+    gc.freeze()  # what is there by now stays, so no later collection looks through it and delays a command
     executor.add_node(node)
     try:
         while not stopping and not done():

@@ -84,7 +84,8 @@ class RobotNode:
             x, y, yaw = (number(message, name, -1e3, 1e3) for name in ("x", "y", "yaw"))
             start = x, y, yaw
         with self._changed:
-            self._base, self._last, self._steps = self.now, -math.inf, 0
+            # a step later: what is still on its way from the last trial is older than all of this one
+            self._base, self._last, self._steps = self.now + STEP, -math.inf, 0
             self.plant.place(index, start)
             self._changed.notify()
         return {"episode": index, "stamp": stamp_of(self.now)}

@@ -245,12 +245,14 @@ def _resets(trials: Sequence[Trial]) -> list[str]:
             jumps |= step > JUMP[0] + JUMP[1] * np.maximum(way, usual)
         at = np.flatnonzero(jumps)
         if 0 < len(at) <= FEW:
-            found.append((trial.name, float(stream.t[at[0] + 1]), float(steps[0][at[0]])))
+            sizes = [f"{step[at[0]]:.2f} {unit}" for step, unit in zip(steps, ("m", "rad"), strict=False)
+                     if step[at[0]] > JUMP[0]]
+            found.append((trial.name, float(stream.t[at[0] + 1]), " and ".join(sizes)))
     if not found:
         return []
     name, at_time, size = found[0]
     return [f"odometry: in {len(found)} of {len(trials)} trials ({name}, at {at_time:.1f} s) its pose jumps by "
-            f"{size:.2f} m from one row to the next, which its speeds do not: it was reset there. Split the trial "
+            f"{size} from one row to the next, which its speeds do not: it was reset there. Split the trial "
             "there."]
 
 

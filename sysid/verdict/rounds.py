@@ -23,6 +23,8 @@ NOTHING = "nothing stands out of the noise and the day-to-day spread"
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
+SIDE = 2.0
+"""Coordinate from which such a fit starts on either side of what only changes the effect."""
 Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
 """Gain (H,), worth (H,) and coordinates of every hypothesis."""
 
@@ -174,7 +176,8 @@ def _rivals(
 
 def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
     """Other starts of a fit whose last effect comes behind `before` coordinates: the base parameters as they were, and
-    what only changes the effect at 0, so that the effect itself has the first chance."""
+    what only changes the effect at 0, so that the effect itself has the first chance; then each of these that has a
+    sign on either side, since there may be a ridge between."""
     q = fit.q.copy()
     axes = fit.hypotheses[-1].axes
     q[before:] = [0.0 if axis.dependent else size for axis, size in zip(axes, q[before:], strict=True)]
@@ -184,6 +187,11 @@ def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
         start = q.copy()
         start[before:] = np.clip(factor * q[before:], -limits, limits)
         out.append(Start(fit.hypotheses, refitter.reference.u, start))
+    for i, axis in enumerate(axes, before):
+        for side in (-SIDE, SIDE) if axis.dependent and axis.signed else ():
+            start = q.copy()
+            start[i] = side
+            out.append(Start(fit.hypotheses, refitter.reference.u, start))
     return out
 
 

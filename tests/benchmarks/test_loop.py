@@ -86,11 +86,14 @@ def test_a_day_is_driven_over_ros_recorded_exactly_and_not_driven_twice(tmp_path
         file.seek(0)
         sent = [float(row["t"]) for row in csv.DictReader(file)]
     assert max(turns) > 0.6 and turns[0] == turns[-1] == 0
-    assert all(0.0499 < b - a < 0.0501 for a, b in zip(sent, sent[1:], strict=False))  # none late, none missing
+    assert sent[0] == 0 and all(0.0499 < b - a < 0.0501 for a, b in zip(sent, sent[1:], strict=False))
     before = trial.stat().st_mtime_ns
     main(options)
     assert trial.stat().st_mtime_ns == before and capsys.readouterr().out.count("days ...") == 1
     assert (tmp_path / "run" / "report.html").exists()
+    main(Options(tmp_path / "direct", until="days", direct=True, **TINY))
+    direct = (tmp_path / "direct/day_1/trials/turn_1/command.csv").read_text()
+    assert (trial / "command.csv").read_text().startswith(direct)
 
 
 @pytest.mark.long

@@ -177,6 +177,10 @@ class Node:
             callback()
 
 
+class SingleThreadedExecutor:
+    """The only executor of one thread that Humble has."""
+
+
 def create_node(name, *, start_parameter_services=True):
     return Node(name)
 
@@ -186,6 +190,7 @@ def install():
     modules = {
         "rclpy": {"init": lambda **_: None, "create_node": create_node, "try_shutdown": lambda: None},
         "rclpy.clock": {"Clock": Clock, "ClockType": ClockType, "JumpThreshold": JumpThreshold},
+        "rclpy.executors": {"SingleThreadedExecutor": SingleThreadedExecutor},
         "rclpy.duration": {"Duration": Duration},
         "rclpy.qos": {"QoSProfile": QoSProfile, "HistoryPolicy": Policy, "ReliabilityPolicy": Policy,
                       "DurabilityPolicy": Policy},

@@ -76,7 +76,7 @@ def test_simulated_clock_that_stops_stops_the_vehicle_by_the_steady_clock(graph,
     graph.start("drive", policy, "--ros-args", "-p", "use_sim_time:=true")
     robot.wait_for_status(driving=True)
     state.timer.cancel()  # the camera goes on
-    robot.wait_for_status(driving=False, reason="frame age")
+    robot.wait_for_status(driving=False, reason="simulated time stands")
     robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
 
 

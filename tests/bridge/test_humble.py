@@ -79,6 +79,7 @@ for i in range(6):
 watch = guard.GuardNode(humble_stub.Node("bridge_guard"), guard.parse_arguments([]))
 watch.node.fire()
 bridge.close()
+assert isinstance(drive.ros.make_executor(), humble_stub.SingleThreadedExecutor)
 sent = [getattr(message, "twist", message) for message in node.publishers["/whill/controller/cmd_vel"].sent]
 reports = [report.status[0].message for report in node.publishers["/diagnostics"].sent]
 assert any(report.startswith("driving") for report in reports), reports

@@ -53,6 +53,21 @@ def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
         assert (row["x"], row["y"]) == pytest.approx((math.sin(turn), 1 - math.cos(turn)), abs=1e-5)
 
 
+def test_recording_that_begins_with_a_manoeuvre_has_its_times_and_nothing_of_before(tmp_path):
+    writer = TrialWriter(tmp_path, "turn_1")
+    writer.begin(7.0)
+    writer.odometry(7.0, 3.0, 2.0, 1.5, 0.0, 0.0)  # of where the vehicle was carried from, and late
+    writer.ground_truth(6.95, 3.0, 2.0, 1.5)
+    writer.command(7.0, 0.0, 0.0)
+    writer.odometry(7.05, 0.0, 0.0, -0.5, 0.0, 0.0)
+    writer.ground_truth(7.05, 1.0, 0.0, -0.5)
+    folder = writer.close()
+    assert [row["t"] for row in read(folder / "command.csv")] == [0.0]
+    [odometry] = read(folder / "odometry.csv")
+    assert (odometry["t"], odometry["x"], odometry["yaw"]) == (0.05, 0.0, 0.0)
+    assert [row["t"] for row in read(folder / "ground_truth.csv")] == [0.05]
+
+
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     writer = TrialWriter(tmp_path, "a")
     writer.ground_truth(0.0, 0.0, 0.0, 0.0)
