@@ -14,7 +14,6 @@ acceleration and drag bend to the same few speeds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
@@ -71,7 +70,7 @@ def search_alone(
         taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
         mine = taken_on.hypothesis.effect
         members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
-        found.accepted.append(replace(taken_on, own=True))
+        found.accepted.append(taken_on)
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
         found.final, found.share = taken_on.refit, taken_on.share

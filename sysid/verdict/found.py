@@ -34,38 +34,8 @@ class Thresholds:
     be below alpha: on 420 days with nothing missing the least one with no such excess was 8e-10."""
     quiet: float = 0.05
     """p-value of the excess that is left from which it passes for a day's own."""
-    second: float = 0.25
-    """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
-    step: float = 0.15
-    """Least further share of the excess that it explains."""
-    own: float = 0.3
-    """Least share of what the effects before it left that a smaller one must explain."""
-    rest: float = 0.9
-    """The same from which no more is asked of one that is needed beside them: what mends their form leaves a rest."""
-    agree: float = 0.6
-    """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
-    of it, at which it is there for its own sake."""
-    alone: float = 1.8
-    """Largest factor by which its gain may then change."""
-    differ: float = 0.35
-    """Largest disagreement of manoeuvres on its size."""
-    half: float = 0.5
-    """Least share of what the effects before it left that one must explain whose columns other forms of them do not
-    imitate (`sysid.verdict.forms`)."""
-    slight: float = 0.05
-    """Least gain of such an effect, as a share of the first one's."""
-    unlike: float = 0.75
-    """Least share of its signature that such forms do not imitate."""
-    instead: float = 0.7
-    """Most that they may gain instead of it, as a share of what it gains."""
-    little: float = 0.1
-    """Minimum share of the remaining error that an effect must explain on left-out manoeuvres."""
-    foretold: float = 0.7
-    """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
     same: float = 0.2
     """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
-    loss: float = 0.1
-    """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
     scatter: float = 1.0
     """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
     more one in six would find the opposite."""
@@ -98,8 +68,6 @@ class Candidate:
     """Family-wise, of that gain."""
     share: float
     refit: Refit
-    own: bool = False
-    """Small beside the first, but as large and as useful without it, and most of what the others left."""
 
 
 @dataclass

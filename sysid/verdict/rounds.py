@@ -14,8 +14,9 @@ from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
-from sysid.verdict.agreement import beside, disagreement, foretold, interval_of_sum
+from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
+from sysid.verdict.forms import beside_forms
 from sysid.verdict.found import Candidate, Scan, Search, Thresholds
 from sysid.verdict.scan import best, run
 
@@ -251,16 +252,14 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
                              POLISH)
     if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
         both, alone = moved_last(both, 0), alone[::-1]
-    if asked.explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
+    if found.accepted and both.cost >= found.accepted[-1].refit.cost:
         return
     members = []
     for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
         one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
-        if (one.p >= thresholds.alpha or asked.explained(fit) - asked.explained(other) < thresholds.step
-                or disagreement(fit, fit.parts[-1], asked.evidence.groups, refitter.precision) > thresholds.differ
-                or interval_of_sum(held_back(asked, fit))[0] <= 0):
+        if one.p >= thresholds.alpha or beside_forms(refitter, fit, asked.evidence.groups)[0] <= 0:
             return
-        members.append(replace(one, own=True))
+        members.append(one)
     members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
     found.accepted = members
     found.classes = [class_of(asked, one, [one]) for one in members]

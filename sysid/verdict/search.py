@@ -13,9 +13,9 @@ from sysid.missing.evidence import Evidence
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
-from sysid.verdict.agreement import beside, disagreement, foretold
-from sysid.verdict.forms import other_forms
-from sysid.verdict.found import LARGEST, Candidate, Search, Thresholds, missing
+from sysid.verdict.agreement import disagreement
+from sysid.verdict.forms import beside_forms
+from sysid.verdict.found import LARGEST, Search, Thresholds, missing
 from sysid.verdict.pairs import scan_pairs
 from sysid.verdict.rounds import (
     NOTHING,
@@ -23,7 +23,6 @@ from sysid.verdict.rounds import (
     Asked,
     Looked,
     begin,
-    candidate_of,
     candidates_of,
     class_of,
     pair_round,
@@ -63,23 +62,19 @@ def _one_by_one(asked: Asked, found: Search, far: Looked) -> None:
     thresholds, current = asked.thresholds, asked.base
     for _ in range(thresholds.rounds):
         candidates = candidates_of(asked, found, current, far)
-        likely = [one for one in candidates if one.p < thresholds.alpha]
-        if not likely:
+        taken_on = next((one for one in candidates if one.p < thresholds.alpha and _own(asked, one.refit)), None)
+        if taken_on is None:
             break
-        taken_on = likely[0]
-        if found.accepted:
-            for one in likely:
-                one.own = _own(asked, one, found, asked.explained(current))
-                if one.own:
-                    taken_on = one
-                    break
-            if not taken_on.own and taken_on.gain < thresholds.second * found.accepted[0].gain:
-                break  # it mends the form of what was found before, and so would what comes after it
         found.accepted.append(taken_on)
         found.classes.append(class_of(asked, taken_on, candidates))
         current = taken_on.refit
         if asked.p_left(current) > thresholds.quiet:
             break
+
+
+def _own(asked: Asked, fit: Refit) -> bool:
+    """Whether the last effect of a joint fit does more than to mend the form of those before it."""
+    return len(fit.hypotheses) < 2 or beside_forms(asked.refitter, fit, asked.evidence.groups)[0] > 0
 
 
 def _drop_stand_ins(asked: Asked, found: Search) -> None:
@@ -92,72 +87,21 @@ def _drop_stand_ins(asked: Asked, found: Search) -> None:
     final = found.accepted[-1].refit
     for one in list(found.accepted[:-1]):
         place = final.hypotheses.index(one.hypothesis)
-        q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
-        kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
-        [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
-        if asked.explained(final) - asked.explained(without) >= asked.thresholds.step:
-            continue
-        worth = candidate_of(asked, asked.hypotheses.index(one.hypothesis), moved_last(final, place), without)
-        if worth.p >= asked.thresholds.alpha:
+        if not _own(asked, moved_last(final, place)):
+            q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
+            kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
+            [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
             number = found.accepted.index(one)
             del found.accepted[number], found.classes[number]
-            found.accepted[-1] = replace(found.accepted[-1], refit=without, share=asked.explained(without), own=True)
+            found.accepted[-1] = replace(found.accepted[-1], refit=without, share=asked.explained(without))
             found.rounds.append([found.accepted[-1]])
             return
-
-
-def _own(asked: Asked, one: Candidate, found: Search, share: float) -> bool:
-    """Whether a further effect is there for its own sake, however small it is beside the first.
-
-    What mends the form of another effect leaves a rest, for it is no part of that form; and it depends on it: each
-    manoeuvre asks for a size of its own, or alone it is of another size, or gains far more or less. Or another form of
-    that effect would do as well. `share` is what the effects before it explain.
-    """
-    refitter, groups, thresholds = asked.refitter, asked.evidence.groups, asked.thresholds
-    q, left = one.refit.split[-1], 1 - share
-    part = slice(len(one.refit.q) - len(q), len(one.refit.q))
-    if one.share - share < thresholds.little * left:
-        return False
-    if one.share - share >= thresholds.rest * left:  # as long as it does not stand for those before it too
-        return one.share - asked.explained(_alone(one, found, refitter)) >= thresholds.step
-    differ = disagreement(one.refit, part, groups, refitter.precision)
-    if (one.share - share >= thresholds.half * left and differ <= thresholds.differ
-            and one.gain >= thresholds.slight * found.accepted[0].gain):
-        forms = other_forms(refitter, one.refit, groups)
-        if forms.own >= thresholds.unlike and forms.instead <= thresholds.instead:
-            return True
-    inside = beside(one.refit.products(refitter.precision), len(q))
-    size = float(q @ inside @ q)
-    if differ <= thresholds.same and _within(size / one.gain, 1 / thresholds.foretold):
-        gains = foretold(one.refit, part, groups, refitter.precision)
-        lost = float(-gains[gains < 0].sum())
-        if _within(float(gains.sum()) / one.gain, 1 / thresholds.foretold) and lost <= thresholds.loss * (
-                gains.sum() + lost):
-            return True
-    if one.share - share < thresholds.own * left or differ > thresholds.differ:
-        return False
-    alone = _alone(one, found, refitter)
-    change = alone.q - q
-    return (float(change @ inside @ change) <= thresholds.agree**2 * size
-            and _within((found.base.cost - alone.cost) / one.gain, thresholds.alone))
-
-
-def _alone(one: Candidate, found: Search, refitter: Refitter) -> Refit:
-    """The fit of an effect without those before it."""
-    alone = next((other.refit for other in found.rounds[0] if other.hypothesis.key == one.hypothesis.key), None)
-    if alone is None:
-        [alone] = refitter.fit_all([Start((one.hypothesis,), found.base.u, one.refit.split[-1])], POLISH)
-    return alone
 
 
 def _most_apart(asked: Asked, fit: Refit) -> float:
     """Largest disagreement of manoeuvres on the size of an effect in a fit."""
     return max((disagreement(fit, part, asked.evidence.groups, asked.refitter.precision) for part in fit.parts),
                default=0.0)
-
-
-def _within(ratio: float, factor: float) -> bool:
-    return 1 / factor <= ratio <= factor
 
 
 def _of_what_lasts(found: Search, wander: Wander, anything: Callable[[np.ndarray], float]) -> float:
@@ -175,13 +119,8 @@ def _decide(asked: Asked, found: Search, anything: Callable[[np.ndarray], float]
     an effect must then leave little to functions without physics.
     """
     thresholds, wander, courses = asked.thresholds, asked.wander, asked.refitter.drives.repeats
-    keep = found.accepted[:1]
-    for one in found.accepted[1:]:
-        if not one.own and one.share - keep[-1].share <= thresholds.step:
-            break  # what came after was fitted beside it
-        keep.append(one)
+    keep = found.accepted
     named = {one.hypothesis.effect for one in keep}
-    found.accepted = keep  # what is named beside an effect is told apart from it
     classes = [[name for name in members if name == members[0] or name not in named]
                for members in found.classes[: len(keep)]]
     found.classes = [members[:LARGEST] for members in classes]

@@ -7,10 +7,10 @@ import pytest
 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
-from sysid.verdict.forms import modulated, other_forms
-from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.agreement import foretold, interval_of_sum
+from sysid.verdict.forms import beside_forms, modulated
+from sysid.verdict.found import Thresholds
 from sysid.verdict.rounds import _rivals, _starts
-from sysid.verdict.search import _own
 
 pytestmark = pytest.mark.quick
 TRIALS, BINS = 6, 80
@@ -64,29 +64,15 @@ def stronger_when_fast(model, first):
     return first * np.abs(model.motion[..., :1])
 
 
-def test_an_effect_of_its_own_is_not_imitated_by_other_forms_of_the_first():
-    model = Linear(unrelated, (3.0, 1.0))
-    forms = other_forms(model, model.fit(2), GROUPS)
-    assert forms.own > 0.95 and forms.instead < 0.05
-
-
-def test_what_grows_with_the_speed_where_the_first_effect_does_is_imitated():
-    model = Linear(stronger_when_fast, (3.0, 0.0), form=0.5)
-    fit = model.fit(2)
-    assert abs(fit.q[1]) > 1  # it explains what the law of the first leaves
-    forms = other_forms(model, fit, GROUPS)
-    assert forms.own < 0.05 and forms.instead > 0.95
-
-
 @pytest.mark.parametrize(("second", "form", "own"), [(unrelated, 0.0, True), (stronger_when_fast, 0.5, False)])
-def test_half_of_what_is_left_makes_a_second_effect_unless_another_form_of_the_first_would_do(second, form, own):
+def test_a_second_effect_predicts_held_back_manoeuvres_beside_other_forms_of_the_first(second, form, own):
     model = Linear(second, (3.0, 0.0 if form else 1.0), form)
-    alone, both = model.fit(1), model.fit(2)
-    one = Candidate(effect("second"), alone.cost - both.cost, 0.0, 0.8, both)
-    found = SimpleNamespace(accepted=[SimpleNamespace(gain=4 * one.gain)])
-    asked = SimpleNamespace(refitter=model, evidence=SimpleNamespace(groups=GROUPS), explained=lambda fit: 0.8,
-                            thresholds=Thresholds(same=-1.0, own=2.0))
-    assert _own(asked, one, found, 0.5) is own
+    fit = model.fit(2)
+    assert abs(fit.q[1]) > 0.9  # it explains what the law of the first leaves
+    plain = interval_of_sum(foretold(fit, fit.parts[1], GROUPS, model.precision))
+    low, high = beside_forms(model, fit, GROUPS)
+    assert plain[0] > 0 and (low > 0) is own
+    assert own or high < 0.2 * plain[1]
 
 
 def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():

@@ -22,7 +22,7 @@ from sysid.verdict import search as search_module
 from sysid.verdict.agreement import disagreement, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import Candidate, Search, Thresholds
-from sysid.verdict.search import _decide, _own
+from sysid.verdict.search import _decide
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
 
@@ -72,12 +72,6 @@ def joint_fit(sizes, trials=3, bins=400):
     return fit, groups, gain
 
 
-def asked_of(groups, **more):
-    """What a search asks of the drives of `joint_fit`."""
-    return SimpleNamespace(refitter=SimpleNamespace(precision=np.eye(1)), evidence=SimpleNamespace(groups=groups),
-                           thresholds=Thresholds(), **more)
-
-
 @pytest.mark.quick
 def test_manoeuvres_agree_on_a_real_effect_and_foretell_one_another():
     fit, groups, gain = joint_fit((1.0, 1.0, 1.0, 1.0))
@@ -92,28 +86,6 @@ def test_manoeuvres_disagree_on_an_effect_that_only_one_of_them_asks_for():
     fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
     assert disagreement(fit, slice(0, 1), groups, np.eye(1)) == pytest.approx(3**0.5, rel=0.1)
     assert foretold(fit, slice(0, 1), groups, np.eye(1)).sum() < 0.3 * gain
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize(("sizes", "own"), [((1.0, 1.0, 1.0, 1.0), True), ((4.0, 0.0, 0.0, 0.0), False)])
-def test_a_small_second_effect_is_one_that_manoeuvres_agree_on(sizes, own):
-    fit, groups, gain = joint_fit(sizes)
-    one = Candidate(SimpleNamespace(key="second"), gain, 0.0, 0.6, fit)
-    assert _own(asked_of(groups), one, SimpleNamespace(rounds=[[]]), 0.5) is own
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize(("share", "alone", "own"), [
-    (0.99, 0.3, True),  # all that the first left, and the first is needed beside it
-    (0.85, 0.3, False),  # manoeuvres do not agree, and a rest stays
-    (0.99, 0.9, False),  # it stands for the first too
-])  # fmt: skip
-def test_a_second_effect_that_leaves_nothing_is_there_though_manoeuvres_differ_on_its_size(share, alone, own):
-    fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
-    one = Candidate(SimpleNamespace(key="second"), gain, 0.0, share, fit)
-    by_itself = Candidate(SimpleNamespace(key="second"), gain, 0.0, alone, fit)
-    found = SimpleNamespace(rounds=[[by_itself]], base=fit)
-    assert _own(asked_of(groups, explained=lambda refit: alone), one, found, 0.5) is own
 
 
 @pytest.mark.quick
