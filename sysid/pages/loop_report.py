@@ -91,6 +91,7 @@ from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
+from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before
 from whill_mjx.effects import EFFECTS, equation
@@ -241,7 +242,7 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
             if one.key in kept:
                 number = result.hypotheses.index(one)
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
-    return {"alpha": alpha, "decisions": result.config.thresholds.rounds + 2, "days": "simulated, linear",
+    return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
 
 

@@ -23,7 +23,7 @@ from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import LARGEST, Search, Thresholds, missing
+from sysid.verdict.found import EFFORT, LARGEST, Search, Thresholds, missing
 from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
@@ -50,8 +50,8 @@ def search_alone(
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
     against, unseen = "what stands out in a linear scan does not hold in a refit", False
-    for _ in range(thresholds.rounds):
-        candidates = candidates_of(asked, found, found.final, far)
+    for _ in range(EFFORT.rounds):
+        candidates = candidates_of(asked, found, found.final, [far])
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
         if not standing:
@@ -84,6 +84,6 @@ def search_alone(
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:
     """The search with its reason, and what exceeds the noise before and after."""
-    found.excess = asked.excess(asked.base), asked.excess(found.final)
+    found.excess = asked.excess(asked.base.residual), asked.excess(found.final.residual)
     found.reason = f"{reason}; {UNTOLD}"
     return found

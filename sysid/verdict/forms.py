@@ -1,43 +1,63 @@
-"""What other forms of the effects found so far could do instead of a further effect.
+"""A further effect beside other forms of those before it.
 
 No vehicle follows the catalogue's laws exactly. What such a law leaves is again the effect's own signature, only larger
-or smaller with speed, turning, time or manoeuvre, or earlier or later. A further effect must predict manoeuvres that
-were held back beside such columns; else it may only mend the form of those before it.
+or smaller with speed, turning, time or manoeuvre, or earlier or later. Every effect may therefore have another form,
+whose columns have a prior of `Thresholds.form` times its size (Kennedy and O'Hagan 2001). What these explain, no
+further effect is needed for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter, without_each
-from sysid.verdict.agreement import foretold, interval_of_sum
 
-USUAL = 0.5
-"""Standard deviation of the sizes of such columns, as a share of the effect."""
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
+RIDGE = 1e-9
 
 
-def beside_forms(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]]) -> tuple[float, float]:
-    """95 % interval of what the last effect of a joint fit gains in manoeuvres that it was not fitted to, where every
-    effect before it may have another form. Linear, around the fit.
+@dataclass(frozen=True)
+class Beside:
+    """The last effect of a joint fit beside other forms of those before it."""
+
+    gain: float
+    """By how much it lowers the cost there."""
+    residual: np.ndarray  # (B, n) what is left where every effect may have another form
+
+
+def beside_forms(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
+    """Let the effects of a joint fit have other forms. Linear, around the fit.
 
     Args:
         groups: trials of each manoeuvre.
+        form: standard deviation of the sizes of such columns, as a share of the effect.
     """
-    whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)[:-1]]))
-    bent = np.concatenate([refitter.white(modulated(whole - one, whole, groups)) for one in less], axis=-1)
-    size, count = len(fit.u), bent.shape[-1]
-    prior = np.zeros((size + count,) * 2)
-    prior[:size, :size] = refitter.precision
-    prior[np.diag_indices(len(prior))] += np.repeat([0.0, USUAL**-2], [size, count])
-    columns = np.concatenate([fit.jacobian[..., :size], bent, fit.jacobian[..., size:]], axis=-1)
-    free = replace(fit, u=np.concatenate([fit.u, np.zeros(count)]), jacobian=columns)
-    return interval_of_sum(foretold(free, fit.parts[-1], groups, prior))
+    whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
+    bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
+    columns = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
+    last = len(fit.u) + fit.parts[-1].start
+    target = fit.residual.reshape(-1) + columns @ np.concatenate([fit.u - refitter.reference.u, fit.q])
+    forms = np.concatenate([one.reshape(len(columns), -1) for one in bent], axis=1)
+    before = forms[:, : sum(one.shape[-1] for one in bent[:-1])]
+
+    def ridge(effects: np.ndarray, others: np.ndarray) -> tuple[float, np.ndarray]:
+        """Least cost of the target, and what is then left (n,)."""
+        design = np.concatenate([effects, others], axis=1)
+        prior = np.diag(np.repeat([0.0, form**-2], [effects.shape[1], others.shape[1]]))
+        prior[: len(fit.u), : len(fit.u)] = refitter.precision
+        matrix = design.T @ design + prior
+        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
+        right = design.T @ target
+        solution = np.linalg.solve(matrix, right)
+        return float(target @ target - right @ solution), target - design @ solution
+
+    gain = ridge(columns[:, :last], before)[0] - ridge(columns, before)[0]
+    return Beside(max(gain, 0.0), ridge(columns, forms)[1].reshape(fit.residual.shape))
 
 
 def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:

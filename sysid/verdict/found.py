@@ -15,46 +15,38 @@ LARGEST = 4  # members of a class
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
+    """What decides. Frozen before any drive is looked at; part of the manifest."""
 
     alpha: float = 0.005
     """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
     the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
-    alarms."""
+    alarms. Of two effects the one whose posterior weight is a smaller share of the other's is not in its class."""
+    form: float = 0.5
+    """Standard deviation of an effect's form from the catalogue's law, as a share of its size."""
     share: float = 0.6
-    """Least share of the excess residual that named effects explain together."""
-    most: float = 0.5
-    """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
-    excess: float = 0.06
-    """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
-    excess_alone: float = 1e-3
-    """p-value of the excess below which something without a name is missing, whatever the search says."""
-    search_alone: float = 1e-10
-    """The same of the search, whatever the excess. Small p-values come more often than they say, so otherwise both must
-    be below alpha: on 420 days with nothing missing the least one with no such excess was 8e-10."""
-    quiet: float = 0.05
-    """p-value of the excess that is left from which it passes for a day's own."""
-    same: float = 0.2
-    """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
-    scatter: float = 1.0
-    """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
-    more one in six would find the opposite."""
+    """Least share that effects explain of what they explain and what is then left that replicates share, or that smooth
+    functions predict."""
+    doubt: float = 1e-10
+    """p-value of the search below which something without a name is missing, whatever the excess. Small p-values come
+    more often than they should: on 420 days with nothing missing the least one without such an excess was 8e-10."""
+
+    @property
+    def alike(self) -> float:
+        """|cos| of two effects' signatures above which another form of one may be the other."""
+        return (1 + self.form**2) ** -0.5
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is tried."""
+
     rounds: int = 3
     """Effects that are searched for one after the other, at most."""
-    pairs: int = 3
-    """Pairs of effects that are refitted."""
-    worthwhile: float = 0.15
-    """Least scanned gain of an effect that is refitted, as a share of the best one's."""
     candidates: int = 4
-    """Effects refitted in a round, of each scan."""
-    close: float = 0.5
-    """Share of the best refit's gain from which another one is polished too."""
-    rival: float = 0.4
-    """|cos| of two effects' signatures above which one is not named before the other was refitted."""
-    between: float = 0.5
-    """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
-    alike: float = 0.9
-    """|cos| of two effects' signatures above which they are not separated."""
+    """Effects refitted in a round, of each scan; pairs refitted; effects that might imitate the best one."""
+
+
+EFFORT = Effort()
 
 
 @dataclass
@@ -101,9 +93,10 @@ class Search:
 
 
 def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
-    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
+    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt. The
+    excess alone is one of five looks at the drives."""
     both = max(search_p, excess_p) < thresholds.alpha
-    return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
+    return both or excess_p < thresholds.alpha / 5 or search_p < thresholds.doubt
 
 
 @dataclass(frozen=True)

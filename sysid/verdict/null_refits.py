@@ -1,15 +1,14 @@
 """Days with nothing missing, put through the same fits as the drives in question.
 
-The nulls of `sysid.verdict.scan` are linear: they move along the columns of the base parameters. Those here are
-drives of
-the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
-day is added, and base fit, scan and refits see it as they see measured drives. They tell how often this very set of
-drives would raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
+The nulls of `sysid.verdict.scan` are linear: they move along the columns of the base parameters. Those here are drives
+of the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
+day is added, and the whole search sees it as it sees measured drives. They show how often this very set of drives would
+raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,19 +22,11 @@ from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import (
-    NullRefits,
-    PairScan,
-    Scan,
-    Search,
-    Thresholds,
-    family,
-    missing,
-    tail,
-)
+from sysid.verdict.found import NullRefits, PairScan, Scan, Search, Thresholds, tail
 from sysid.verdict.pairs import scan_again
-from sysid.verdict.rounds import Asked, pair_round, refitted
+from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
+from sysid.verdict.search import settle
 
 TOGETHER, ACCELERATED = 16, 100
 """Days whose base fits advance side by side on a processor, and on an accelerator."""
@@ -44,7 +35,7 @@ TOGETHER, ACCELERATED = 16, 100
 def run(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
     thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
-    pairs: PairScan | None = None,
+    pairs: PairScan | None = None, anything: Callable[[np.ndarray], float] = lambda _: 0.0,
 ) -> NullRefits:
     """Simulate and judge `count` days.
 
@@ -52,6 +43,7 @@ def run(
         evidence: of the drives in question around the reference, as `gather` made it.
         scan: of the drives in question: its linear nulls are what the first look at each day is held against.
         pairs: likewise of pairs of effects; None where pairs do not decide.
+        anything: `Asked.anything`.
     """
     reference = refitter.reference
     rng = np.random.default_rng((seed, 1))
@@ -60,22 +52,14 @@ def run(
     p, alarms = np.ones(count), 0
     for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
         around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
-        day = Asked(around, hypotheses, one, wander, thresholds, base, scan, similar)
-        looked = best(Solver(around), hypotheses, wander)
-        p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
-        if p[n] < thresholds.alpha:
-            p[n] = max(p[n], min((each.p for each in refitted(day, base, [looked])), default=0.0))
-        # An effect that stays significant in a refit may be named; without one, the rule of the verdict holds.
-        alarm = p[n] < thresholds.alpha or missing(p[n], day.p_left(base), thresholds)
-        if not alarm and pairs is not None:
-            again = scan_again(pairs, around, hypotheses, wander)
-            if again.p_family < thresholds.alpha:
-                found = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
-                               pairs=again)
-                pair_round(day, found, set())
-                alarm = bool(found.accepted)
-                p[n] = min(p[n], found.p_value) if alarm else p[n]
-        alarms += bool(alarm)
+        gain, worth, q = best(Solver(around), hypotheses, wander)
+        looked = replace(scan, gain=gain, worth=worth, q=q,
+                         p=np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))]))
+        found = Search("none", base, base, looked,
+                       pairs=None if pairs is None else scan_again(pairs, around, hypotheses, wander))
+        settle(Asked(around, hypotheses, one, wander, thresholds, base, looked, similar, anything), found)
+        p[n] = found.p_value
+        alarms += found.verdict != "none"
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")
     return NullRefits(p, alarms)

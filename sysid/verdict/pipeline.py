@@ -81,7 +81,7 @@ def find_missing(
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
         nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
-                                config.refit_nulls, config.seed, progress, outcome.pairs)
+                                config.refit_nulls, config.seed, progress, outcome.pairs, anything)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":

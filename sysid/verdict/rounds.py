@@ -16,8 +16,8 @@ from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
-from sysid.verdict.forms import beside_forms
-from sysid.verdict.found import Candidate, Scan, Search, Thresholds
+from sysid.verdict.forms import Beside, beside_forms
+from sysid.verdict.found import EFFORT, Candidate, Scan, Search, Thresholds
 from sysid.verdict.scan import best, run
 
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
@@ -42,6 +42,9 @@ class Asked:
     scan: Scan
     """Of all hypotheses beside the base."""
     similar: np.ndarray  # (H, H) |cos| of signatures
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0
+    """By how much the best of the smooth functions that know no physics lowers the sum of squares of a white residual
+    (B, n), on drives held back from it."""
     report: Callable[[str], None] = lambda _: None
     """Says what was just done."""
 
@@ -50,23 +53,48 @@ class Asked:
         """Squared white residual where nothing is missing."""
         return float((self.refitter.drives.mask > 0).sum()) * self.wander.level
 
-    def excess(self, fit: Refit) -> float:
-        """Squared white residual of a fit over its number of values, less 1."""
-        return float(np.square(fit.residual).sum()) / self.count - 1
+    def excess(self, residual: np.ndarray) -> float:
+        """Squared white residual (B, n) over its number of values, less 1."""
+        return float(np.square(residual).sum()) / self.count - 1
 
-    def p_left(self, fit: Refit) -> float:
+    def p_left(self, residual: np.ndarray) -> float:
         """Probability of so much excess on a day with nothing missing."""
-        return self.wander.p_excess(self.excess(fit))
+        return self.wander.p_excess(self.excess(residual))
 
     def explained(self, fit: Refit) -> float:
-        """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
-        before = self.excess(self.base)
-        return float(np.clip((before - self.excess(fit)) / max(before, self.thresholds.excess), 0.0, 1.0))
+        """Share of the base fit's excess that a fit removes; where there is hardly any, of what a day's varies by."""
+        before = self.excess(self.base.residual)
+        return float(np.clip((before - self.excess(fit.residual)) / max(before, self.wander.excess), 0.0, 1.0))
+
+    def share(self, gain: float, residual: np.ndarray) -> float:
+        """What effects gain, as a share of that and of what they leave (B, n) though it could be predicted.
+
+        That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
+        of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing explains.
+        """
+        wander = self.wander
+        common = self.excess(residual) - wander.unshared(residual, self.refitter.drives.repeats)
+        left = common * self.count if wander.p_excess(common) < self.thresholds.alpha else 0.0
+        smooth = self.anything(residual) - wander.usual * len(residual)
+        return gain / max(gain + max(left, smooth, 0.0), 1e-9)
+
+    def beside_forms(self, fit: Refit) -> Beside:
+        """The last effect of a joint fit beside other forms of those before it."""
+        return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
+
+    def calm(self, fit: Refit) -> bool:
+        """Whether other forms of the effects of a joint fit leave no more than days differ by."""
+        return self.p_left(self.beside_forms(fit).residual) >= self.thresholds.alpha
+
+    def own(self, fit: Refit) -> bool:
+        """Whether the last effect of a joint fit does more than to mend the form of those before it."""
+        found = self.beside_forms(fit)
+        return self.share(found.gain, found.residual) >= self.thresholds.share
 
 
 def begin(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    draws: int, seed: int, progress: Progress | None,
+    draws: int, seed: int, progress: Progress | None, anything: Callable[[np.ndarray], float] = lambda _: 0.0,
 ) -> tuple[Asked, Looked]:
     """What a search asks, around the base refitted to the drives; and a scan around the reference."""
     def report(text: str) -> None:
@@ -80,13 +108,13 @@ def begin(
     scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
     report("scan")
     return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
-                 report), far
+                 anything, report), far
 
 
-def candidates_of(asked: Asked, found: Search, current: Refit, far: Looked) -> list[Candidate]:
-    """The next round of a search, which is kept."""
+def candidates_of(asked: Asked, found: Search, current: Refit, far: Sequence[Looked] = ()) -> list[Candidate]:
+    """The next round of a search, which is kept; the first one also starts where other scans (`far`) found most."""
     scan = asked.scan
-    scans = [rescan(asked, current)] if found.rounds else [far, (scan.gain, scan.worth, scan.q)]
+    scans = [rescan(asked, current)] if found.rounds else [*far, (scan.gain, scan.worth, scan.q)]
     found.rounds.append(refitted(asked, current, scans, len(found.rounds) + 1))
     return found.rounds[-1]
 
@@ -104,15 +132,14 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
 
     fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
     asked.report(f"refits, round {number}")
-    least = current.cost - asked.thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
-    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
+    best_of = [int(i) for i in np.argsort([fit.cost for fit in fits])[: EFFORT.candidates]]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
         again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
         fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
     asked.report(f"polish, round {number}")
-    rivals = _rivals(hypotheses, asked.similar, [h for h, _ in chosen], fits, taken, asked.thresholds)
+    rivals = _rivals(hypotheses, asked.similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
     fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
     asked.report(f"rivals, round {number}")
@@ -141,25 +168,22 @@ def _starts(
     for number, (gain, worth, q) in enumerate(scans):
         standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
         chosen = sorted(standing, key=lambda h: -gain[h])
-        chosen = [h for h in chosen if gain[h] >= thresholds.worthwhile * gain[chosen[0]]]
         if number == len(scans) - 1:
-            chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
+            chosen = [*chosen[: EFFORT.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
         new = 0
         most = [h for h in sorted(left, key=lambda h: -gain[h])[:1] if gain[h] > 0]
         for h in [*chosen, *most]:
             wide, start = _widest(hypotheses, h, q, standing)
-            if hypotheses[wide].key not in order and (new < thresholds.candidates or h not in chosen):
+            if hypotheses[wide].key not in order and (new < EFFORT.candidates or h not in chosen):
                 order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
 
 
 def _rivals(
-    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
-    thresholds: Thresholds,
+    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str]
 ) -> list[int]:
-    """What might imitate the best fit, or be imitated by it, and was not tried: it must have had its chance before
-    another is named."""
+    """What is most like the best fit, and was not tried: it must have had its chance before another is named."""
     if not fits:
         return []
     winner = tried[int(np.argmin([fit.cost for fit in fits]))]
@@ -167,10 +191,10 @@ def _rivals(
     out: list[int] = []
     alike = np.maximum(similar[winner], similar[:, winner])
     for h in np.argsort(-alike):
-        if alike[h] > thresholds.rival and hypotheses[h].effect not in done:
+        if hypotheses[h].effect not in done:
             done.add(hypotheses[h].effect)
             out.append(int(h))
-    return out[: thresholds.candidates]
+    return out[: EFFORT.candidates]
 
 
 def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
@@ -226,8 +250,8 @@ def candidate_of(asked: Asked, h: int, fit: Refit, current: Refit) -> Candidate:
 def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
     """Two effects instead of what was accepted, where only together they explain the drives.
 
-    Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
-    another, and together they must explain more than what was accepted one by one.
+    Each must be significant and do more than to mend the form of the other, and together they must explain more than
+    what was accepted one by one.
 
     Args:
         tried: effects whose pairs had their chance, with the other one as a further effect.
@@ -243,7 +267,7 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
             seen.add(names)
             order.append(int(m))
     starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
-              for m in order[: thresholds.pairs]]
+              for m in order[: EFFORT.candidates]]
     if not starts:
         return
     fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
@@ -257,7 +281,7 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
     members = []
     for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
         one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
-        if one.p >= thresholds.alpha or beside_forms(refitter, fit, asked.evidence.groups)[0] <= 0:
+        if one.p >= thresholds.alpha or not asked.own(fit):
             return
         members.append(one)
     members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
@@ -273,8 +297,12 @@ def held_back(asked: Asked, fit: Refit) -> np.ndarray:
 
 
 def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> list[str]:
-    """Effects that these drives do not separate from the best: nearly as good a fit, alike signatures, or a
-    fit so much better than imitating the best would bring that the truth may lie between the two."""
+    """Effects that these drives do not separate from the best, nearest first.
+
+    Another form of the best could be such an effect (`Thresholds.alike`), or its posterior weight is not a negligible
+    share of the best one's, or it gains so much more than imitating the best would bring that the truth may lie between
+    the two.
+    """
     hypotheses, similar, thresholds = asked.hypotheses, asked.similar, asked.thresholds
     mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}
@@ -282,7 +310,7 @@ def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> 
         imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
         ratio = other.gain / best.gain
         own = (ratio - imitated) / max(1 - imitated, 1e-9)
-        if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
+        if best.gain - other.gain < -2 * np.log(thresholds.alpha) or own > thresholds.form:
             near[other.hypothesis.effect] = ratio
     for j, one in enumerate(hypotheses):
         if similar[mine, j] > thresholds.alike:

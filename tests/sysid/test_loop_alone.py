@@ -18,7 +18,7 @@ from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.found import Candidate, Effort, Thresholds
 from sysid.verdict.preparation import days_of
 from sysid.verdict.rounds import NOTHING, Asked
 from whill_mjx.effects import make_effect
@@ -115,7 +115,7 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
     evidence = drives(np.zeros(4))
     linear = Linear(evidence)
     base = linear.fit((), None)
-    asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(rounds=1), base,
+    asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(), base,
                   SimpleNamespace(p_family=0.0), np.eye(4))
     listed = [candidate(*each) for each in (
         ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0))]
@@ -126,6 +126,7 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
         return listed
 
     monkeypatch.setattr(alone, "begin", lambda *_: (asked, None))
+    monkeypatch.setattr(alone, "EFFORT", Effort(rounds=1))
     monkeypatch.setattr(alone, "candidates_of", candidates_of)
     monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
     monkeypatch.setattr(alone, "class_of", lambda asked, best, _: [best.hypothesis.effect])

@@ -7,7 +7,6 @@ import pytest
 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
-from sysid.verdict.agreement import foretold, interval_of_sum
 from sysid.verdict.forms import beside_forms, modulated
 from sysid.verdict.found import Thresholds
 from sysid.verdict.rounds import _rivals, _starts
@@ -31,6 +30,7 @@ class Linear:
         first = rng.standard_normal((TRIALS, BINS, 5)) * (np.arange(5) > 1)  # speeds are those of the motion
         self.signatures = np.stack([first[::-1], first, second(self, first)], -1)
         self.precision, self.groups = np.eye(1), GROUPS
+        self.reference = SimpleNamespace(u=np.zeros(1))
         self.drives = SimpleNamespace(simulate=lambda sets: np.stack([self.features(one) for one in sets]))
         law = first * (1 + form * np.abs(self.motion[..., :1]))
         self.data = self.features(np.array([0.0, 0.0, truth[1]])) + truth[0] * law + rng.standard_normal(first.shape)
@@ -65,14 +65,14 @@ def stronger_when_fast(model, first):
 
 
 @pytest.mark.parametrize(("second", "form", "own"), [(unrelated, 0.0, True), (stronger_when_fast, 0.5, False)])
-def test_a_second_effect_predicts_held_back_manoeuvres_beside_other_forms_of_the_first(second, form, own):
+def test_what_other_forms_of_the_first_effect_explain_is_no_gain_of_a_second(second, form, own):
     model = Linear(second, (3.0, 0.0 if form else 1.0), form)
     fit = model.fit(2)
     assert abs(fit.q[1]) > 0.9  # it explains what the law of the first leaves
-    plain = interval_of_sum(foretold(fit, fit.parts[1], GROUPS, model.precision))
-    low, high = beside_forms(model, fit, GROUPS)
-    assert plain[0] > 0 and (low > 0) is own
-    assert own or high < 0.2 * plain[1]
+    plain, found = model.fit(1).cost - fit.cost, beside_forms(model, fit, GROUPS, 0.5)
+    assert found.gain > 0.9 * plain if own else found.gain < 0.1 * plain
+    assert np.square(found.residual).mean() == pytest.approx(1.0, abs=0.05)
+    assert own or np.square(model.fit(1).residual).mean() > 1.2  # by its law alone the first leaves more
 
 
 def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():
@@ -101,5 +101,5 @@ def test_what_the_best_fit_imitates_has_its_chance_as_what_imitates_it(imitates)
     effects = [effect(name) for name in ("payload", "traction", "slope")]
     similar = np.eye(3)
     similar[imitates] = 0.8
-    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == [1]
-    assert _rivals(effects, np.eye(3), [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == []
+    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], {"slope"}) == [1]
+    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set())[0] == 1

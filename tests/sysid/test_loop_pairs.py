@@ -62,7 +62,7 @@ def named(found):
 
 
 def test_a_hidden_pair_is_named_and_a_single_effect_stays_one(wander):
-    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.88), wander)
+    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.86), wander)
     assert named(pair) == ("named", {"slope", "track_width"})
     assert pair.scan.p_family > 0.01 > pair.p_value and pair.share > 0.7
     assert named(verdict(drives((0.0, 0.0, 1.0, 0.0)), wander)) == ("named", {"side_force"})

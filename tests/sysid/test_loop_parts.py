@@ -19,9 +19,10 @@ from sysid.pages.loop_page import not_determined
 from sysid.pages.loop_report import in_range, unit_of
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
-from sysid.verdict.agreement import disagreement, foretold
+from sysid.verdict.agreement import foretold
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import Candidate, Search, Thresholds
+from sysid.verdict.found import Candidate, Scan, Search, Thresholds
+from sysid.verdict.rounds import Asked
 from sysid.verdict.search import _decide
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
@@ -75,16 +76,14 @@ def joint_fit(sizes, trials=3, bins=400):
 @pytest.mark.quick
 def test_manoeuvres_agree_on_a_real_effect_and_foretell_one_another():
     fit, groups, gain = joint_fit((1.0, 1.0, 1.0, 1.0))
-    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) < 0.05
     told = foretold(fit, slice(0, 1), groups, np.eye(1))
     assert told.min() > 0
     assert told.sum() == pytest.approx(gain, rel=0.1)
 
 
 @pytest.mark.quick
-def test_manoeuvres_disagree_on_an_effect_that_only_one_of_them_asks_for():
+def test_manoeuvres_foretell_little_of_an_effect_that_only_one_of_them_asks_for():
     fit, groups, gain = joint_fit((4.0, 0.0, 0.0, 0.0))
-    assert disagreement(fit, slice(0, 1), groups, np.eye(1)) == pytest.approx(3**0.5, rel=0.1)
     assert foretold(fit, slice(0, 1), groups, np.eye(1)).sum() < 0.3 * gain
 
 
@@ -105,17 +104,17 @@ def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_th
     one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
 
     def fit(cost):
-        return Refit((one,), np.zeros(0), np.ones(1), cost, np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(0))
+        return Refit((one,), np.zeros(0), np.ones(1), cost, np.full((1, 1), np.sqrt(cost)), np.zeros((1, 1, 1)),
+                     np.zeros(0))
 
     candidate = Candidate(one, 1.0, search_p, 0.1, fit(1 + 0.9 * excess))
     found = Search("none", fit(1 + excess), fit(1 + excess), SimpleNamespace(p_family=0.0), rounds=[[candidate]])
     if search_p < Thresholds().alpha:
         found.accepted, found.classes = [candidate], [["quadratic_drag"]]
     wander = Wander((), (), freedom=10.0, excess=1.0)
-    refitter = SimpleNamespace(drives=SimpleNamespace(repeats=np.zeros(1, int)), precision=np.zeros((0, 0)))
-    asked = SimpleNamespace(thresholds=Thresholds(), wander=wander, refitter=refitter,
-                            excess=lambda refit: refit.cost - 1, evidence=SimpleNamespace(groups=[[0]]))
-    _decide(asked, found, lambda residual: 0.0)
+    refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones(1)))
+    asked = Asked(None, (one,), refitter, wander, Thresholds(), found.base, None, None)
+    _decide(asked, found, 0.1)
     assert found.verdict == verdict
     if verdict == "none":
         assert not found.accepted and not found.classes and found.final is found.base and found.share == 0
@@ -135,14 +134,15 @@ def test_a_simulated_day_is_an_alarm_where_the_verdict_would_be_that_something_i
     refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones((1, 1, 1))),
                                reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
     monkeypatch.setattr(null_refits, "_days", lambda *_: [(refitter, base)] * 2)
-    monkeypatch.setattr(null_refits, "at_fit", lambda *_: None)
-    monkeypatch.setattr(null_refits, "Solver", lambda *_: None)
-    monkeypatch.setattr(null_refits, "imitation", lambda *_: None)
+    for name in ("at_fit", "Solver", "imitation"):
+        monkeypatch.setattr(null_refits, name, lambda *_: None)
     monkeypatch.setattr(null_refits, "best", lambda *_: (np.zeros(1), np.zeros(1), (np.zeros(1),)))
-    scan = SimpleNamespace(smallest=np.linspace(0.0, 1.0, 100), null=np.zeros((100, 1)))
+    monkeypatch.setattr(rounds, "refitted", lambda *_: [])
+    nothing = np.zeros((100, 1))
+    scan = Scan(np.zeros(1), np.zeros(1), (np.zeros(1),), nothing, np.ones(1), np.linspace(0.0, 1.0, 100))
     one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
     nulls = null_refits.run(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), scan, Thresholds(), 2)
-    assert (nulls.p == 1.0).all() and nulls.alarms == alarms
+    assert (nulls.p > 0.5).all() and nulls.alarms == alarms
 
 
 @pytest.mark.quick
@@ -163,12 +163,13 @@ def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left
     monkeypatch.setattr(search_module, "scan_pairs", lambda *_, **__: scan)
     monkeypatch.setattr(rounds, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
     monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
+    monkeypatch.setattr(Asked, "beside_forms", lambda _, fit: SimpleNamespace(residual=fit.residual))
     monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
     monkeypatch.setattr(search_module, "_decide", lambda *_: None)
     drives = SimpleNamespace(mask=np.ones(1), repeats=np.zeros(1, int))
     refitter = SimpleNamespace(fit=lambda *_: base_fit(10.0), drives=drives,
                                reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
-    search_module.search(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), None)
+    search_module.search(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), lambda _: 0.0)
     assert bool(asked) == pairs
 
 
