@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -80,6 +81,8 @@ class Search:
     """Squared white residual over its number, less 1: before and after."""
     reason: str = ""
     pairs: PairScan | None = None
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    """The numbers behind each step."""
     together: float | None = None
     """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
 

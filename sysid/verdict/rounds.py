@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,8 @@ class Asked:
     (B, n), on drives held back from it."""
     report: Callable[[str], None] = lambda _: None
     """Says what was just done."""
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    """The numbers behind each step so far."""
 
     @cached_property
     def count(self) -> float:
@@ -66,8 +69,8 @@ class Asked:
         before = self.excess(self.base.residual)
         return float(np.clip((before - self.excess(fit.residual)) / max(before, self.wander.excess), 0.0, 1.0))
 
-    def share(self, gain: float, residual: np.ndarray) -> float:
-        """What effects gain, as a share of that and of what they leave (B, n) though it could be predicted.
+    def share(self, fit: Refit, gain: float, residual: np.ndarray) -> float:
+        """What effects of a fit gain, as a share of that and of what they leave (B, n) though it could be predicted.
 
         That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
         of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing explains.
@@ -76,7 +79,10 @@ class Asked:
         common = self.excess(residual) - wander.unshared(residual, self.refitter.drives.repeats)
         left = common * self.count if wander.p_excess(common) < self.thresholds.alpha else 0.0
         smooth = self.anything(residual) - wander.usual * len(residual)
-        return gain / max(gain + max(left, smooth, 0.0), 1e-9)
+        share = gain / max(gain + max(left, smooth, 0.0), 1e-9)
+        self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "common": common * self.count,
+                           "p_common": wander.p_excess(common), "smooth": smooth, "share": share})
+        return share
 
     def beside_forms(self, fit: Refit) -> Beside:
         """The last effect of a joint fit beside other forms of those before it."""
@@ -84,12 +90,15 @@ class Asked:
 
     def calm(self, fit: Refit) -> bool:
         """Whether other forms of the effects of a joint fit leave no more than days differ by."""
-        return self.p_left(self.beside_forms(fit).residual) >= self.thresholds.alpha
+        p = self.p_left(self.beside_forms(fit).residual)
+        self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
+                           "p_left_beside_forms": p})
+        return p >= self.thresholds.alpha
 
     def own(self, fit: Refit) -> bool:
         """Whether the last effect of a joint fit does more than to mend the form of those before it."""
         found = self.beside_forms(fit)
-        return self.share(found.gain, found.residual) >= self.thresholds.share
+        return self.share(fit, found.gain, found.residual) >= self.thresholds.share
 
 
 def begin(

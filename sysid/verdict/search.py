@@ -39,7 +39,7 @@ def search(
 def settle(asked: Asked, found: Search, far: Sequence[Looked] = ()) -> None:
     """Turn a scan of effects and of pairs into a verdict; `far` are scans around other points."""
     thresholds, base = asked.thresholds, asked.base.residual
-    found.excess = (asked.excess(base),) * 2
+    found.excess, found.steps = (asked.excess(base),) * 2, asked.steps
     looks = [asked.scan.p_family, asked.p_left(base)] + ([found.pairs.p_family] if found.pairs else [])
     if min(looks) >= thresholds.alpha:
         found.reason = NOTHING
@@ -98,7 +98,7 @@ def _share(asked: Asked, found: Search) -> float:
     if not found.accepted:
         return 0.0
     final = found.accepted[-1].refit
-    return asked.share(asked.base.cost - final.cost, final.residual)
+    return asked.share(final, asked.base.cost - final.cost, final.residual)
 
 
 def _decide(asked: Asked, found: Search, share: float) -> None:
