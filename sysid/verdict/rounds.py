@@ -73,15 +73,18 @@ class Asked:
         """What effects of a fit gain, as a share of that and of what they leave (B, n) though it could be predicted.
 
         That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
-        of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing explains.
+        of drives that were held back, beyond a usual day's. Of what replicates do not share (gusts, say) nothing can be
+        predicted; `Thresholds.form` squared of it counts, since an effect that acts at random does not do so mostly.
         """
-        wander = self.wander
-        common = self.excess(residual) - wander.unshared(residual, self.refitter.drives.repeats)
-        left = common * self.count if wander.p_excess(common) < self.thresholds.alpha else 0.0
+        wander, excess = self.wander, self.excess(residual)
+        common = excess - wander.unshared(residual, self.refitter.drives.repeats)
         smooth = self.anything(residual) - wander.usual * len(residual)
-        share = gain / max(gain + max(left, smooth, 0.0), 1e-9)
-        self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "common": common * self.count,
-                           "p_common": wander.p_excess(common), "smooth": smooth, "share": share})
+        left = {"smooth": smooth, "common": common * self.count, "any": self.thresholds.form**2 * excess * self.count}
+        p = {"common": wander.p_excess(common), "any": wander.p_excess(excess)}
+        counted = [left[name] for name in left if p.get(name, 0.0) < self.thresholds.alpha]
+        share = gain / max(gain + max(counted, default=0.0), gain, 1e-9)
+        self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "left": left, "p": p,
+                           "share": share})
         return share
 
     def beside_forms(self, fit: Refit) -> Beside:

@@ -88,6 +88,26 @@ def test_manoeuvres_foretell_little_of_an_effect_that_only_one_of_them_asks_for(
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize(("shared", "own", "smooth", "share"), [
+    (0.0, 0.0, 0.0, 1.0),  # no more is left than days differ by
+    (1.0, 0.0, 0.0, 1 / 2),  # replicates have as much in common as the effect gains
+    (0.0, 1.0, 0.0, 4 / 5),  # what they do not share counts a quarter
+    (0.0, 3.0, 0.0, 4 / 7),  # most of it is at random: lost messages, say
+    (0.0, 0.0, 2.0, 1 / 3),  # smooth functions predict twice as much
+])
+def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(shared, own, smooth, share):
+    random, (trials, values) = np.random.default_rng(0), (8, 4000)
+    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
+    common = np.repeat(random.standard_normal((2, values)), trials // 2, axis=0)
+    residual = random.standard_normal((trials, values)) * np.sqrt(1 + own) + np.sqrt(shared) * common
+    drives = SimpleNamespace(mask=np.ones(residual.shape), repeats=np.repeat([0, 1], trials // 2))
+    asked = Asked(None, (one,), SimpleNamespace(drives=drives), Wander((), (), freedom=10.0), Thresholds(), None, None,
+                  None, lambda _: smooth * residual.size)
+    fit = Refit((one,), np.zeros(0), np.ones(1), 0.0, residual, np.zeros((1, 1, 1)), np.zeros(0))
+    assert asked.share(fit, float(residual.size), residual) == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("search_p", "excess", "verdict"),
     [
