@@ -69,17 +69,17 @@ class Asked:
         before = self.excess(self.base.residual)
         return float(np.clip((before - self.excess(fit.residual)) / max(before, self.wander.excess), 0.0, 1.0))
 
-    def share(self, fit: Refit, gain: float, residual: np.ndarray) -> float:
+    def share(self, fit: Refit, gain: float, residual: np.ndarray, random: float) -> float:
         """What effects of a fit gain, as a share of that and of what they leave (B, n) though it could be predicted.
 
         That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
-        of drives that were held back, beyond a usual day's. Of what replicates do not share (gusts, say) nothing can be
-        predicted; `Thresholds.form` squared of it counts, since an effect that acts at random does not do so mostly.
+        of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing predicts:
+        a share of it counts (`random`).
         """
         wander, excess = self.wander, self.excess(residual)
         common = excess - wander.unshared(residual, self.refitter.drives.repeats)
         smooth = self.anything(residual) - wander.usual * len(residual)
-        left = {"smooth": smooth, "common": common * self.count, "any": self.thresholds.form**2 * excess * self.count}
+        left = {"smooth": smooth, "common": common * self.count, "any": random * excess * self.count}
         p = {"common": wander.p_excess(common), "any": wander.p_excess(excess)}
         counted = [left[name] for name in left if p.get(name, 0.0) < self.thresholds.alpha]
         share = gain / max(gain + max(counted, default=0.0), gain, 1e-9)
@@ -92,16 +92,23 @@ class Asked:
         return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
 
     def calm(self, fit: Refit) -> bool:
-        """Whether other forms of the effects of a joint fit leave no more than days differ by."""
-        p = self.p_left(self.beside_forms(fit).residual)
+        """Whether other forms of the effects of a joint fit leave no more than days differ by, or nothing that smooth
+        functions predict better than on usual days."""
+        residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
+        p, smooth = self.p_left(residual), self.anything(residual) / len(residual)
         self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
-                           "p_left_beside_forms": p})
-        return p >= self.thresholds.alpha
+                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if np.isfinite(limit) else None})
+        return p >= self.thresholds.alpha or smooth <= limit < np.inf
+
+    def named(self, fit: Refit) -> float:
+        """Share of what could be predicted that the effects of a fit explain. They may act at random in part: in energy
+        `Thresholds.form` squared of what they leave so counts against them."""
+        return self.share(fit, self.base.cost - fit.cost, fit.residual, self.thresholds.form**2)
 
     def own(self, fit: Refit) -> bool:
         """Whether the last effect of a joint fit does more than to mend the form of those before it."""
         found = self.beside_forms(fit)
-        return self.share(fit, found.gain, found.residual) >= self.thresholds.share
+        return self.share(fit, found.gain, found.residual, 1.0) >= self.thresholds.share
 
 
 def begin(

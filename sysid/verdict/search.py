@@ -94,11 +94,7 @@ def _drop_stand_ins(asked: Asked, found: Search) -> None:
 
 
 def _share(asked: Asked, found: Search) -> float:
-    """What was accepted explains, as a share of what could be predicted (`Asked.share`)."""
-    if not found.accepted:
-        return 0.0
-    final = found.accepted[-1].refit
-    return asked.share(final, asked.base.cost - final.cost, final.residual)
+    return asked.named(found.accepted[-1].refit) if found.accepted else 0.0
 
 
 def _decide(asked: Asked, found: Search, share: float) -> None:

@@ -101,10 +101,10 @@ def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(s
     common = np.repeat(random.standard_normal((2, values)), trials // 2, axis=0)
     residual = random.standard_normal((trials, values)) * np.sqrt(1 + own) + np.sqrt(shared) * common
     drives = SimpleNamespace(mask=np.ones(residual.shape), repeats=np.repeat([0, 1], trials // 2))
-    asked = Asked(None, (one,), SimpleNamespace(drives=drives), Wander((), (), freedom=10.0), Thresholds(), None, None,
-                  None, lambda _: smooth * residual.size)
+    asked = Asked(None, (one,), SimpleNamespace(drives=drives), Wander((), (), freedom=10.0), Thresholds(),
+                  SimpleNamespace(cost=float(residual.size)), None, None, lambda _: smooth * residual.size)
     fit = Refit((one,), np.zeros(0), np.ones(1), 0.0, residual, np.zeros((1, 1, 1)), np.zeros(0))
-    assert asked.share(fit, float(residual.size), residual) == pytest.approx(share, abs=0.03)
+    assert asked.named(fit) == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.quick
