@@ -32,6 +32,7 @@ from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
+from sysid.verdict.rounds import Asked
 from sysid.verdict.vehicles import (
     drives_of,
     fitted_alone,
@@ -192,7 +193,8 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
             found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
 
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
-    monkeypatch.setattr("sysid.verdict.null_refits.pair_round", rounds)
+    monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
+    monkeypatch.setattr(Asked, "named", lambda *_: 1.0)
     nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
                             sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
     assert nulls.alarms == (2 if accepted else 0)
