@@ -73,7 +73,7 @@ def candidates(report: dict[str, Any]) -> str:
     rows = [[" and ".join(one["effects"]), one["gain"], *(one["left"][key] for key in ("common", "smooth", "any")),
              f"{one['share']:.0%}"] for one in report["steps"] if "share" in one]
     if rows:
-        parts.append(table(["effects", "gain", "replicates have in common", "smooth functions predict", "may be at random",
+        parts.append(table(["effects", "gain", "replicates share", "smooth functions predict", "may be at random",
                             "share"], rows, "what they gain, and what they leave though it could be predicted"))
     return "".join(parts) or paragraph("Nothing stood out, so nothing was refitted.")
 
