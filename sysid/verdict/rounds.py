@@ -78,11 +78,13 @@ class Asked:
         """
         wander, excess = self.wander, self.excess(residual)
         common = excess - wander.unshared(residual, self.refitter.drives.repeats)
-        smooth = self.anything(residual) - wander.usual * len(residual)
-        left = {"smooth": smooth, "common": common * self.count, "any": random * excess * self.count}
+        left = {"common": common * self.count, "any": random * excess * self.count}
         p = {"common": wander.p_excess(common), "any": wander.p_excess(excess)}
-        counted = [left[name] for name in left if p.get(name, 0.0) < self.thresholds.alpha]
-        share = gain / max(gain + max(counted, default=0.0), gain, 1e-9)
+        most = max((left[name] for name in left if p[name] < self.thresholds.alpha), default=0.0)
+        if gain >= self.thresholds.share * (gain + most):  # else smooth functions change nothing
+            left["smooth"] = self.anything(residual) - wander.usual * len(residual)
+            most = max(most, left["smooth"])
+        share = gain / max(gain + most, 1e-9)
         self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "left": left, "p": p,
                            "share": share})
         return share
@@ -95,10 +97,12 @@ class Asked:
         """Whether other forms of the effects of a joint fit leave no more than days differ by, or nothing that smooth
         functions predict better than on usual days."""
         residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
-        p, smooth = self.p_left(residual), self.anything(residual) / len(residual)
+        p = self.p_left(residual)
+        known = p < self.thresholds.alpha and np.isfinite(limit)  # whether smooth functions have a say
+        smooth = self.anything(residual) / len(residual) if known else None
         self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
-                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if np.isfinite(limit) else None})
-        return p >= self.thresholds.alpha or smooth <= limit < np.inf
+                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if known else None})
+        return p >= self.thresholds.alpha or smooth is not None and smooth <= limit
 
     def named(self, fit: Refit) -> float:
         """Share of what could be predicted that the effects of a fit explain. They may act at random in part: in energy
