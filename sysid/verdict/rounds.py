@@ -94,7 +94,7 @@ class Asked:
         return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
 
     def calm(self, fit: Refit) -> bool:
-        """Whether smooth functions predict no more of what other forms of the effects of a joint fit leave than of usual
+        """Whether smooth functions predict no more of what other forms of the effects of a fit leave than of usual
         days; where no days show it, whether no more is left than days differ by."""
         residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
         p, smooth = self.p_left(residual), self.anything(residual) / len(residual)
