@@ -17,14 +17,9 @@ from collections.abc import Sequence
 
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
-from sysid.missing.catalogue import Hypothesis
-from sysid.missing.days import Wander
-from sysid.missing.evidence import Evidence
-from sysid.missing.refit import Refitter
-from sysid.search.result import Progress
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import EFFORT, LARGEST, Search, Thresholds, missing
-from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
+from sysid.verdict.found import EFFORT, LARGEST, Search, missing
+from sysid.verdict.rounds import NOTHING, Asked, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
 UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
@@ -35,23 +30,20 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def search_alone(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    wheels: bool = True, draws: int = 1000, seed: int = 0, progress: Progress | None = None,
-) -> Search:
+def search_alone(asked: Asked, wheels: bool = True) -> Search:
     """The verdict on drives that stand alone: effects are added one after the other, as long as they make the rest of
     the drives better predicted.
 
     Args:
         wheels: whether any trial has an odometry.
     """
-    asked, far = begin(evidence, hypotheses, refitter, wander, thresholds, draws, seed, progress)
+    thresholds = asked.thresholds
     found = Search("none", asked.base, asked.base, asked.scan)
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
     against, unseen = "what stands out in a linear scan does not hold in a refit", False
     for _ in range(EFFORT.rounds):
-        candidates = candidates_of(asked, found, found.final, [far])
+        candidates = candidates_of(asked, found, found.final)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
         if not standing:

@@ -8,21 +8,19 @@ raise a false alarm, and calibrate its p-value without the assumption that the m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander, alike
-from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.evidence import Solver, at_fit
 from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
 from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
-from sysid.verdict.classes import imitation
-from sysid.verdict.found import NullRefits, PairScan, Scan, Search, Thresholds, tail
+from sysid.verdict.found import NullRefits, PairScan, Search, Thresholds, tail
 from sysid.verdict.pairs import scan_again
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
@@ -33,31 +31,25 @@ TOGETHER, ACCELERATED = 16, 100
 
 
 def run(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
-    thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
-    pairs: PairScan | None = None, anything: Callable[[np.ndarray], float] = lambda _: 0.0,
+    asked: Asked, pairs: PairScan | None, count: int, seed: int = 0, progress: Progress | None = None
 ) -> NullRefits:
     """Simulate and judge `count` days.
 
     Args:
-        evidence: of the drives in question around the reference, as `gather` made it.
-        scan: of the drives in question: its linear nulls are what the first look at each day is held against.
+        asked: of the drives in question; its linear nulls are what the first look at each day is held against.
         pairs: likewise of pairs of effects; None where pairs do not decide.
-        anything: `Asked.anything`.
     """
-    reference = refitter.reference
+    scan, hypotheses, wander, reference = asked.scan, asked.hypotheses, asked.wander, asked.refitter.reference
     rng = np.random.default_rng((seed, 1))
     factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
-    similar = imitation(evidence, hypotheses)
     p, alarms = np.ones(count), 0
-    for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
-        around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
+    for n, (one, base) in enumerate(_days(asked.refitter, factor, rng, count)):
+        around = at_fit(asked.evidence, base.residual, base.jacobian, base.u - reference.u)
         gain, worth, q = best(Solver(around), hypotheses, wander)
-        looked = replace(scan, gain=gain, worth=worth, q=q,
-                         p=np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))]))
-        found = Search("none", base, base, looked,
-                       pairs=None if pairs is None else scan_again(pairs, around, hypotheses, wander))
-        settle(Asked(around, hypotheses, one, wander, thresholds, base, looked, similar, anything), found)
+        p_each = np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))])
+        day = replace(asked, evidence=around, refitter=one, base=base, far=None, steps=[], report=lambda _: None,
+                      scan=replace(scan, gain=gain, worth=worth, q=q, p=p_each))
+        found = settle(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
         p[n] = found.p_value
         alarms += found.verdict != "none"
         if progress is not None:

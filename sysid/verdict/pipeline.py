@@ -27,6 +27,7 @@ from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
+from sysid.verdict.rounds import begin
 from sysid.verdict.search import search
 from sysid.verdict.sensor_noise import compared, with_noise
 
@@ -70,18 +71,16 @@ def find_missing(
     def anything(residual: np.ndarray) -> float:
         return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
+    asked = begin(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     alone = stands_alone(log.training, reference.known)
     if alone:
-        wheels = any(trial.odometry is not None for trial in log.training)
-        outcome = search_alone(evidence, found, refitter, ready.wander, config.thresholds, wheels, draws, config.seed,
-                               progress)
+        outcome = search_alone(asked, any(trial.odometry is not None for trial in log.training))
     else:
-        outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed,
-                         progress)
+        outcome = search(asked, config.seed)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
-                                config.refit_nulls, config.seed, progress, outcome.pairs, anything)
+        nulls = run_null_refits(replace(asked, wander=usual.wander), outcome.pairs, config.refit_nulls, config.seed,
+                                progress)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":

@@ -48,6 +48,8 @@ class Asked:
     (B, n), on drives held back from it."""
     report: Callable[[str], None] = lambda _: None
     """Says what was just done."""
+    far: Looked | None = None
+    """A scan around the reference: a large effect shows best there."""
     steps: list[dict[str, Any]] = field(default_factory=list)
     """The numbers behind each step so far."""
 
@@ -116,9 +118,10 @@ class Asked:
 
 def begin(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    draws: int, seed: int, progress: Progress | None, anything: Callable[[np.ndarray], float] = lambda _: 0.0,
-) -> tuple[Asked, Looked]:
-    """What a search asks, around the base refitted to the drives; and a scan around the reference."""
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0, draws: int = 1000, seed: int = 0,
+    progress: Progress | None = None,
+) -> Asked:
+    """What a search asks, around the base refitted to the drives."""
     def report(text: str) -> None:
         if progress is not None:
             progress(1, text)
@@ -130,13 +133,13 @@ def begin(
     scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
     report("scan")
     return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
-                 anything, report), far
+                 anything, report, far)
 
 
-def candidates_of(asked: Asked, found: Search, current: Refit, far: Sequence[Looked] = ()) -> list[Candidate]:
-    """The next round of a search, which is kept; the first one also starts where other scans (`far`) found most."""
-    scan = asked.scan
-    scans = [rescan(asked, current)] if found.rounds else [*far, (scan.gain, scan.worth, scan.q)]
+def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate]:
+    """The next round of a search, which is kept."""
+    near = (asked.scan.gain, asked.scan.worth, asked.scan.q)
+    scans = [rescan(asked, current)] if found.rounds else [near] if asked.far is None else [asked.far, near]
     found.rounds.append(refitted(asked, current, scans, len(found.rounds) + 1))
     return found.rounds[-1]
 

@@ -2,66 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from sysid.missing.catalogue import Hypothesis
-from sysid.missing.days import Wander
-from sysid.missing.evidence import Evidence
 from sysid.missing.joint_fit import Start, moved_last
-from sysid.missing.refit import Refitter
-from sysid.search.result import Progress
-from sysid.verdict.found import EFFORT, LARGEST, Search, Thresholds, missing
+from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search, missing
 from sysid.verdict.pairs import scan_pairs
-from sysid.verdict.rounds import NOTHING, POLISH, Asked, Looked, begin, candidates_of, class_of, pair_round
+from sysid.verdict.rounds import NOTHING, POLISH, Asked, candidates_of, class_of, pair_round
 
 
-def search(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    anything: Callable[[np.ndarray], float], draws: int = 1000, seed: int = 0, progress: Progress | None = None,
-) -> Search:
-    """The verdict on one set of drives whose noise other drives show.
-
-    Args:
-        anything: `Asked.anything`.
-    """
-    asked, far = begin(evidence, hypotheses, refitter, wander, thresholds, draws, seed, progress, anything)
-    pairs = scan_pairs(asked.evidence, hypotheses, refitter.reference.spread, wander, asked.similar, thresholds.alike,
-                       seed=seed)
+def search(asked: Asked, seed: int = 0) -> Search:
+    """The verdict on one set of drives whose noise other drives show."""
+    pairs = scan_pairs(asked.evidence, asked.hypotheses, asked.refitter.reference.spread, asked.wander, asked.similar,
+                       asked.thresholds.alike, seed=seed)
     asked.report("scan of pairs")
-    found = Search("none", asked.base, asked.base, asked.scan, pairs=pairs)
-    settle(asked, found, [far])
-    return found
+    return settle(asked, pairs)
 
 
-def settle(asked: Asked, found: Search, far: Sequence[Looked] = ()) -> None:
-    """Turn a scan of effects and of pairs into a verdict; `far` are scans around other points."""
-    thresholds, base = asked.thresholds, asked.base.residual
-    found.excess, found.steps = (asked.excess(base),) * 2, asked.steps
-    looks = [asked.scan.p_family, asked.p_left(base)] + ([found.pairs.p_family] if found.pairs else [])
+def settle(asked: Asked, pairs: PairScan | None) -> Search:
+    """Turn a scan of effects and of pairs into a verdict."""
+    thresholds, base = asked.thresholds, asked.base
+    found = Search("none", base, base, asked.scan, excess=(asked.excess(base.residual),) * 2, pairs=pairs,
+                   steps=asked.steps, reason=NOTHING)
+    looks = [asked.scan.p_family, asked.p_left(base.residual)] + ([] if pairs is None else [pairs.p_family])
     if min(looks) >= thresholds.alpha:
-        found.reason = NOTHING
-        return
-    _one_by_one(asked, found, far)
+        return found
+    _one_by_one(asked, found)
     _drop_stand_ins(asked, found)
     alone = len(found.accepted) == 1
     calm = alone and asked.calm(found.accepted[-1].refit)
     share = _share(asked, found)
-    if found.pairs and not (calm and share >= thresholds.share):
+    if pairs is not None and not (calm and share >= thresholds.share):
         # A single effect had its chance with every other one as a further effect.
         pair_round(asked, found, {found.accepted[0].hypothesis.effect} if alone and not calm else set())
         asked.report("refits of pairs")
         share = _share(asked, found)
     _decide(asked, found, share)
+    return found
 
 
-def _one_by_one(asked: Asked, found: Search, far: Sequence[Looked]) -> None:
+def _one_by_one(asked: Asked, found: Search) -> None:
     """Accept effects one after the other, as long as more is left than other forms of them explain."""
     current = asked.base
     for _ in range(EFFORT.rounds):
-        candidates = candidates_of(asked, found, current, far)
+        candidates = candidates_of(asked, found, current)
         likely = (one for one in candidates if one.p < asked.thresholds.alpha)
         taken_on = next((one for one in likely if not found.accepted or asked.own(one.refit)), None)
         if taken_on is None:

@@ -176,10 +176,14 @@ def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sl
     assert not weak.accepted
 
 
+def asked_of(result):
+    return Asked(result.evidence, result.hypotheses, refitter_of(result), result.prepared.wander, CONFIG.thresholds,
+                 result.search.base, result.search.scan, np.eye(len(result.hypotheses)))
+
+
 def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, monkeypatch):
     def days():
-        return run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
-                               sloping.search.scan, CONFIG.thresholds, 3).p
+        return run_null_refits(asked_of(sloping), None, 3).p
 
     together = days()
     monkeypatch.setattr("sysid.verdict.null_refits.TOGETHER", 1)
@@ -195,8 +199,7 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
     monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
     monkeypatch.setattr(Asked, "named", lambda *_: 1.0)
-    nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
-                            sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
+    nulls = run_null_refits(asked_of(sloping), sloping.search.pairs, 2)
     assert nulls.alarms == (2 if accepted else 0)
     assert (nulls.p == 1e-4).all() == accepted
 

@@ -14,6 +14,7 @@ from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
 from sysid.verdict.found import Thresholds
 from sysid.verdict.pairs import scan_again, scan_pairs, tail
+from sysid.verdict.rounds import begin
 from sysid.verdict.scan import run
 from sysid.verdict.search import search
 
@@ -54,7 +55,7 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 def verdict(evidence, wander):
-    return search(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), lambda _: 0.0, 300)
+    return search(begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300))
 
 
 def named(found):

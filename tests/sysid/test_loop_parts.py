@@ -154,14 +154,15 @@ def test_a_simulated_day_is_an_alarm_where_the_verdict_would_be_that_something_i
     refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones((1, 1, 1))),
                                reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
     monkeypatch.setattr(null_refits, "_days", lambda *_: [(refitter, base)] * 2)
-    for name in ("at_fit", "Solver", "imitation"):
+    for name in ("at_fit", "Solver"):
         monkeypatch.setattr(null_refits, name, lambda *_: None)
     monkeypatch.setattr(null_refits, "best", lambda *_: (np.zeros(1), np.zeros(1), (np.zeros(1),)))
     monkeypatch.setattr(rounds, "refitted", lambda *_: [])
     nothing = np.zeros((100, 1))
     scan = Scan(np.zeros(1), np.zeros(1), (np.zeros(1),), nothing, np.ones(1), np.linspace(0.0, 1.0, 100))
     one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
-    nulls = null_refits.run(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), scan, Thresholds(), 2)
+    asked = Asked(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), base, scan, None)
+    nulls = null_refits.run(asked, None, 2)
     assert (nulls.p > 0.5).all() and nulls.alarms == alarms
 
 
@@ -176,20 +177,15 @@ def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left
 
     asked = []
     scan = SimpleNamespace(p_family=0.0, gain=None, worth=None, q=None)
-    for name in ("at_fit", "Solver", "imitation", "best"):
-        monkeypatch.setattr(rounds, name, lambda *_: None)
     monkeypatch.setattr(search_module, "class_of", lambda *_: None)
-    monkeypatch.setattr(rounds, "run", lambda *_: scan)
-    monkeypatch.setattr(search_module, "scan_pairs", lambda *_, **__: scan)
     monkeypatch.setattr(rounds, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
     monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
     monkeypatch.setattr(Asked, "beside_forms", lambda _, fit: SimpleNamespace(residual=fit.residual))
     monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
     monkeypatch.setattr(search_module, "_decide", lambda *_: None)
-    drives = SimpleNamespace(mask=np.ones(1), repeats=np.zeros(1, int))
-    refitter = SimpleNamespace(fit=lambda *_: base_fit(10.0), drives=drives,
-                               reference=SimpleNamespace(u=np.zeros(1), spread=np.eye(1)))
-    search_module.search(None, [one], refitter, Wander((), (), freedom=10.0, excess=1.0), Thresholds(), lambda _: 0.0)
+    refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones(1), repeats=np.zeros(1, int)))
+    wander = Wander((), (), freedom=10.0, excess=1.0)
+    search_module.settle(Asked(None, [one], refitter, wander, Thresholds(), base_fit(10.0), scan, None), scan)
     assert bool(asked) == pairs
 
 
