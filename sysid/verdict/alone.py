@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import EFFORT, LARGEST, Search, missing
+from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search, missing
 from sysid.verdict.rounds import NOTHING, Asked, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
@@ -30,7 +30,7 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def search_alone(asked: Asked, wheels: bool = True) -> Search:
+def search_alone(asked: Asked, _: PairScan | None = None, wheels: bool = True) -> Search:
     """The verdict on drives that stand alone: effects are added one after the other, as long as they make the rest of
     the drives better predicted.
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.missing.joint_fit import Refit
-from sysid.missing.refit import Refitter, without_each
+from sysid.missing.joint_fit import Refit, Replays, without_each
 
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
@@ -30,7 +29,7 @@ class Beside:
     residual: np.ndarray  # (B, n) what is left where every effect may have another form
 
 
-def beside_forms(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
+def beside_forms(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
     """Let the effects of a joint fit have other forms. Linear, around the fit.
 
     Args:

@@ -8,7 +8,7 @@ raise a false alarm, and calibrate its p-value without the assumption that the m
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,18 +24,19 @@ from sysid.verdict.found import NullRefits, PairScan, Search, Thresholds, tail
 from sysid.verdict.pairs import scan_again
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
-from sysid.verdict.search import settle
 
 TOGETHER, ACCELERATED = 16, 100
 """Days whose base fits advance side by side on a processor, and on an accelerator."""
 
 
 def run(
-    asked: Asked, pairs: PairScan | None, count: int, seed: int = 0, progress: Progress | None = None
+    asked: Asked, judge: Callable[[Asked, PairScan | None], Search], pairs: PairScan | None, count: int, seed: int = 0,
+    progress: Progress | None = None,
 ) -> NullRefits:
     """Simulate and judge `count` days.
 
     Args:
+        judge: what the drives in question are judged by (`sysid.verdict.search.settle`).
         asked: of the drives in question; its linear nulls are what the first look at each day is held against.
         pairs: likewise of pairs of effects; None where pairs do not decide.
     """
@@ -49,7 +50,7 @@ def run(
         p_each = np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))])
         day = replace(asked, evidence=around, refitter=one, base=base, far=None, steps=[], report=lambda _: None,
                       scan=replace(scan, gain=gain, worth=worth, q=q, p=p_each))
-        found = settle(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
+        found = judge(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
         p[n] = found.p_value
         alarms += found.verdict != "none"
         if progress is not None:

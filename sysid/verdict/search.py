@@ -12,16 +12,16 @@ from sysid.verdict.pairs import scan_pairs
 from sysid.verdict.rounds import NOTHING, POLISH, Asked, candidates_of, class_of, pair_round
 
 
-def search(asked: Asked, seed: int = 0) -> Search:
-    """The verdict on one set of drives whose noise other drives show."""
+def pairs_of(asked: Asked, seed: int = 0) -> PairScan:
+    """A scan of all pairs of effects beside the base."""
     pairs = scan_pairs(asked.evidence, asked.hypotheses, asked.refitter.reference.spread, asked.wander, asked.similar,
                        asked.thresholds.alike, seed=seed)
     asked.report("scan of pairs")
-    return settle(asked, pairs)
+    return pairs
 
 
 def settle(asked: Asked, pairs: PairScan | None) -> Search:
-    """Turn a scan of effects and of pairs into a verdict."""
+    """The verdict on one set of drives whose noise other drives show, from a scan of effects and of pairs."""
     thresholds, base = asked.thresholds, asked.base
     found = Search("none", base, base, asked.scan, excess=(asked.excess(base.residual),) * 2, pairs=pairs,
                    steps=asked.steps, reason=NOTHING)

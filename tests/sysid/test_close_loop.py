@@ -20,7 +20,7 @@ from sysid.logs.metrics import own_floor, score
 from sysid.logs.synthetic import write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
-from sysid.missing.refit import without_each
+from sysid.missing.joint_fit import without_each
 from sysid.pages.loop_report import effects, make_report, manifest, replay, shifts, write_run
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
@@ -33,6 +33,7 @@ from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import Asked
+from sysid.verdict.search import settle
 from sysid.verdict.vehicles import (
     drives_of,
     fitted_alone,
@@ -183,7 +184,7 @@ def asked_of(result):
 
 def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, monkeypatch):
     def days():
-        return run_null_refits(asked_of(sloping), None, 3).p
+        return run_null_refits(asked_of(sloping), settle, None, 3).p
 
     together = days()
     monkeypatch.setattr("sysid.verdict.null_refits.TOGETHER", 1)
@@ -199,7 +200,7 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
     monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
     monkeypatch.setattr(Asked, "named", lambda *_: 1.0)
-    nulls = run_null_refits(asked_of(sloping), sloping.search.pairs, 2)
+    nulls = run_null_refits(asked_of(sloping), settle, sloping.search.pairs, 2)
     assert nulls.alarms == (2 if accepted else 0)
     assert (nulls.p == 1e-4).all() == accepted
 

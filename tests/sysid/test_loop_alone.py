@@ -73,7 +73,7 @@ def verdict(sizes, wheels=True, **more):
     """The verdict on linear drives that stand alone."""
     evidence = drives(sizes, **more)
     asked = begin(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
-    return search_alone(asked, wheels)
+    return search_alone(asked, wheels=wheels)
 
 
 def named(found):

@@ -16,7 +16,8 @@ from sysid.verdict.found import Thresholds
 from sysid.verdict.pairs import scan_again, scan_pairs, tail
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import run
-from sysid.verdict.search import search
+from sysid.verdict.search import pairs_of as pairs_of_effects
+from sysid.verdict.search import settle
 
 pytestmark = pytest.mark.quick
 def pairs_of(evidence, wander):
@@ -55,7 +56,8 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 def verdict(evidence, wander):
-    return search(begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300))
+    asked = begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300)
+    return settle(asked, pairs_of_effects(asked))
 
 
 def named(found):
