@@ -30,25 +30,30 @@ class Beside:
 
 
 def beside_forms(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
-    """Let the effects of a joint fit have other forms. Linear, around the fit.
+    """Let the effects of a joint fit have other forms. Base parameters and sizes move linearly around the fit; the last
+    effect is taken away whole, since its columns say little of a dead zone or a limit without it.
 
     Args:
         groups: trials of each manoeuvre.
-        form: standard deviation of the sizes of such columns, as a share of the effect.
+        form: root mean square of all forms of an effect together, as a share of what it changes.
     """
     whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
+    changes = [refitter.white(whole - one) for one in less]
     bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
-    columns = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    last = len(fit.u) + fit.parts[-1].start
-    target = fit.residual.reshape(-1) + columns @ np.concatenate([fit.u - refitter.reference.u, fit.q])
+    bent = [one * (np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5
+            for one, change in zip(bent, changes, strict=True)]
+    size, last = len(fit.u), len(fit.u) + fit.parts[-1].start
+    columns, mine = fit.jacobian.reshape(-1, fit.jacobian.shape[-1]), changes[-1].reshape(-1, 1)
+    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u) + mine[:, 0]
     forms = np.concatenate([one.reshape(len(columns), -1) for one in bent], axis=1)
     before = forms[:, : sum(one.shape[-1] for one in bent[:-1])]
+    columns = np.concatenate([columns, mine], axis=1)
 
     def ridge(effects: np.ndarray, others: np.ndarray) -> tuple[float, np.ndarray]:
         """Least cost of the target, and what is then left (n,)."""
         design = np.concatenate([effects, others], axis=1)
         prior = np.diag(np.repeat([0.0, form**-2], [effects.shape[1], others.shape[1]]))
-        prior[: len(fit.u), : len(fit.u)] = refitter.precision
+        prior[:size, :size] = refitter.precision
         matrix = design.T @ design + prior
         matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
         right = design.T @ target

@@ -157,14 +157,16 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
 
     fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
     asked.report(f"refits, round {number}")
-    best_of = [int(i) for i in np.argsort([fit.cost for fit in fits])[: EFFORT.candidates]]
+    least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
+    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
         again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
         fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
     asked.report(f"polish, round {number}")
-    rivals = _rivals(hypotheses, asked.similar, [h for h, _ in chosen], fits, taken)
+    similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
+    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
     fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
     asked.report(f"rivals, round {number}")
@@ -216,7 +218,7 @@ def _rivals(
     out: list[int] = []
     alike = np.maximum(similar[winner], similar[:, winner])
     for h in np.argsort(-alike):
-        if hypotheses[h].effect not in done:
+        if alike[h] > 0 and hypotheses[h].effect not in done:
             done.add(hypotheses[h].effect)
             out.append(int(h))
     return out[: EFFORT.candidates]

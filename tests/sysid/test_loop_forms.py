@@ -101,5 +101,5 @@ def test_what_the_best_fit_imitates_has_its_chance_as_what_imitates_it(imitates)
     effects = [effect(name) for name in ("payload", "traction", "slope")]
     similar = np.eye(3)
     similar[imitates] = 0.8
-    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], {"slope"}) == [1]
-    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set())[0] == 1
+    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set()) == [1]
+    assert _rivals(effects, np.eye(3), [0], [SimpleNamespace(cost=1.0)], set()) == []
