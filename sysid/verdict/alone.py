@@ -30,11 +30,12 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def search_alone(asked: Asked, _: PairScan | None = None, wheels: bool = True) -> Search:
+def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = True) -> Search:
     """The verdict on drives that stand alone: effects are added one after the other, as long as they make the rest of
     the drives better predicted.
 
     Args:
+        pairs: not asked, since nothing shows their noise.
         wheels: whether any trial has an odometry.
     """
     thresholds = asked.thresholds

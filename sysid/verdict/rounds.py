@@ -96,14 +96,15 @@ class Asked:
         return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
 
     def calm(self, fit: Refit) -> bool:
-        """Whether smooth functions predict no more of what other forms of the effects of a fit leave than of usual
-        days; where no days show it, whether no more is left than days differ by."""
+        """Whether other forms of the effects of a joint fit leave no more than days differ by, or nothing that smooth
+        functions predict better than on usual days."""
         residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
-        p, smooth = self.p_left(residual), self.anything(residual) / len(residual)
+        p = self.p_left(residual)
+        known = p < self.thresholds.alpha and np.isfinite(limit)  # whether smooth functions have a say
+        smooth = self.anything(residual) / len(residual) if known else None
         self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
-                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if np.isfinite(limit) else None,
-                           "named": self.named(fit)})
-        return smooth <= limit if np.isfinite(limit) else p >= self.thresholds.alpha
+                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if known else None})
+        return p >= self.thresholds.alpha or smooth is not None and smooth <= limit
 
     def named(self, fit: Refit) -> float:
         """Share of what could be predicted that the effects of a fit explain. They may act at random in part: in energy
