@@ -33,25 +33,20 @@ from whill_mjx import evaluate as evaluation_command
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.checks import mean_figures
+from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
 from whill_mjx.learning.setup import (
     TRUTH,
     find_preset,
     functional_env,
+    make_evaluation_env,
     make_training_env,
     with_layout,
     with_repeat,
     with_settings,
 )
+from whill_mjx.learning.trainings import train_baseline, train_policy
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.train import (
-    TrainOptions,
-    begin,
-    choose_preset,
-    main,
-    preset_name,
-    train_baseline,
-    train_policy,
-)
+from whill_mjx.train import begin, main
 
 CLAIM = "DreamerV3 (PPO where a name says so) from 64x64 RGB on the obstacle course; every seed listed in repeats"
 FINAL = 1000  # episodes of the last evaluation of seeds side by side
@@ -112,7 +107,7 @@ def together(options: argparse.Namespace) -> None:
     rows = steps + 2 * preset.instances + learner.pretrain_steps
     learner = dataclasses.replace(learner, replay_capacity=min(learner.replay_capacity, rows))
     vehicle = options.vehicle or "whill_cr_ramp"
-    held_out = functional_env(make_training_env(task, vehicle, preset.eval_episodes), shaped=False)
+    held_out = functional_env(make_evaluation_env(task, vehicle, preset.eval_episodes), shaped=False)
 
     def evaluation(params: Any, number: int, episodes: int) -> list[dict[str, float]]:
         found = evaluate(held_out, learner, params, jax.random.key(number), episodes)
@@ -126,9 +121,8 @@ def together(options: argparse.Namespace) -> None:
                 for name, value in one.items()}
 
     starts = preset.exploring_starts if options.starts is None else options.starts
-    training = make_training_env(
-        task, vehicle, preset.instances, exploring_starts=starts, second_tries=preset.second_tries
-    )
+    plain = dataclasses.replace(preset, task=task, exploring_starts=starts, spread=0.0, looks=None, vary=())
+    training = make_training_env(plain, vehicle)
     env = functional_env(training, targets=TRUTH in learner.decode_only)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None

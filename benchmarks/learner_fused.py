@@ -20,6 +20,8 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plt
 
 from benchmarks import harness
 from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE
@@ -30,6 +32,7 @@ from dreamer.recurrence import Step, Tree
 from dreamer.rssm import Latent
 from dreamer.types import Params
 
+ALL = slice(None)
 PARTS = 4
 """Shares into which the rows of the widest product are split, so that every program has one."""
 ROUNDS = 20
@@ -61,9 +64,6 @@ def fused_scan(
     Raises:
         ValueError: a width is not a power of two, which Triton needs.
     """
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton as plt
-
     config: DreamerConfig = step.args[0]  # type: ignore[attr-defined]
     for name in ("deter", "hidden", "stoch", "classes", "blocks", "batch_size"):
         value = getattr(config, name)
@@ -93,7 +93,7 @@ def fused_scan(
 
     def kernel(*refs: Any) -> None:
         own = dict(zip([*names, *[f"{name}_before" for name in shared], *shared, *fresh], refs, strict=True))
-        _run_steps(config, layout, own, pl, plt, tiles, programs, count, batch)
+        _Program(config, layout, own, batch, pl.program_id(0)).run(count)
 
     call = pl.pallas_call(
         kernel,
@@ -111,140 +111,199 @@ def fused_scan(
     return last, (out["deter"][1:], out["stoch"][1:], probs)
 
 
-def _run_steps(
-    config: DreamerConfig, layout: Layout, ref: dict[str, Any], pl: Any, plt: Any, tiles: int, programs: int,
-    count: int, batch: int,
-) -> None:
-    """The kernel of one program: all stages of all steps, for its tiles."""
-    me, size, hidden, classes = pl.program_id(0), layout.columns, config.hidden, config.classes
-    block = config.deter // config.blocks
-    per_block, latent = block // size, config.stoch * classes
-    dtype = ref["deter"].dtype
+@dataclass(frozen=True)
+class _Program:
+    """One program of the kernel: all stages of all steps, for its tiles."""
 
-    def shared(name: str, *at: Any) -> jax.Array:
-        """Read what other programs wrote: past the cache of this multiprocessor."""
-        return plt.load(ref[name].at[_index(at)], volatile=True)
+    config: DreamerConfig
+    layout: Layout
+    ref: dict[str, Any]
+    """What the kernel reads and writes, by name."""
+    batch: int
+    me: Any
+    """Number of this program."""
 
-    def constant(name: str, *at: Any) -> jax.Array:
-        return plt.load(ref[f"{name}_constant"].at[_index(at)]).astype(jnp.float32)
+    @property
+    def block(self) -> int:
+        """Units of a block."""
+        return self.config.deter // self.config.blocks
 
-    def norm_act(x: jax.Array, scale: jax.Array, squares: jax.Array | None = None) -> jax.Array:
-        mean = jnp.mean(x * x, -1) if squares is None else squares
-        return jax.nn.silu(x * jax.lax.rsqrt(mean + NORM_EPS)[:, None] * scale[None]).astype(dtype)
+    @property
+    def per_block(self) -> int:
+        """Tiles of a block."""
+        return self.block // self.layout.columns
 
-    def dot(x: jax.Array, weight: jax.Array) -> jax.Array:
-        return jnp.dot(x, weight, preferred_element_type=jnp.float32)
+    @property
+    def tiles(self) -> int:
+        """Tiles of the state."""
+        return self.config.deter // self.layout.columns
 
-    def columns(tile: Any, of: int = size) -> Any:
-        return pl.ds(tile * of, of)
+    def run(self, count: int) -> None:
+        """All steps."""
+        jax.lax.fori_loop(0, count, self.step, jnp.int32(0))
 
-    def kept(x: jax.Array, first: jax.Array) -> jax.Array:
-        return jnp.where((first > 0)[:, None], jnp.zeros_like(x), x)
+    def step(self, t: Any, waits: Any) -> Any:
+        """The stages of one step; returns how often the program has waited."""
+        config, size = self.config, self.layout.columns
+        latent, classes = config.stoch * config.classes, config.classes
+        step = _Step(self, t, plt.load(self.ref["first"].at[t, ALL]))
 
-    everything = slice(None)
+        def stoch_weight(tile: Any) -> tuple[jax.Array]:
+            return (self.weight("in_stoch", ALL, self.columns(tile, 16)),)
 
-    def stage(of: int, load: Callable[[Any], tuple], make: Callable[..., None]) -> Callable[[Any], Any]:
-        """Wait for the stage before, then make this stage's tiles; the weights may be on their way meanwhile."""
+        def logit_weight(tile: Any) -> tuple[jax.Array]:
+            return (self.weight("post_logit", ALL, self.columns(tile, classes)),)
 
-        def enter(waits: Any) -> Any:
-            if layout.alone:
-                for number in range(of):
-                    make(number, *load(number))
-                return waits
-            tile = jnp.minimum(me, of - 1)  # loads of programs without a tile are not used
-            held = load(tile) if layout.early and layout.work else ()
-            _wait(ref["waiting"], (waits + 1) * programs, plt)
-            if layout.work:
-                @pl.when(me < of)
-                def _() -> None:
-                    make(tile, *(held or load(tile)))
-            return waits + 1
-
-        return enter
-
-    def one(t: Any, waits: Any) -> Any:
-        first = plt.load(ref["first"].at[t, everything])
-
-        def from_stoch(tile: Any, weight: jax.Array) -> None:
-            value = dot(kept(shared("stoch", t, everything, everything), first), weight)
-            plt.store(ref["from_stoch"].at[:, columns(tile, 16)], value + constant("in_stoch", columns(tile, 16))[None])
-
-        def core(tile: Any, own: jax.Array, deter_share: jax.Array, stoch_share: jax.Array) -> None:
-            group = tile // per_block
-            old = kept(shared("deter", t, everything, columns(group, block)), first)
-            product = kept(_summed(partial(shared, "products"), 0, hidden, pl), first)
-            deter_part = norm_act(product + constant("in_deter_bias", everything)[None],
-                                  constant("in_deter_scale", everything))
-            stoch_part = norm_act(shared("from_stoch", everything, everything), constant("in_stoch_scale", everything))
-            value = dot(old, own) + dot(deter_part, deter_share) + dot(stoch_part, stoch_share)
-            value += plt.load(ref["core_term"].at[t, :, columns(tile)]).astype(jnp.float32)
-            plt.store(ref["wide"].at[:, columns(tile)], value)
-            plt.store(ref["squares"].at[_index((tile, everything))], jnp.sum(value * value, -1))
-
-        def gates(tile: Any, reset: jax.Array, candidate: jax.Array, update: jax.Array) -> None:
-            group, inside = tile // per_block, tile % per_block
-            squares = jnp.sum(shared("squares", everything, everything), 0) / config.deter
-            wide = norm_act(shared("wide", everything, columns(group, block)),
-                            constant("core_scale", columns(group, block)), squares)
-
-            def gate(weight: jax.Array, number: int) -> jax.Array:
-                place = pl.ds(group * 3 * block + number * block + inside * size, size)
-                return dot(wide, weight) + constant("gates", place)[None]
-
-            value = jnp.tanh(jax.nn.sigmoid(gate(reset, 0)) * gate(candidate, 1))
-            share = jax.nn.sigmoid(gate(update, 2) - 1.0)
-            old = kept(shared("deter", t, everything, columns(tile)), first).astype(jnp.float32)
-            plt.store(ref["deter"].at[t + 1, :, columns(tile)], (share * value + (1 - share) * old).astype(dtype))
-
-        def products(tile: Any, weight: jax.Array) -> None:
-            part, place = tile % PARTS, tile // PARTS
-            rows = shared("deter", t + 1, everything, columns(part, config.deter // PARTS))
-            plt.store(ref["products"].at[_index((part, everything, columns(place)))], dot(rows, weight))
-
-        def sample(tile: Any, weight: jax.Array) -> None:
-            value = _summed(partial(shared, "products"), hidden, hidden, pl)
-            value += plt.load(ref["post_term"].at[t, :, :]).astype(jnp.float32)
-            place = columns(tile, classes)
-            logits = dot(norm_act(value, constant("post_scale", everything)), weight)
-            logits += constant("post_logit", place)[None]
-            scaled = jnp.exp(logits - jnp.max(logits, -1)[:, None])
-            probs = (1 - config.unimix) * scaled / jnp.sum(scaled, -1)[:, None] + config.unimix / classes
-            row = jax.lax.broadcasted_iota(jnp.int32, (batch, classes, classes), 1)
-            column = jax.lax.broadcasted_iota(jnp.int32, (batch, classes, classes), 2)
-            reached = jnp.sum(jnp.where(row <= column, probs[:, :, None], 0.0), 1)
-            position = jax.lax.broadcasted_iota(jnp.int32, (batch, classes), 1)
-            drawn = plt.load(ref["uniform"].at[_index((t, everything, tile))])
-            passed = (drawn[:, None] >= reached) & (position < classes - 1)
-            index = jnp.sum(passed.astype(jnp.int32), -1)
-            plt.store(ref["stoch"].at[t + 1, :, place], (position == index[:, None]).astype(dtype))
-            plt.store(ref["probs"].at[t, :, place], probs)
-
-        def weight(name: str, *at: Any) -> jax.Array:
-            return plt.load(ref[f"{name}_weight"].at[_index(at)])
-
-        def core_weights(tile: Any) -> tuple[jax.Array, ...]:
-            place = (tile // per_block, tile % per_block)
-            return tuple(weight("core", place[0], pl.ds(start, rows), columns(place[1]))
-                         for start, rows in ((0, block), (block, hidden), (block + hidden, hidden)))
-
-        def gate_weights(tile: Any) -> tuple[jax.Array, ...]:
-            return tuple(weight("gates", tile // per_block, everything,
-                                pl.ds(number * block + tile % per_block * size, size)) for number in range(3))
-
-        def product_weights(tile: Any) -> tuple[jax.Array]:
-            return (weight("deter", columns(tile % PARTS, config.deter // PARTS), columns(tile // PARTS)),)
-
-        for enter in (
-            stage(hidden // 16, lambda tile: (weight("in_stoch", everything, columns(tile, 16)),), from_stoch),
-            stage(tiles, core_weights, core),
-            stage(tiles, gate_weights, gates),
-            stage(2 * hidden // size * PARTS, product_weights, products),
-            stage(latent // classes, lambda tile: (weight("post_logit", everything, columns(tile, classes)),), sample),
-        ):
-            waits = enter(waits)
+        stages: tuple[tuple[int, Callable[[Any], tuple], Callable[..., None]], ...] = (
+            (config.hidden // 16, stoch_weight, step.from_stoch),
+            (self.tiles, self.core_weights, step.core),
+            (self.tiles, self.gate_weights, step.gates),
+            (2 * config.hidden // size * PARTS, self.product_weights, step.products),
+            (latent // classes, logit_weight, step.sample),
+        )
+        for of, load, make in stages:
+            waits = self.stage(of, load, make, waits)
         return waits
 
-    jax.lax.fori_loop(0, count, one, jnp.int32(0))
+    def stage(self, of: int, load: Callable[[Any], tuple], make: Callable[..., None], waits: Any) -> Any:
+        """Wait for the stage before, then make this stage's tiles; the weights may be on their way meanwhile."""
+        layout = self.layout
+        if layout.alone:
+            for number in range(of):
+                make(number, *load(number))
+            return waits
+        tile = jnp.minimum(self.me, of - 1)  # loads of programs without a tile are not used
+        held = load(tile) if layout.early and layout.work else ()
+        _wait(self.ref["waiting"], (waits + 1) * self.tiles)
+        if layout.work:
+            @pl.when(self.me < of)
+            def _() -> None:
+                make(tile, *(held or load(tile)))
+        return waits + 1
+
+    def shared(self, name: str, *at: Any) -> jax.Array:
+        """Read what other programs wrote: past the cache of this multiprocessor."""
+        return plt.load(self.ref[name].at[_index(at)], volatile=True)
+
+    def constant(self, name: str, *at: Any) -> jax.Array:
+        """Read a constant of the step."""
+        return plt.load(self.ref[f"{name}_constant"].at[_index(at)]).astype(jnp.float32)
+
+    def weight(self, name: str, *at: Any) -> jax.Array:
+        """Read a part of a weight."""
+        return plt.load(self.ref[f"{name}_weight"].at[_index(at)])
+
+    def columns(self, tile: Any, of: int | None = None) -> Any:
+        """Columns of a tile, of so many."""
+        size = of or self.layout.columns
+        return pl.ds(tile * size, size)
+
+    def core_weights(self, tile: Any) -> tuple[jax.Array, ...]:
+        """Of the core's product: its own block, the state's share and the latent's."""
+        block, hidden = self.block, self.config.hidden
+        place = (tile // self.per_block, tile % self.per_block)
+        return tuple(self.weight("core", place[0], pl.ds(start, rows), self.columns(place[1]))
+                     for start, rows in ((0, block), (block, hidden), (block + hidden, hidden)))
+
+    def gate_weights(self, tile: Any) -> tuple[jax.Array, ...]:
+        """Of reset, candidate and update."""
+        size, per_block = self.layout.columns, self.per_block
+        return tuple(self.weight("gates", tile // per_block, ALL,
+                                 pl.ds(number * self.block + tile % per_block * size, size)) for number in range(3))
+
+    def product_weights(self, tile: Any) -> tuple[jax.Array]:
+        """Of the new state, into the posterior and the next step."""
+        return (self.weight("deter", self.columns(tile % PARTS, self.config.deter // PARTS),
+                            self.columns(tile // PARTS)),)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """The stages of step `t`: each makes one tile."""
+
+    program: _Program
+    t: Any
+    first: jax.Array
+
+    def kept(self, x: jax.Array) -> jax.Array:
+        """Zero where an episode begins."""
+        return jnp.where((self.first > 0)[:, None], jnp.zeros_like(x), x)
+
+    def norm_act(self, x: jax.Array, scale: jax.Array, squares: jax.Array | None = None) -> jax.Array:
+        """Normalised and activated, in the type of the state."""
+        mean = jnp.mean(x * x, -1) if squares is None else squares
+        normed = x * jax.lax.rsqrt(mean + NORM_EPS)[:, None] * scale[None]
+        return jax.nn.silu(normed).astype(self.program.ref["deter"].dtype)
+
+    def from_stoch(self, tile: Any, weight: jax.Array) -> None:
+        """The latent's share of the core's input."""
+        own = self.program
+        value = _dot(self.kept(own.shared("stoch", self.t, ALL, ALL)), weight)
+        place = own.columns(tile, 16)
+        plt.store(own.ref["from_stoch"].at[:, place], value + own.constant("in_stoch", place)[None])
+
+    def core(self, tile: Any, block_share: jax.Array, deter_share: jax.Array, stoch_share: jax.Array) -> None:
+        """The core's product, and its squares for the norm."""
+        own, hidden = self.program, self.program.config.hidden
+        old = self.kept(own.shared("deter", self.t, ALL, own.columns(tile // own.per_block, own.block)))
+        product = self.kept(_summed(partial(own.shared, "products"), 0, hidden))
+        deter_part = self.norm_act(product + own.constant("in_deter_bias", ALL)[None],
+                                   own.constant("in_deter_scale", ALL))
+        stoch_part = self.norm_act(own.shared("from_stoch", ALL, ALL), own.constant("in_stoch_scale", ALL))
+        value = _dot(old, block_share) + _dot(deter_part, deter_share) + _dot(stoch_part, stoch_share)
+        value += plt.load(own.ref["core_term"].at[self.t, :, own.columns(tile)]).astype(jnp.float32)
+        plt.store(own.ref["wide"].at[:, own.columns(tile)], value)
+        plt.store(own.ref["squares"].at[_index((tile, ALL))], jnp.sum(value * value, -1))
+
+    def gates(self, tile: Any, reset: jax.Array, candidate: jax.Array, update: jax.Array) -> None:
+        """The new state."""
+        own, block, size = self.program, self.program.block, self.program.layout.columns
+        group, inside = tile // own.per_block, tile % own.per_block
+        squares = jnp.sum(own.shared("squares", ALL, ALL), 0) / own.config.deter
+        wide = self.norm_act(own.shared("wide", ALL, own.columns(group, block)),
+                             own.constant("core_scale", own.columns(group, block)), squares)
+
+        def gate(weight: jax.Array, number: int) -> jax.Array:
+            place = pl.ds(group * 3 * block + number * block + inside * size, size)
+            return _dot(wide, weight) + own.constant("gates", place)[None]
+
+        value = jnp.tanh(jax.nn.sigmoid(gate(reset, 0)) * gate(candidate, 1))
+        share = jax.nn.sigmoid(gate(update, 2) - 1.0)
+        old = self.kept(own.shared("deter", self.t, ALL, own.columns(tile))).astype(jnp.float32)
+        new = (share * value + (1 - share) * old).astype(own.ref["deter"].dtype)
+        plt.store(own.ref["deter"].at[self.t + 1, :, own.columns(tile)], new)
+
+    def products(self, tile: Any, weight: jax.Array) -> None:
+        """A part of the new state's products."""
+        own = self.program
+        part, place = tile % PARTS, tile // PARTS
+        rows = own.shared("deter", self.t + 1, ALL, own.columns(part, own.config.deter // PARTS))
+        plt.store(own.ref["products"].at[_index((part, ALL, own.columns(place)))], _dot(rows, weight))
+
+    def sample(self, tile: Any, weight: jax.Array) -> None:
+        """Posterior probabilities of one class variable, and what is drawn of them."""
+        own, config = self.program, self.program.config
+        classes, hidden, shape = config.classes, config.hidden, (own.batch, config.classes, config.classes)
+        value = _summed(partial(own.shared, "products"), hidden, hidden)
+        value += plt.load(own.ref["post_term"].at[self.t, :, :]).astype(jnp.float32)
+        place = own.columns(tile, classes)
+        logits = _dot(self.norm_act(value, own.constant("post_scale", ALL)), weight)
+        logits += own.constant("post_logit", place)[None]
+        scaled = jnp.exp(logits - jnp.max(logits, -1)[:, None])
+        probs = (1 - config.unimix) * scaled / jnp.sum(scaled, -1)[:, None] + config.unimix / classes
+        row, column = (jax.lax.broadcasted_iota(jnp.int32, shape, axis) for axis in (1, 2))
+        reached = jnp.sum(jnp.where(row <= column, probs[:, :, None], 0.0), 1)
+        position = jax.lax.broadcasted_iota(jnp.int32, shape[:2], 1)
+        drawn = plt.load(own.ref["uniform"].at[_index((self.t, ALL, tile))])
+        passed = (drawn[:, None] >= reached) & (position < classes - 1)
+        index = jnp.sum(passed.astype(jnp.int32), -1)
+        chosen = (position == index[:, None]).astype(own.ref["deter"].dtype)
+        plt.store(own.ref["stoch"].at[self.t + 1, :, place], chosen)
+        plt.store(own.ref["probs"].at[self.t, :, place], probs)
+
+
+def _dot(x: jax.Array, weight: jax.Array) -> jax.Array:
+    return jnp.dot(x, weight, preferred_element_type=jnp.float32)
 
 
 def _index(at: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -252,7 +311,7 @@ def _index(at: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(jnp.int32(one) if isinstance(one, int) else one for one in at)
 
 
-def _summed(read: Callable[..., jax.Array], start: int, width: int, pl: Any) -> jax.Array:
+def _summed(read: Callable[..., jax.Array], start: int, width: int) -> jax.Array:
     """(B, width) sum over the parts of the split product."""
     total = read(0, slice(None), pl.ds(start, width))
     for part in range(1, PARTS):
@@ -260,7 +319,7 @@ def _summed(read: Callable[..., jax.Array], start: int, width: int, pl: Any) -> 
     return total
 
 
-def _wait(counter: Any, target: Any, plt: Any) -> None:
+def _wait(counter: Any, target: Any) -> None:
     """Go on when all programs have come here: each adds one, and the counter is then at `target`."""
     plt.debug_barrier()  # what this program's threads wrote is written before it says so
     seen = plt.atomic_add(counter, (0,), jnp.int32(1)) + 1

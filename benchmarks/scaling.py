@@ -33,7 +33,7 @@ from dreamer.replay import Replay
 from dreamer.types import FunctionalEnv, Transition
 from whill_mjx.devices import choose_devices
 from whill_mjx.io.command_line import COUNT, run
-from whill_mjx.learning.setup import functional_env, make_training_env
+from whill_mjx.learning.setup import functional_env, make_evaluation_env
 from whill_mjx.tasks.tasks import make_task
 
 CLAIM = "Stepping the environment and learning on several devices of one host, at a fixed work per device"
@@ -118,7 +118,7 @@ def env_program(options: Options, count: int) -> Program:
     devices = choose_devices(count)
     total = count * options.instances
     task = make_task("obstacle_course")
-    env = functional_env(make_training_env(task, "whill_cr_ramp", total, devices=devices))
+    env = functional_env(make_evaluation_env(task, "whill_cr_ramp", total, devices=devices))
 
     def body(carry: tuple[Any, Transition, jax.Array], key: jax.Array) -> tuple[Any, None]:
         state, transition, earned = carry

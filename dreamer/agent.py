@@ -166,15 +166,15 @@ def loss(
     """Joint loss () of world model, policy and critic; with posterior states, percentiles and metrics."""
     model_key, imagine_key = jax.random.split(key)
     losses, latent, model_metrics = world_model.loss(config, params, batch, model_key)
-    outcome = (batch.reward, batch.is_last, batch.is_terminal)
+    outcome = behavior.Outcome(batch.reward, batch.is_last, batch.is_terminal)
     latest, tail = jax.tree.map(lambda x: x[-config.start_steps :], (latent, outcome))
     behavior_losses, returns, norm, metrics = behavior.imagination_loss(
         config, params, agent.slow_value, agent.return_norm, latest, imagine_key
     )
     losses.update(behavior_losses)
-    start_return = returns.reshape(tail[0].shape)
+    start_return = returns.reshape(tail.reward.shape)
     losses["replay_value"] = config.replay_value_scale * behavior.replay_loss(
-        config, params, agent.slow_value, latest, tail[0], tail[1], tail[2], start_return
+        config, params, agent.slow_value, latest, tail, start_return
     )
     means = {name: jnp.mean(value) for name, value in losses.items()}
     total = sum(means.values(), jnp.zeros(()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -210,15 +211,18 @@ def stop_rollout(rollout: Imagined) -> Imagined:
     return Imagined(jax.lax.stop_gradient(rollout.features), jax.lax.stop_gradient(rollout.actions))
 
 
+class Outcome(NamedTuple):
+    """What replayed steps came to, (T, B) each."""
+
+    reward: jax.Array
+    is_last: jax.Array
+    """Cuts the mixing of returns: what follows belongs to another episode."""
+    is_terminal: jax.Array
+    """Ends the value."""
+
+
 def replay_loss(
-    config: DreamerConfig,
-    params: Params,
-    slow: Params,
-    latent: Latent,
-    reward: jax.Array,
-    is_last: jax.Array,
-    is_terminal: jax.Array,
-    start_return: jax.Array,
+    config: DreamerConfig, params: Params, slow: Params, latent: Latent, outcome: Outcome, start_return: jax.Array
 ) -> jax.Array:
     """Critic loss (T - 1, B) along the replayed sequence; its gradient reaches the world model.
 
@@ -229,16 +233,14 @@ def replay_loss(
         params: of the whole agent.
         slow: slow critic.
         latent: posterior states (T, B, ...).
-        reward: (T, B), is_last and is_terminal alike.
-        is_last: cuts the mixing: what follows belongs to another episode.
-        is_terminal: ends the value.
+        outcome: of the same steps.
         start_return: (T, B) imagined returns.
     """
     features = latent.features()
-    last = is_last.astype(jnp.float32)
-    live = config.discount * (1.0 - is_terminal.astype(jnp.float32))
+    last = outcome.is_last.astype(jnp.float32)
+    live = config.discount * (1.0 - outcome.is_terminal.astype(jnp.float32))
     returns = lambda_return(
-        reward, live, config.return_lambda * (1.0 - last), start_return, min(config.scan_unroll, last.shape[0])
+        outcome.reward, live, config.return_lambda * (1.0 - last), start_return, min(config.scan_unroll, last.shape[0])
     )
     logits = world_model.head(params["value"], features)[:-1]
     slow_logits = world_model.head(slow, jax.lax.stop_gradient(features))[:-1]

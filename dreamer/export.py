@@ -38,6 +38,21 @@ Step = Callable[[Carry, jax.Array], tuple[Carry, jax.Array]]
 
 
 @dataclasses.dataclass(frozen=True)
+class Converted:
+    """A network, the same as ONNX, and how far their actions differ."""
+
+    network: Network
+    model: bytes
+    differences: dict[str, Any]
+
+    @classmethod
+    def of(cls, network: Network, check_steps: int) -> "Converted":
+        """Convert a network and compare both over so many recurrent steps on random observations."""
+        model = to_onnx(network)
+        return cls(network, model, parity(model, network, check_steps))
+
+
+@dataclasses.dataclass(frozen=True)
 class PolicyContract:
     """What the vehicle must know to feed the policy and to read its output."""
 
@@ -112,21 +127,18 @@ def export_policy(
         carry, action = step(carry, obs["image"])
         return carry, (action.astype(jnp.float32),)
 
-    network = Network(named_step, shapes, {"image": _image_shape(contract)})
-    model = to_onnx(network)
-    checked = parity(model, network, check_steps)
-
+    converted = Converted.of(Network(named_step, shapes, {"image": _image_shape(contract)}), check_steps)
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        (folder / "policy.onnx").write_bytes(model)
+        (folder / "policy.onnx").write_bytes(converted.model)
         save_arrays(folder / "weights.npz", flatten_weights(weights))
         if stablehlo:
             (folder / "policy.stablehlo").write_bytes(_to_stablehlo(step, shapes, contract))
         vehicle_sha256 = contract.vehicle_sha256
         if vehicle_file is not None:
             vehicle_sha256 = _copy_vehicle(Path(vehicle_file), folder / "vehicle.toml", vehicle_sha256)
-        _finish(folder, path, _describe(contract, vehicle_sha256), network, checked)
+        _finish(folder, path, _describe(contract, vehicle_sha256), converted)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return path
@@ -167,9 +179,7 @@ def export_agent(
         raise ValueError(f"params: the policy's last bias has the shape {bias.shape}, but {actions} needs "
                          f"({actions.outputs},). Give the action_dim of the training, and of several seeds one agent "
                          "(dreamer.seeds.pick).")
-    network = _network_of(config, params, obs_shape, actions)
-    model = to_onnx(network)
-    checked = parity(model, network, check_steps)
+    converted = Converted.of(_network_of(config, params, obs_shape, actions), check_steps)
     described = {name: list(one) for name, one in obs_shape.items()} if isinstance(obs_shape, Mapping) else obs_shape
     table = {
         "schema": SCHEMA,
@@ -178,7 +188,7 @@ def export_agent(
         "action": {"kind": type(actions).__name__.lower(), "size": actions.width},
         "task": task,
     }
-    return _write_agent(path, model, params, table, network, checked)
+    return _write_agent(path, converted, params, table)
 
 
 def export_sensing(
@@ -218,9 +228,7 @@ def export_sensing(
         carry, action = step(carry, obs)
         return carry, (action.astype(jnp.float32),)
 
-    network = Network(named_step, shapes, dict(inputs))
-    model = to_onnx(network)
-    checked = parity(model, network, check_steps)
+    converted = Converted.of(Network(named_step, shapes, dict(inputs)), check_steps)
     vehicle = _describe(contract, "")
     table = {
         "schema": SCHEMA,
@@ -229,22 +237,21 @@ def export_sensing(
         "action": {"kind": "box", "size": 2, **vehicle["action"]},
         **{name: vehicle[name] for name in ("rate_hz", "action_repeat", "task")},
     }
-    return _write_agent(path, model, weights, table, network, checked, vehicle_file)
+    return _write_agent(path, converted, weights, table, vehicle_file)
 
 
 def _write_agent(
-    path: Path, model: bytes, weights: Any, table: dict[str, Any], network: Network, checked: dict[str, Any],
-    vehicle_file: str | Path | None = None,
-) -> Path:  # fmt: skip
+    path: Path, converted: Converted, weights: Any, table: dict[str, Any], vehicle_file: str | Path | None = None
+) -> Path:
     """Write the folder of an agent, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        (folder / "policy.onnx").write_bytes(model)
+        (folder / "policy.onnx").write_bytes(converted.model)
         save_arrays(folder / "weights.npz", flatten_weights(weights))
         if vehicle_file is not None:
             _copy_vehicle(Path(vehicle_file), folder / "vehicle.toml", "")
-        _finish(folder, path, table, network, checked)
+        _finish(folder, path, table, converted)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return path
@@ -270,8 +277,9 @@ def _network_of(
     return Network(step, carry, dict(inputs) if several else {SINGLE: inputs}, outputs)
 
 
-def _finish(folder: Path, path: Path, table: dict[str, Any], network: Network, checked: dict[str, Any]) -> None:
+def _finish(folder: Path, path: Path, table: dict[str, Any], converted: Converted) -> None:
     """Describe the network and the files in `folder` in its policy.json, and put the folder at `path`."""
+    network = converted.network
     inputs, outputs = network.tensors
     described = {
         **table,
@@ -280,7 +288,7 @@ def _finish(folder: Path, path: Path, table: dict[str, Any], network: Network, c
         "onnx": {"opset": OPSET, "inputs": inputs, "outputs": outputs},
         "files": {item.name: sha256(item.read_bytes()) for item in sorted(folder.iterdir())},
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "parity": checked,
+        "parity": converted.differences,
     }
     (folder / "policy.json").write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
     folder.chmod(0o755)

@@ -176,13 +176,7 @@ def observe(
         return jnp.broadcast_to(x, (*steps, *x.shape))
 
     core_weight, post_weight = cast(params["core"]["w"]), cast(params["post"]["w"])
-    weights = {
-        "in_stoch": cast(params["in_stoch"]["w"]),
-        "core": core_weight[:, : d // g + 2 * h],
-        "gates": cast(params["gates"]["w"]),
-        "deter": jnp.concatenate([cast(params["in_deter"]["w"]), post_weight[:d]], -1),
-        "post_logit": cast(params["post_logit"]["w"]),
-    }
+    weights = _recurrent_weights(config, params, core_weight, post_weight)
     action = embed_action(params, jnp.where(is_first[..., None], 0.0, actions), dtype)
     action_term = jnp.einsum("tbh,gho->tbgo", action, core_weight[:, d // g + 2 * h :])
     token_term = tokens.astype(dtype) @ post_weight[d:] + cast(params["post"]["b"])
@@ -200,6 +194,20 @@ def observe(
     step = partial(_observe_body, config)
     _, (deter, stoch, probs) = scan_products(step, config.scan_unroll, weights, carry, terms, inputs)
     return Latent(deter, stoch), probs
+
+
+def _recurrent_weights(
+    config: DreamerConfig, params: Params, core: jax.Array, post: jax.Array
+) -> dict[str, jax.Array]:
+    """Weights of the products with the recurrent state, in the type of those of the core and the posterior."""
+    d, h, g, dtype = config.deter, config.hidden, config.blocks, core.dtype
+    return {
+        "in_stoch": params["in_stoch"]["w"].astype(dtype),
+        "core": core[:, : d // g + 2 * h],
+        "gates": params["gates"]["w"].astype(dtype),
+        "deter": jnp.concatenate([params["in_deter"]["w"].astype(dtype), post[:d]], -1),
+        "post_logit": params["post_logit"]["w"].astype(dtype),
+    }
 
 
 def _observe_body(

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import functools
-import json
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, Protocol
+from typing import Any, ParamSpec, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from filelock import FileLock, Timeout
 from jax.sharding import Mesh
 
-from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
+from dreamer import checkpoint, parallel, pretrain, seeds
 from dreamer.agent import AgentState
-from dreamer.board import Board
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
+from dreamer.first_state import check_seed, first_state, fits, save_state
 from dreamer.iteration import (
     TrainState,
     compile_init,
@@ -32,13 +29,13 @@ from dreamer.iteration import (
     lower_iteration,
     train_iteration,
 )
+from dreamer.metrics_log import Log, Meter, MetricsFn, evaluated, headline
 from dreamer.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
 __all__ = ["TrainingOptions", "TrainResult", "TrainState", "evaluate", "init_state", "train", "train_iteration"]
 
 EvalFn = Callable[[Params, int], dict[str, float]]
-MetricsFn = Callable[[dict[str, float]], None]
 StopFn = Callable[[dict[str, float]], bool]
 P = ParamSpec("P")
 COMPILING = "compiling training and evaluation: usually 1 to 2 minutes, seconds where they are kept of an earlier run"
@@ -62,51 +59,6 @@ class TrainResult:
     """Time of the run [s], all its parts together, compilation included."""
     last_metrics: dict[str, float]
     """The last logged line."""
-
-
-class Meter:
-    """Sums the metrics of iterations until they are logged."""
-
-    def __init__(self) -> None:
-        self._sums: list[dict[str, jax.Array]] = []
-        self._steps = 0
-        self._since = time.monotonic()
-
-    def add(self, metrics: dict[str, jax.Array], steps: int) -> None:
-        """Queue one iteration's sums and control steps, without waiting for the device."""
-        self._sums.append(metrics)
-        self._steps += steps
-
-    def wait_for_previous(self) -> None:
-        """Let the device be at most one iteration behind the host."""
-        if len(self._sums) > 1:
-            jax.block_until_ready(self._sums[-2])
-
-    def read(self, config: DreamerConfig) -> dict[str, float]:
-        """Means since the last reading, and rates; starts anew."""
-        fetched = jax.device_get(self._sums)
-        # Several seeds: their mean.
-        sums = {name: float(np.sum([np.mean(x[name]) for x in fetched])) for name in fetched[0]} if fetched else {}
-        now = time.monotonic()
-        seconds, self._since = max(now - self._since, 1e-9), now
-        updates, episodes = sums.pop("updates", 0.0), sums.pop("episodes", 0.0)
-        steps, self._steps, self._sums = self._steps, 0, []
-        line = {
-            "env_steps_per_s": steps / seconds,
-            "updates_per_s": updates / seconds,
-            "replayed_steps_per_s": updates * config.replayed_per_update / seconds,
-            "updates_per_env_step": updates / max(steps, 1),
-            "episodes": episodes,
-        }
-        goals = sums.pop("update/goal_frames", 0.0)
-        predicted, true = (sums.pop(f"update/goal_reward_{name}sum", 0.0) for name in ("", "true_"))
-        if goals:
-            line |= {"goal_reward_predicted": predicted / goals, "goal_reward_true": true / goals}
-        for name, value in sums.items():
-            count = episodes if name.startswith("episode/") else updates
-            if count:
-                line[name.replace("update/", "")] = value / count
-        return line
 
 
 def alone(function: Callable[P, TrainResult]) -> Callable[P, TrainResult]:
@@ -194,7 +146,7 @@ def train(
             replay in the host's memory is asked for with several seeds or devices, or another process trains there.
     """
     out = Path(out)
-    _check_seed(out, seed, options.resume)
+    check_seed(out, seed, options.resume)
     out.mkdir(parents=True, exist_ok=True)
     mesh = parallel.make_mesh(options.devices, env.num_envs, config.batch_size) if options.devices else None
     if mesh is not None and not isinstance(seed, int):
@@ -246,12 +198,12 @@ class _Run:
         options, self._began = self.options, time.monotonic()
         options.announce("preparing the training: first worlds and parameters")
         early = self._compiled_ahead(seed, mesh)
-        self.state, self._wall_before = _first_state(self.env, self.config, self.out, seed, options.resume, mesh)
+        self.state, self._wall_before = first_state(self.env, self.config, self.out, seed, options.resume, mesh)
         self.env_steps = int(self.state.env_steps)
         self._done = pretrain.counters(self.state)
         place = pretrain.position(self.config, {"env_steps": self.env_steps, **self._done})
         self._counted = place >= 0  # all pretraining is done
-        self._log = _Log(self.out / "metrics.jsonl", self.config, place, options.on_metrics, options.tensorboard)
+        self._log = Log(self.out / "metrics.jsonl", self.config, place, options.on_metrics, options.tensorboard)
 
         def compiled(step: Any) -> Any:
             if isinstance(seed, int):
@@ -279,7 +231,7 @@ class _Run:
         if not isinstance(seed, int) or mesh is not None or self.config.pretrain_steps or resumed:
             return None
         where = self.config.replay_memory
-        if where == "host" or (where == "auto" and not _fits(self.env, self.config)):
+        if where == "host" or (where == "auto" and not fits(self.env, self.config)):
             return None
         config = replace(self.config, replay_memory="device")
         shapes = jax.eval_shape(compile_init(self.env, config, seed))
@@ -381,7 +333,7 @@ class _Run:
         elif evaluated:
             params = jax.tree.map(jnp.copy, self.state.agent.acting)  # the next iteration donates its own
         self._waiting.append((line, params))
-        self._bar.show(self.env_steps, _headline(line))
+        self._bar.show(self.env_steps, headline(line))
         return self._write_waiting(at_once)
 
     def _write_waiting(self, at_once: bool) -> bool:
@@ -396,27 +348,12 @@ class _Run:
                     wait([self._ready])
                 figures = self.options.eval_fn(params, line["env_steps"])
                 line |= {f"eval/{name}": float(value) for name, value in figures.items()}
-                self._bar.note(_evaluated(figures))
+                self._bar.note(evaluated(figures))
             self._log.write(line)
             self._waiting.pop(0)  # interrupted just before, the line is written twice and read once
             stop = self.options.stop
             stops = stops or (params is not None and stop is not None and stop(line))
         return stops
-
-
-def _check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
-    """Raise ValueError where a run would go on with another seed than it was begun with."""
-    path = out / "config.json"
-    if not resume or not path.exists() or not checkpoint.complete(out / "checkpoints"):
-        return
-    try:
-        begun = json.loads(path.read_text())["seed"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return  # the checkpoint has the configuration, and its keys those of the seed
-    asked = seed if isinstance(seed, int) else list(seed)
-    if begun != asked:
-        raise ValueError(f"{out}: the run there was begun with seed {begun}, not {asked}. Give that seed, or another "
-                         "folder.")
 
 
 def in_thread(call: Callable[..., Any], *given: Any) -> Future:
@@ -425,155 +362,6 @@ def in_thread(call: Callable[..., Any], *given: Any) -> Future:
     started = threads.submit(call, *given)
     threads.shutdown(wait=False)
     return started
-
-
-def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: float) -> Path:
-    """Write a checkpoint of the whole run; of the replay only what is filled."""
-    rows = state.replay.reward.shape[0]
-    used = max(1, min(rows, int(state.replay.written)))
-    filled = ("replay.", used, rows) if state.replay.reward.ndim == 2 else None  # of several seeds all is written
-    env_steps = int(state.env_steps)
-    pretraining = 0 if env_steps else sum(pretrain.counters(state).values())
-    state = host_replay.revealed(state)
-    path = checkpoint.save(out / "checkpoints", state, config, env_steps, wall_s, filled, pretraining)
-    parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
-    return path
-
-
-def _first_state(
-    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int | Sequence[int], resume: bool, mesh: Mesh | None
-) -> tuple[TrainState, float]:
-    """State to start from and the time [s] already spent."""
-    if resume and checkpoint.complete(out / "checkpoints"):
-        template = _init(env, config, seed, None, split=mesh is not None)()
-        restored = checkpoint.restore(out / "checkpoints", host_replay.revealed(template), config)
-        if restored is not None:
-            state = host_replay.hidden(restored[0], template)
-            if mesh is not None:
-                state = parallel.place(state, parallel.state_shardings(mesh, state, env.num_envs))
-            return state, float(restored[1]["wall_s"])
-    state = _init(env, config, seed, mesh)()
-    if not parallel.is_first_process():
-        return state, 0.0
-    if not resume:
-        for path in checkpoint.complete(out / "checkpoints"):
-            checkpoint.remove(path)
-    _write_atomically(out / "config.json", json.dumps({**asdict(config), "seed": seed}, indent=1) + "\n")
-    return state, 0.0
-
-
-def _init(
-    env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], mesh: Mesh | None, split: bool = False
-) -> Any:
-    """The compiled first state, () -> state; `split`: it will be placed on several devices."""
-    alone = isinstance(seed, int) and mesh is None and not split
-    config = replace(config, replay_memory=_memory(env, config, alone))
-    if isinstance(seed, int):
-        return compile_init(env, config, seed, mesh)
-    return functools.partial(jax.jit(lambda each: seeds.init_states(env, config, each)), np.asarray(seed, np.int32))
-
-
-def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["device", "host"]:
-    """Where the observations of the replay go; `alone`: one seed on one device."""
-    if config.replay_memory == "host" and not alone:
-        raise ValueError(
-            "DreamerConfig.replay_memory = 'host': a replay in the host's memory belongs to one seed on one device. "
-            "Give one seed and no devices, or leave it at 'auto' with a smaller replay_capacity."
-        )
-    if config.replay_memory != "auto" or not alone:
-        return "host" if config.replay_memory == "host" else "device"
-    if _fits(env, config):
-        return "device"
-    size = _observation_bytes(env, config)
-    print(
-        f"The replay's observations would take {size / 1e9:.1f} GB, more than half of the device's memory: they are "
-        "kept in the host's, which is slower. A smaller replay_capacity keeps them on the device.",
-        file=sys.stderr,
-    )
-    return "host"
-
-
-def _fits(env: FunctionalEnv, config: DreamerConfig) -> bool:
-    """Whether the device has room for the observations of the replay."""
-    return host_replay.fits(_observation_bytes(env, config), jax.devices()[0])
-
-
-def _observation_bytes(env: FunctionalEnv, config: DreamerConfig) -> int:
-    """Size of the observations of the replay."""
-    there = replace(config, replay_memory="device")
-    memory = jax.eval_shape(lambda: replay.init(there, env.num_envs, env.obs_shape, 1, 1 + config.mirror))
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(memory.obs))
-
-
-def _evaluated(figures: dict[str, float]) -> dict[str, str]:
-    """The figures of an evaluation that a watcher wants to see."""
-    shown = {"success": f"{figures['success']:.0%}"} if "success" in figures else {}
-    return shown | ({"eval return": f"{figures['return']:.3g}"} if "return" in figures else {})
-
-
-def _headline(line: dict[str, Any]) -> dict[str, str]:
-    """The figures a watcher wants to see."""
-    names = {
-        "pretrain/env_steps_per_s": "random step/s",
-        "pretrain/updates_per_s": "model upd/s",
-        "pretrain_updates": "model updates",
-        "replayed_steps_per_s": "replay/s",
-        "updates_per_s": "upd/s",
-        "updates_per_env_step": "upd/step",
-        "episode/return": "return",
-    }
-    return {short: f"{line[name]:.3g}" for name, short in names.items() if name in line}
-
-
-class _Log:
-    """metrics.jsonl, without the lines a resumed run is about to write again."""
-
-    def __init__(
-        self, path: Path, config: DreamerConfig, place: int, on_metrics: MetricsFn | None, tensorboard: bool
-    ) -> None:
-        self._path, self._on_metrics, self._config = path, on_metrics, config
-        self._board = Board(path.parent, place) if tensorboard and parallel.is_first_process() else None
-        self.last: dict[str, float] = {}
-        self.evaluated_at = 0
-        """Steps at the last evaluation so far."""
-        kept: list[str] = []
-        if not parallel.is_first_process():
-            return
-        for text in path.read_text(errors="replace").splitlines() if path.exists() else []:
-            try:
-                line = json.loads(text)
-                pretrain.position(config, line)
-            except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-                continue  # cut off by the kill, or damaged
-            if pretrain.position(config, line) <= place and text not in kept[-1:]:
-                kept.append(text)
-                self.last = line
-                if any(name.startswith("eval/") for name in line):
-                    self.evaluated_at = line["env_steps"]
-        _write_atomically(path, "".join(text + "\n" for text in kept))
-
-    def write(self, line: dict[str, float]) -> None:
-        """Append one line."""
-        self.last = line
-        if not parallel.is_first_process():
-            return
-        with self._path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        if self._board is not None:
-            self._board.write(line, pretrain.position(self._config, line))
-        if self._on_metrics is not None:
-            self._on_metrics(line)
-
-    def close(self) -> None:
-        """Close the curves."""
-        if self._board is not None:
-            self._board.close()
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 if __name__ == "__main__":

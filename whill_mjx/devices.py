@@ -65,3 +65,9 @@ def choose_devices(count: int | None) -> tuple[jax.Device, ...]:
                          "Leave the option out.")
     chosen = tuple(devices[: count or len(devices)])
     return chosen if len(chosen) > 1 else ()
+
+
+def runs_triton() -> bool:
+    """Whether the default device is an NVIDIA GPU for which our kernels are written: Ampere or later."""
+    capability = str(getattr(jax.devices()[0], "compute_capability", ""))
+    return capability.replace(".", "", 1).isdigit() and float(capability) >= 8.0

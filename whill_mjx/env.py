@@ -40,7 +40,8 @@ from whill_mjx.world.people.contact import (
 )
 from whill_mjx.world.photometric import Photometry, augment, draw_photometry, neutral
 from whill_mjx.world.randomize import randomize_looks
-from whill_mjx.world.render import Quality, pinhole, render
+from whill_mjx.world.render import Quality, pinhole
+from whill_mjx.world.render.draw import draw
 from whill_mjx.world.render.rich import floor_light
 from whill_mjx.world.rich import furnish, paint, pictures_of
 from whill_mjx.world.scene import Scene, footprint
@@ -469,7 +470,7 @@ def observe(env: Env, state: State) -> jax.Array:
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
     scene = shown(state.scene, position, rotation, intrinsics, env.width)
-    image = render(position, rotation, intrinsics, scene, env.height, env.width)
+    image = draw(position, rotation, intrinsics, scene, env.height, env.width)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
@@ -496,7 +497,7 @@ def _observe_rich(env: Env, state: State) -> jax.Array:
     exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
     rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
     scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics, env.width)
-    image = render(position, rotation, intrinsics, scene, env.height, env.width, RICH)
+    image = draw(position, rotation, intrinsics, scene, env.height, env.width, RICH)
     turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
     return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)
 

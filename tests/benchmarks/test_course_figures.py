@@ -11,7 +11,7 @@ import pytest
 from benchmarks import course
 from benchmarks.course_figures import groups, load_run
 from dreamer.config import preset
-from whill_mjx.train import Trained
+from whill_mjx.learning.trainings import Trained
 
 COURSE, CORRIDOR = {"action_repeat": 1}, {"action_repeat": 1, "box_x": 2.5}
 

@@ -155,7 +155,7 @@ def test_a_mean_in_saturation_is_pulled_back_where_every_action_pays_the_same(ag
             losses, *_ = behavior.imagination_loss(config, params, agent_state.slow_value, NORM, start, key)
             return jnp.mean(losses["policy"])
 
-        return jax.grad(loss)(params)["policy"]["out"]["b"]
+        return jax.jit(jax.grad(loss))(params)["policy"]["out"]["b"]
 
     np.testing.assert_allclose(bias_gradient(0.0), 0.0, atol=1e-9)
     pulled = bias_gradient(0.01)

@@ -15,13 +15,17 @@ def random(*shape, seed=0):
 
 def assert_same(function, other, *arguments):
     """Values and the gradients of all arguments, up to the rounding of a float32 sum."""
-    value, back = jax.vjp(jax.jit(function), *arguments)
-    expected, other_back = jax.vjp(jax.jit(other), *arguments)
-    cotangent = jax.tree.map(lambda x: random(*x.shape, seed=9).astype(x.dtype), value)
-    pairs = zip(jax.tree.leaves((value, back(cotangent))), jax.tree.leaves((expected, other_back(cotangent))),
-                strict=True)
-    for mine, theirs in pairs:
-        scale = float(jnp.max(jnp.abs(theirs))) + 1e-6
+
+    def value_and_gradients(function):
+        @jax.jit
+        def both(arguments):
+            value, back = jax.vjp(function, *arguments)
+            return value, back(jax.tree.map(lambda x: random(*x.shape, seed=9).astype(x.dtype), value))
+
+        return [np.asarray(leaf) for leaf in jax.tree.leaves(both(arguments))]
+
+    for mine, theirs in zip(value_and_gradients(function), value_and_gradients(other), strict=True):
+        scale = float(np.max(np.abs(theirs))) + 1e-6
         np.testing.assert_allclose(mine / scale, theirs / scale, atol=2e-6)
 
 

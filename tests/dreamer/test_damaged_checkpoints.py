@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dreamer import checkpoint
-from dreamer.train import _Log
+from dreamer.metrics_log import Log
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def test_damaged_lines_of_a_log_are_left_out(data, tmp_path_factory):
     path = Path(tmp_path_factory.getbasetemp()) / "metrics.jsonl"
     good = b'{"env_steps": 10, "loss": 0.5}\n{"env_steps": 20, "eval/return": 1.5}\n'
     path.write_bytes(data.draw(damage.damaged(good)))
-    log = _Log(path, tiny_config(), 15, None, False)
+    log = Log(path, tiny_config(), 15, None, False)
     assert all(json.loads(line)["env_steps"] <= 15 for line in path.read_text().splitlines())
     log.write({"env_steps": 30.0})
     assert json.loads(path.read_text().splitlines()[-1]) == {"env_steps": 30.0}

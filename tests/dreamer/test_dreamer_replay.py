@@ -165,7 +165,7 @@ def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothin
     with pytest.raises(ValueError, match="has no mirror"):
         iteration.init_state(plain_env, config, 0)
     step = jax.jit(lambda state: iteration.train_iteration(env, config, state))
-    state, updates = iteration.init_state(env, config, 0), 0
+    state, updates = iteration.compile_init(env, config, 0)(), 0
     for _ in range(14):
         state, metrics = step(state)
         updates += int(metrics["updates"])
@@ -193,7 +193,7 @@ def test_each_world_of_the_mirror_has_a_stream_of_its_own():
         iteration.init_state(env, tiny_config(mirror=3), 0)
     config = tiny_config(mirror=2, learning_starts=0)
     step = jax.jit(lambda state: iteration.train_iteration(env, config, state))
-    state = iteration.init_state(env, config, 0)
+    state = iteration.compile_init(env, config, 0)()
     for _ in range(8):
         state, _ = step(state)
     real, one, other = (jax.tree.map(lambda x: np.asarray(x[:8]), columns(state.replay, slice(i, i + 2)))

@@ -64,7 +64,7 @@ def test_the_policy_is_sampled_with_this_noise():
 
 
 def test_without_a_time_constant_there_is_no_noise_to_keep():
-    assert iteration.init_state(corridor_env(2), tiny_config(), 0).noise is None
+    assert jax.eval_shape(lambda: iteration.init_state(corridor_env(2), tiny_config(), 0)).noise is None
 
 
 def test_classes_and_too_short_memories_are_refused():

@@ -8,7 +8,7 @@ from dreamer_toys import SHAPE, tiny_config
 
 from dreamer import agent, behavior, world_model
 from dreamer import distributions as dist
-from dreamer.behavior import ReturnNorm
+from dreamer.behavior import Outcome, ReturnNorm
 from dreamer.rssm import Latent
 
 CONFIG = tiny_config(imag_horizon=15)
@@ -124,23 +124,23 @@ def replayed():
     """States, rewards, ends of three streams (a time-out, a terminal, none), and imagined returns."""
     reward, boot = jax.random.normal(KEY, (2, T, B)) * 2 + 1
     last = jnp.zeros((T, B), bool).at[2, 0].set(True).at[3, 1].set(True)
-    return states(T, B), reward, last, jnp.zeros((T, B), bool).at[3, 1].set(True), boot
+    return states(T, B), Outcome(reward, last, jnp.zeros((T, B), bool).at[3, 1].set(True)), boot
 
 
 @pytest.fixture(scope="module")
 def replay_learned(params, slow, replayed):
     """Gradients by parameters, slow critic, states and imagined returns; and losses with both critics' outputs."""
-    latent, reward, last, terminal, boot = replayed
+    latent, outcome, boot = replayed
 
     def total(params, slow, latent, boot):
-        losses = behavior.replay_loss(CONFIG, params, slow, latent, reward, last, terminal, boot)
+        losses = behavior.replay_loss(CONFIG, params, slow, latent, outcome, boot)
         return jnp.mean(losses), (losses, [world_model.head(p, latent.features()) for p in (params["value"], slow)])
 
     return jax.jit(jax.grad(total, (0, 1, 2, 3), has_aux=True))(params, slow, latent, boot)
 
 
 def test_the_replayed_critic_learns_from_real_rewards_and_imagined_returns(replayed, replay_learned):
-    reward, last, terminal, boot = map(np.asarray, replayed[1:])
+    reward, last, terminal, boot = map(np.asarray, (*replayed[1], replayed[2]))
     losses, (logits, slow_logits) = jax.tree.map(np.asarray, replay_learned[1])
     assert losses.shape == (T - 1, B)
     discount = 1 - 1 / CONFIG.horizon

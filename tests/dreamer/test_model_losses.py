@@ -1,7 +1,6 @@
 """Which part of a replayed step each loss of the world model reads, and the gates of its recurrence."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -74,9 +73,13 @@ def test_a_first_step_forgets_state_and_action_of_its_own_sequence_alone(losses_
 def test_an_update_in_bf16_keeps_parameters_and_moments_in_float32_and_loses_what_float32_does(batch):
     def updated(dtype):
         config = tiny_config(compute_dtype=dtype)
-        begun = agent.init_agent(config, SHAPE, 2, KEY)
-        start = rssm.initial(config, B)
-        return jax.jit(partial(agent.update, config))(begun, dataclasses.replace(batch, start=start), KEY)
+
+        @jax.jit
+        def update(batch):
+            begun = agent.init_agent(config, SHAPE, 2, KEY)
+            return agent.update(config, begun, dataclasses.replace(batch, start=rssm.initial(config, B)), KEY)
+
+        return update(batch)
 
     learner, latent, metrics = updated("bfloat16")
     _, exact_latent, exact = updated("float32")

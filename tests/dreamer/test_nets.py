@@ -84,21 +84,28 @@ def test_block_and_patch_layouts_are_inverted_exactly(shape):
 @pytest.mark.parametrize("encoder", ["conv", "patch"])
 def test_images_that_are_not_square_keep_their_shape(encoder):
     config, shape = tiny_config(encoder=encoder, depth=4), (32, 48, 3)
-    params = init(config, shape)
-    deter, stoch = jnp.zeros((2, config.deter)), jnp.zeros((2, config.stoch_size))
-    picture = image.decode(config, params["dec"], deter, stoch, shape)
+
+    def shown(frames):
+        params = agent.init_params(config, shape, 2, jax.random.PRNGKey(0))
+        deter, stoch = jnp.zeros((2, config.deter)), jnp.zeros((2, config.stoch_size))
+        return image.decode(config, params["dec"], deter, stoch, shape), image.encode(config, params["enc"], frames)
+
+    picture, tokens = jax.eval_shape(shown, jnp.zeros((3, 2, *shape), jnp.uint8))
     assert picture.shape == (2, *shape)
-    tokens = image.encode(config, params["enc"], jnp.zeros((3, 2, *shape), jnp.uint8))
     assert tokens.shape == (3, 2, image.token_size(config, shape))
 
 
 def test_the_patch_encoder_sees_centred_pixels():
     config = tiny_config()
-    params = init(config)["enc"]
     frames = jax.random.randint(jax.random.PRNGKey(3), (2, *SHAPE), 0, 256).astype(jnp.uint8)
-    x = nets.layer(params["patch"], image.to_patches(frames / 255 - 0.5, config.patch))
-    expected = nets.layer(params["mix"], x.reshape(2, -1))
-    np.testing.assert_allclose(image.encode(config, params, frames), expected, rtol=1e-4, atol=1e-4)
+
+    @jax.jit
+    def both():
+        params = agent.init_params(config, SHAPE, 2, jax.random.PRNGKey(0))["enc"]
+        x = nets.layer(params["patch"], image.to_patches(frames / 255 - 0.5, config.patch))
+        return image.encode(config, params, frames), nets.layer(params["mix"], x.reshape(2, -1))
+
+    np.testing.assert_allclose(*both(), rtol=1e-4, atol=1e-4)
 
 
 def test_reconstruction_loss_is_the_squared_error_of_the_decoded_image():
@@ -106,8 +113,14 @@ def test_reconstruction_loss_is_the_squared_error_of_the_decoded_image():
     params = init(config)["dec"]
     deter, stoch = random(2, config.deter), random(2, config.stoch_size)
     frames = jax.random.randint(jax.random.PRNGKey(3), (2, *SHAPE), 0, 256).astype(jnp.uint8)
-    error = np.asarray(image.decode(config, params, deter, stoch, SHAPE)) - np.asarray(frames) / 255
-    loss = image.reconstruction_loss(config, params, deter, stoch, frames)
+
+    @jax.jit
+    def both(params):
+        return (image.decode(config, params, deter, stoch, SHAPE),
+                image.reconstruction_loss(config, params, deter, stoch, frames))
+
+    picture, loss = both(params)
+    error = np.asarray(picture) - np.asarray(frames) / 255
     np.testing.assert_allclose(loss, np.square(error).sum((1, 2, 3)), rtol=1e-4)
 
 

@@ -12,7 +12,7 @@ from dreamer_toys import SHAPE, corridor_env, tiny_config
 
 from dreamer import agent, checkpoint, sensors
 from dreamer.config import DreamerConfig
-from dreamer.iteration import init_state, train_iteration
+from dreamer.iteration import compile_init, train_iteration
 from dreamer.progress import Progress
 from dreamer.rssm import Latent
 from dreamer.train import TrainingOptions, train
@@ -84,7 +84,7 @@ def test_an_average_follows_the_parameters_and_learning_does_not_notice():
     plain = dataclasses.replace(config, average_rate=0.0)
     step = jax.jit(lambda state: train_iteration(env, config, state)[0])
     plain_step = jax.jit(lambda state: train_iteration(env, plain, state)[0])
-    state, other = init_state(env, config, 0), init_state(env, plain, 0)
+    state, other = (compile_init(env, one, 0)() for one in (config, plain))
     assert other.agent.average is None and other.agent.acting is other.agent.params
     expected, updates = state.agent.params, 0
     for _ in range(14):

@@ -155,15 +155,16 @@ def test_a_share_of_the_failed_worlds_is_begun_again(radius, share, least, most)
     many = make_batch(env, params, 32, spread=0.05, second_tries=share)
     state, _ = jax.jit(many.reset)(jax.random.key(2))
 
-    def two(state, _):
-        ended, _ = many.step(state, jnp.ones((32, 2)))  # one step: time is up, or the goal reached
-        begun, frame = many.step(ended, jnp.ones((32, 2)))
+    def advance(last_two, _):  # an episode has one step, at whose end time is up or the goal reached
+        begun, ended = last_two
+        new, frame = many.step(ended, jnp.ones((32, 2)))
         same = [jax.vmap(lambda one, two: jnp.allclose(one, two, atol=1e-5))(a, b) for a, b in zip(
-            jax.tree.leaves((state.env.scene, state.params, state.env.vehicle.qpos)),
-            jax.tree.leaves((begun.env.scene, begun.params, begun.env.vehicle.qpos)), strict=True)]
-        return begun, (jnp.all(jnp.stack(same), 0), jnp.all(frame.first), begun.tries)
+            jax.tree.leaves((begun.env.scene, begun.params, begun.env.vehicle.qpos)),
+            jax.tree.leaves((new.env.scene, new.params, new.env.vehicle.qpos)), strict=True)]
+        return (ended, new), (jnp.all(jnp.stack(same), 0), jnp.all(frame.first), new.tries)
 
-    _, (same, first, tries) = jax.jit(lambda state: jax.lax.scan(two, state, None, length=12))(state)
+    _, steps = jax.jit(lambda state: jax.lax.scan(advance, (state, state), None, length=24))(state)
+    same, first, tries = (each[1::2] for each in steps)  # every second step begins episodes
     assert bool(first.all())
     assert least <= float(same.mean()) <= most
     counted = np.zeros(32, int)

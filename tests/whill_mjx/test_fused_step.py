@@ -13,7 +13,7 @@ import pytest
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.config import VehicleConfig
-from whill_mjx.vehicle.dynamics import drive, place
+from whill_mjx.vehicle.dynamics import drive, nominal_world, place
 from whill_mjx.vehicle.kinematics import rotation_from_quaternion
 from whill_mjx.vehicle.model import VehicleModel, build_model, mujoco_model, wheel_bodies
 from whill_mjx.vehicle.presets import preset
@@ -43,7 +43,8 @@ def test_accelerations_equal_those_of_c_mujoco_for_any_state_and_heavy_wheels(se
                           data.qvel, data.qfrc_applied)
         )  # fmt: skip
         rotation = rotation_from_quaternion(qpos[3:7])
-        found = rigid.accelerations(model, mass, inertia, com, gravity, rotation, qvel, force)
+        world = replace(nominal_world(model), gravity=gravity)
+        found = rigid.accelerations(model, rigid.Chassis(mass, inertia, com), world, rotation, qvel, force)
     np.testing.assert_allclose(found, data.qacc, rtol=1e-9, atol=1e-9)
 
 

@@ -88,6 +88,19 @@ def test_derivatives_of_the_kernel_are_those_of_the_plain_steps():
         close(*(derivative(partial(end, function))(params["stiffness"]) for function in (in_kernel, pulled)))
 
 
+def test_a_drive_has_the_same_derivatives_in_both_directions():
+    spec, params = preset("whill_cr_paper")
+    model = build_model(spec, VehicleConfig(control_dt=0.005))
+    start = place(model, params, 0.0, 0.0, 0.0)
+
+    def speeds(command):
+        return drive(model, params, start, command).qvel
+
+    forward, backward = (jax.jit(derivative(speeds))(jnp.array([0.5, 0.2])) for derivative in (jax.jacfwd, jax.jacrev))
+    assert np.abs(forward).max() > 0.01
+    np.testing.assert_allclose(backward, forward, rtol=1e-4, atol=1e-6)
+
+
 @quick
 def test_a_step_that_the_kernel_lacks_is_refused_or_taken_without_it():
     def step(params, state, given):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, reset_state, step_state
-from whill_mjx.evaluation.planner import first_plan, for_task, plan_action, predicted_poses, predicted_return
+from whill_mjx.evaluation.planner import Begin, first_plan, for_task, plan_action, predicted_poses, predicted_return
 from whill_mjx.tasks.tasks import sample_world
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
@@ -60,10 +60,10 @@ def test_predicted_return_of_full_speed_over_an_open_field_is_that_of_the_reward
     open_field = scene.replace(boxes=no_boxes(1))
     config = for_task(env.task)
     start, straight = jnp.zeros(5), jnp.tile(jnp.array([1.0, 0.0]), (config.knots, 1))
-    value = float(predicted_return(config, env, open_field, start, jnp.zeros(2), straight))
+    value = float(predicted_return(config, env, Begin(open_field, start, jnp.zeros(2)), straight))
     periods = 4.3 + 0.29
     assert value == pytest.approx(100 + 30 * 4.35 - periods * 10 * (0.05 + config.hurry), abs=3.0)
-    blocked = float(predicted_return(config, env, scene, start, jnp.zeros(2), straight))
+    blocked = float(predicted_return(config, env, Begin(scene, start, jnp.zeros(2)), straight))
     assert blocked < value - 100
 
 

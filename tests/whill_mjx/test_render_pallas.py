@@ -13,6 +13,7 @@ from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_me
 
 from whill_mjx.world.materials import label_count, make_atlas, plain_finish
 from whill_mjx.world.render import Quality, camera_rotation, pinhole, render
+from whill_mjx.world.render.draw import draw
 from whill_mjx.world.render.pallas import Tiling, fast_level, fast_small, fast_whole, render_pallas
 from whill_mjx.world.scene import Boxes, Marker, Scene, default_looks
 from whill_mjx.world.solids import Solids, block, person, post, stack_rounds
@@ -135,3 +136,29 @@ def test_sums_replace_conversions():
 def test_tiles_that_triton_cannot_draw_are_refused():
     with pytest.raises(ValueError, match="columns is 12"):
         Tiling(8, 12)
+
+
+def test_an_image_is_drawn_by_the_kernel_on_nvidia_gpus_and_by_plain_jax_elsewhere(monkeypatch):
+    scene, lens = crowd(5), pinhole(1.0, 16, 16)
+
+    def picture(scene):
+        return draw(EYE, TURN, lens, scene, 16, 16)
+
+    assert "platform_index" not in str(jax.make_jaxpr(picture)(scene))  # no GPU: nothing of the kernel is traced
+    monkeypatch.setattr("whill_mjx.world.render.draw.runs_triton", lambda: True)
+    expected = jax.jit(lambda s: render(EYE, TURN, lens, s, 16, 16))(scene)
+    np.testing.assert_array_equal(jax.jit(picture)(scene), expected)
+    device = AbstractDevice("NVIDIA H200", None, "cuda")
+    with use_abstract_mesh(AbstractMesh((1,), ("one",), (AxisType.Auto,), abstract_device=device)):
+        assert "triton" in jax.jit(picture).trace(scene).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def test_what_is_computed_beside_an_image_keeps_its_derivative(monkeypatch):
+    monkeypatch.setattr("whill_mjx.world.render.draw.runs_triton", lambda: True)
+    scene, lens = crowd(5), pinhole(1.0, 16, 16)
+
+    def height_and_image(eye):
+        return eye[2] ** 2, draw(eye, TURN, lens, scene, 16, 16)
+
+    gradient, _ = jax.jit(jax.grad(height_and_image, has_aux=True))(EYE)
+    np.testing.assert_allclose(gradient, [0, 0, 2 * EYE[2]])

@@ -24,10 +24,12 @@ from whill_mjx.io import command_line
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.folders import FolderRefused
 from whill_mjx.learning.checks import Stopper, keep_best, read_best
-from whill_mjx.learning.setup import find_preset, functional_env, make_training_env, with_repeat
+from whill_mjx.learning.options import TrainOptions, choose_preset
+from whill_mjx.learning.setup import find_preset, functional_env, make_evaluation_env, with_repeat
 from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
+from whill_mjx.learning.trainings import Trained, best_params
 from whill_mjx.tasks.tasks import Corridor, ObstacleCourse, make_task
-from whill_mjx.train import Trained, TrainOptions, begin, best_params, choose_preset, main
+from whill_mjx.train import begin, main
 
 
 @pytest.fixture(scope="module")
@@ -355,7 +357,7 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
                                                   ("obstacle_course", "randomised", 1)])  # fmt: skip
 def test_the_mirror_shows_no_more_worlds_than_there_are(task, layout, worlds):
     preset = choose_preset(TrainOptions(preset="paper", task=task, layout=layout))
-    batch = make_training_env(preset.task, "whill_cr_ramp", 1)
+    batch = make_evaluation_env(preset.task, "whill_cr_ramp", 1)
     assert preset.learner.mirror == worlds <= functional_env(batch).mirror.worlds
     assert preset.task.layout == layout
 
@@ -388,8 +390,8 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
 
     monkeypatch.setattr("whill_mjx.learning.setup.make_batch", batched)
     monkeypatch.setattr("whill_mjx.learning.setup.make_env", noted)
-    monkeypatch.setattr("whill_mjx.train.train", stop)
-    monkeypatch.setattr("whill_mjx.train.train_ppo", stop)
+    monkeypatch.setattr("whill_mjx.learning.trainings.train", stop)
+    monkeypatch.setattr("whill_mjx.learning.trainings.train_ppo", stop)
     options = TrainOptions(out=tmp_path, vehicle=Path("whill_cr_ramp"), preset="smoke", exploring_starts=0.5,
                            second_tries=0.25, learner=learner)
     with pytest.raises(Enough):

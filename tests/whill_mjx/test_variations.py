@@ -51,7 +51,8 @@ def test_a_wrong_variation_is_refused(text, said):
 
 def test_a_training_takes_them_and_they_are_part_of_what_it_is():
     from whill_mjx.learning.identity import identity_of
-    from whill_mjx.train import TrainOptions, check, choose_preset
+    from whill_mjx.learning.options import TrainOptions, choose_preset
+    from whill_mjx.train import check
 
     options = TrainOptions(preset="smoke", vary=("body.mass=0.9x:1.1x",), spread=0.05)
     chosen = choose_preset(options)

@@ -173,8 +173,8 @@ def test_stiff_springs_shift_the_load_at_once_by_what_the_pull_asks_for():
     params = set_values(params, ["suspension.sag", "body.com_z", "command_delay.delay"], jnp.array([2e-5, 0.1, 0.0]))
     model = build_model(spec)
     state = place(model, params, 0.0, 0.0, 0.0)
-    _, _, rest = forces(model, params, state, jnp.zeros(2))
-    _, force, pulled = forces(model, params, state, jnp.array([1.0, 0.0]))
+    pull = jax.jit(lambda command: forces(model, params, state, command))
+    (_, _, rest), (_, force, pulled) = pull(jnp.zeros(2)), pull(jnp.array([1.0, 0.0]))
     height, mass = spec.wheel_radius + 0.1, float(params.body.mass)
     expected = float(force[0]) * height / spec.wheelbase
     shifted = float((pulled.normal_force - rest.normal_force)[:2].sum())
@@ -192,8 +192,9 @@ def test_bearings_stop_a_wheel_that_nothing_else_holds():
     model = build_model(spec)
     state = place(model, params, 0.0, 0.0, 0.0)
     state = state.replace(qvel=state.qvel.at[6:8].set(4.0))
+    period = jax.jit(lambda state: drive(model, params, state, jnp.zeros(2)))
     for _ in range(20):
-        state = drive(model, params, state, jnp.zeros(2))
+        state = period(state)
     decay = np.exp(-0.05 / spec.wheel_inertia * 20 * model.config.control_dt)
     np.testing.assert_allclose(state.qvel[6:8], 4.0 * decay, atol=0.02)
 

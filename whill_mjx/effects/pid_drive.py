@@ -5,13 +5,24 @@ from __future__ import annotations
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect
 from whill_mjx.effects.card import Card
 from whill_mjx.effects.planar import look_ahead
-from whill_mjx.effects.wheel_pid import PidMemory, pid, pid_memory
 from whill_mjx.vehicle.types import Drive, Motion, Wrench, parameter
+
+DERIVATIVE_FILTER = 0.03  # [s] time constant of the low-pass on the derivative
+
+
+@struct.dataclass
+class PidMemory:
+    """Integral of the error, last measured speed and its filtered derivative, per wheel."""
+
+    integral: jax.Array  # (2,)
+    measured: jax.Array  # (2,)
+    derivative: jax.Array  # (2,)
 
 
 @struct.dataclass
@@ -28,15 +39,37 @@ class PidDrive(Effect):
     integral_limit: jax.Array = parameter("m", 0.0, 3.0, 0.0, "anti-windup limit of the integral")
 
     def init(self) -> PidMemory:
-        return pid_memory()
+        return PidMemory(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
 
     def actuation(self, memory: PidMemory, drive: Drive, motion: Motion) -> tuple[PidMemory, Drive]:
         """Adds the force (2,) of each side [N]."""
         speed = motion.spin * motion.wheel_radius
-        memory, acceleration = pid(
-            self.kp, self.ki, self.kd, self.integral_limit, memory, drive.target, speed, motion.dt
-        )
+        memory, acceleration = self.control(memory, drive.target, speed, motion.dt)
         return memory, replace(drive, force=drive.force + motion.mass / 2 * acceleration)
+
+    def control(
+        self, memory: PidMemory, target: jax.Array, measured: jax.Array, dt: float
+    ) -> tuple[PidMemory, jax.Array]:
+        """kp e + ki clip(integral of e, +-limit) - kd d(measured)/dt per wheel, with e = target - measured.
+
+        The derivative is of the measurement, not of the error: a step of the target would otherwise kick the vehicle
+        with kd * step / dt, which depends on the time step. It is low-passed: an acceleration fed back within one
+        physics step would oscillate at kd near 1.
+
+        Args:
+            memory: from `init` or the previous call.
+            target, measured: (2,) speeds.
+            dt: time since the previous call [s].
+
+        Returns:
+            New memory, and the control output (2,).
+        """
+        error, limit = target - measured, self.integral_limit
+        integral = jnp.clip(memory.integral + error * dt, -limit, limit)
+        slope = (measured - memory.measured) / dt
+        derivative = memory.derivative + (slope - memory.derivative) * dt / (dt + DERIVATIVE_FILTER)
+        output = self.kp * error + self.ki * integral - self.kd * derivative
+        return PidMemory(integral, measured, derivative), output
 
 
 @struct.dataclass

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,39 @@ class PlannerConfig:
     """Time constants with which speed and yaw rate follow the ramp [s]; those of the built-in vehicle."""
 
 
+class Effort(NamedTuple):
+    """How long and how far one search looks around the plan that it begins with."""
+
+    rounds: int
+    samples: int
+    width: float
+    """Over the usual spread."""
+
+
+class Begin(NamedTuple):
+    """What a plan begins with."""
+
+    scene: Scene
+    motion: jax.Array
+    """(5,) true x, y, yaw, v, omega."""
+    command: jax.Array
+    """(2,) speed and yaw rate commanded last."""
+    step_count: jax.Array | int = 0
+    """() control periods that have passed."""
+
+
+class Period(NamedTuple):
+    """One step of the planner's own model, as a task's rewards and endings see it."""
+
+    pose: jax.Array
+    twist: jax.Array
+    command: jax.Array
+    earlier: jax.Array
+    distance: jax.Array
+    farther: jax.Array
+    time_s: jax.Array
+
+
 def for_task(task: Task) -> PlannerConfig:
     """Settings that suit a task's speed: slow tasks look further ahead with longer steps."""
     if task.v_max >= 0.8:
@@ -71,9 +105,9 @@ def for_task(task: Task) -> PlannerConfig:
 def first_plan(config: PlannerConfig, env: Env, state: State, key: jax.Array) -> jax.Array:
     """Plan (knots, 2) of actions for an episode that begins: a search from full speed straight on."""
     straight = jnp.tile(jnp.array([1.0, 0.0]), (config.knots, 1))
-    plans, values = jax.vmap(
-        lambda key: _search(config, env, state, straight, key, config.first_rounds, config.first_samples, 2.0)
-    )(jax.random.split(key, config.starts))
+    effort = Effort(config.first_rounds, config.first_samples, 2.0)
+    keys = jax.random.split(key, config.starts)
+    plans, values = jax.vmap(lambda key: _search(config, env, state, straight, key, effort))(keys)
     return plans[jnp.argmax(values)]
 
 
@@ -89,51 +123,33 @@ def plan_action(
         plan: (knots, 2) actions, the first one now; from the previous step or `first_plan`.
         key: random key.
     """
-    plan, _ = _search(config, env, state, plan, key, config.rounds, config.samples, 0.4)
+    plan, _ = _search(config, env, state, plan, key, Effort(config.rounds, config.samples, 0.4))
     return plan[0], _later(config, plan, env.model.config.control_dt * env.task.action_repeat)
 
 
 def _search(
-    config: PlannerConfig,
-    env: Env,
-    state: State,
-    plan: jax.Array,
-    key: jax.Array,
-    rounds: int,
-    samples: int,
-    width: float,
+    config: PlannerConfig, env: Env, state: State, plan: jax.Array, key: jax.Array, effort: Effort
 ) -> tuple[jax.Array, jax.Array]:
-    """Best plan (knots, 2) of the last of some rounds that begin around `plan`, `width` times the usual spread.
-
-    Also its predicted return ().
-    """
-    start = _start(env, state)
-    score = jax.vmap(
-        lambda actions: predicted_return(config, env, state.scene, start, state.command, actions, state.step_count)
-    )
+    """Best plan (knots, 2) of the last of some rounds that begin around `plan`, and its predicted return ()."""
+    begin = Begin(state.scene, _start(env, state), state.command, state.step_count)
+    score = jax.vmap(lambda actions: predicted_return(config, env, begin, actions))
 
     def one_round(carry, round_key):
         mean, deviation = carry
-        noise = jax.random.normal(round_key, (samples, config.knots, 2))
+        noise = jax.random.normal(round_key, (effort.samples, config.knots, 2))
         tried = jnp.clip(mean + deviation * noise.at[0].set(0.0), -1.0, 1.0)
         values, order = jax.lax.top_k(score(tried), config.elites)
         elite = tried[order]
         return (elite.mean(0), elite.std(0) + 0.01), (elite[0], values[0])
 
-    deviation = jnp.broadcast_to(width * jnp.array([config.spread_v, config.spread_omega]), plan.shape)
-    _, (best, values) = jax.lax.scan(one_round, (plan, deviation), jax.random.split(key, rounds))
+    deviation = jnp.broadcast_to(effort.width * jnp.array([config.spread_v, config.spread_omega]), plan.shape)
+    _, (best, values) = jax.lax.scan(one_round, (plan, deviation), jax.random.split(key, effort.rounds))
     return best[-1], values[-1]
 
 
-def predicted_return(
-    config: PlannerConfig, env: Env, scene: Scene, start: jax.Array, before: jax.Array, actions: jax.Array,
-    step_count: jax.Array | int = 0,
-) -> jax.Array:  # fmt: skip
-    """() return of a profile (knots, 2) in the planner's own model, less the cost of passing too close.
-
-    `start` (5,) is x, y, yaw, v, omega; `before` (2,) the speed and yaw rate commanded last;
-    `step_count` () control periods have passed.
-    """
+def predicted_return(config: PlannerConfig, env: Env, begin: Begin, actions: jax.Array) -> jax.Array:
+    """() return of a profile (knots, 2) in the planner's own model, less the cost of passing too close."""
+    scene, start, before, step_count = begin
     task, dt = env.task, config.horizon_s / config.steps
     goal = task.goal(scene)
     periods = dt / env.model.config.control_dt  # control periods per step of this model
@@ -147,7 +163,8 @@ def predicted_return(
     near = _touches(config, env, scene, poses, config.margin)
     time_s = step_count * jnp.array(env.model.config.control_dt, float) + dt * jnp.arange(1, config.steps + 1)
 
-    def look(pose, twist, command, earlier, distance, farther, time_s):
+    def look(period: Period):
+        pose, twist, command, earlier, distance, farther, time_s = period
         body = footprint(env.model.spec, pose[0], pose[1], pose[2])
         collided = touches(body, obstacles_of(scene, body.x, body.y))
         reached = (distance <= task.goal_radius) & ~collided
@@ -158,7 +175,7 @@ def predicted_return(
         ends = jnp.stack([jnp.asarray(holds, bool) for holds in task.endings(moment).values()])
         return {name: jnp.asarray(value, float) for name, value in task.rewards(moment).items()}, jnp.any(ends)
 
-    terms, ends = jax.vmap(look)(poses, speeds, commands, earlier, distance, farther, time_s)
+    terms, ends = jax.vmap(look)(Period(poses, speeds, commands, earlier, distance, farther, time_s))
     for name in task.per_period:
         if name in terms:
             terms[name] = terms[name] * periods
@@ -180,7 +197,7 @@ def predicted_motion(
     """Poses (T, 3) x, y, yaw and speeds (T, 2) v, omega after each of commands (T, 2), held for dt [s].
 
     The planner's own model is a unicycle: speed and yaw rate follow a ramp towards the command with a first-order lag.
-    `start` and `before` are those of `predicted_return`.
+    `start` and `before` are motion and command of `Begin`.
     """
     limit = jnp.array([config.acceleration, 2.0 * config.acceleration / env.model.spec.track])
     lag = jnp.array(config.lag)

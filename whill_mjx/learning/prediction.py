@@ -9,7 +9,7 @@ import numpy as np
 
 from dreamer import video
 from dreamer.types import Params
-from whill_mjx.learning.setup import Preset, functional_env, make_training_env
+from whill_mjx.learning.setup import Preset, functional_env, make_evaluation_env
 
 SEEN, FORETOLD = 5, 40  # control periods that are shown to the model, and that are not
 
@@ -30,7 +30,7 @@ def write_prediction(
     """
     periods = preset.task.action_repeat
     context, steps = max(2, SEEN // periods), max(8, (SEEN + FORETOLD) // periods)
-    env = functional_env(make_training_env(preset.task, vehicle, drives), preset.safety, shaped=False)
+    env = functional_env(make_evaluation_env(preset.task, vehicle, drives), preset.safety, shaped=False)
 
     @jax.jit
     def foretell(params: Params, key: jax.Array) -> tuple[jax.Array, jax.Array]:

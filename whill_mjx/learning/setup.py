@@ -359,13 +359,19 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
     return Mirror(other_obs, other_action, worlds=PAINTS if paints else 1)
 
 
-def make_training_env(
-    task: Task, vehicle: str | Path | None, instances: int, spread: float = 0.0, devices: tuple = (),
-    exploring_starts: float = 0.0, second_tries: float = 0.0, looks: str | None = None, vary: Sequence[str] = (),
-) -> BatchEnv:  # fmt: skip
-    """`instances` chairs of a vehicle file or preset in a task, split over `devices`; for the rest see `Preset`."""
-    env, params = make_env(task, vehicle, exploring_starts=exploring_starts, looks=looks)
-    return make_batch(env, params, instances, spread, devices, second_tries, variations_of(vary, vehicle))
+def make_training_env(preset: Preset, vehicle: str | Path | None, devices: tuple = ()) -> BatchEnv:
+    """A preset's chairs, of a vehicle file or built-in vehicle, as it trains them; split over `devices`."""
+    env, params = make_env(preset.task, vehicle, exploring_starts=preset.exploring_starts, looks=preset.looks)
+    variations = variations_of(preset.vary, vehicle)
+    return make_batch(env, params, preset.instances, preset.spread, devices, preset.second_tries, variations)
+
+
+def make_evaluation_env(
+    task: Task, vehicle: str | Path | None, instances: int, looks: str | None = None, devices: tuple = ()
+) -> BatchEnv:
+    """`instances` chairs of a vehicle file or built-in vehicle in a task: each as the file says, from the start."""
+    env, params = make_env(task, vehicle, exploring_starts=0.0, looks=looks)
+    return make_batch(env, params, instances, 0.0, devices, 0.0)
 
 
 def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Variation, ...]:

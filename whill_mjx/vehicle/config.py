@@ -18,7 +18,7 @@ class VehicleConfig:
     dynamics: str = "fused"
     """How a physics step is computed: "fused" takes the rigid bodies in closed form and everything on single numbers,
     so that it compiles into few kernels; "mjx" calls `mjx.step`. Both give the same motion to rounding."""
-    kernel: bool | None = False
+    kernel: bool | None = None
     """Whether all physics steps of a control period are one GPU kernel (`vehicle/kernel.py`), with "fused" dynamics.
     None: on NVIDIA GPUs since Ampere, for effects whose operations it has. True interprets it elsewhere: slow."""
     limited: bool = True

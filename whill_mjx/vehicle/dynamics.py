@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.devices import runs_triton
 from whill_mjx.effects.base import (
     apply_chain,
     contact_wrench,
@@ -18,7 +19,7 @@ from whill_mjx.effects.base import (
 from whill_mjx.effects.planar import by_mode, spin_response
 from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.ground import footing, plane_under
-from whill_mjx.vehicle.kernel import Roll, held_in_registers, suits_device
+from whill_mjx.vehicle.kernel import Roll, held_in_registers
 from whill_mjx.vehicle.kinematics import (
     body_twist,
     heading,
@@ -116,7 +117,7 @@ def drive(model: VehicleModel, params: VehicleParams, state: VehicleState, comma
     def plain(params: VehicleParams, state: VehicleState, command: jax.Array) -> VehicleState:
         return substeps(model, params, state, jnp.broadcast_to(command, (config.substeps, 2)))
 
-    wanted = suits_device() if config.kernel is None else config.kernel
+    wanted = runs_triton() if config.kernel is None else config.kernel
     if config.dynamics != "fused" or not wanted:
         return plain(params, state, command)
     roll = Roll(partial(one_step, model), config.substeps, plain)
@@ -227,28 +228,24 @@ def integrate(
 ) -> tuple[jax.Array, jax.Array]:
     """qpos (9,) and qvel (8,) one physics step on, under the generalised force (8,)."""
     if model.config.dynamics == "fused":
-        return rigid.step(
-            model, *mass_distribution(model, params, world), world.gravity, state.qpos, state.qvel, force,
-            world.wheel_inertia,
-        )
+        chassis = mass_distribution(model, params, world)
+        return rigid.step(model, chassis, world, state.qpos, state.qvel, force)
     mjx = import_mjx()
     data = model.data.replace(qpos=state.qpos, qvel=state.qvel, qfrc_applied=force)
     data = mjx.step(instance_model(model, params, world), data)
     return rigid.moved(state.qpos, (state.qvel + data.qvel) / 2, model.config.physics_dt), data.qvel
 
 
-def mass_distribution(
-    model: VehicleModel, params: VehicleParams, world: World
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mass (), inertia (3,) about the centre of mass and centre of mass (3,) of this instance's chassis body."""
+def mass_distribution(model: VehicleModel, params: VehicleParams, world: World) -> rigid.Chassis:
+    """Mass, inertia and centre of mass of this instance's chassis body."""
     body = params.body
     roll, pitch, _ = box_inertia(model.spec)
     scale = body.mass / model.spec.mass
     inertia = jnp.stack([roll * scale, pitch * scale, body.yaw_inertia])
     com = jnp.stack([body.com_x, body.com_y, body.com_z])
     if world.payload is None:
-        return body.mass, inertia, com
-    return add_payload(body.mass, inertia, com, world.payload)
+        return rigid.Chassis(body.mass, inertia, com)
+    return rigid.Chassis(*add_payload(body.mass, inertia, com, world.payload))
 
 
 def instance_model(model: VehicleModel, params: VehicleParams, world: World):

@@ -101,12 +101,6 @@ def held_in_registers(
     return jax.tree.map(lambda leaf: leaf[0], instances(*alone))
 
 
-def suits_device() -> bool:
-    """Whether the default device is an NVIDIA GPU with the instructions that `ptx.py` writes (Ampere or later)."""
-    capability = str(getattr(jax.devices()[0], "compute_capability", ""))
-    return capability.replace(".", "", 1).isdigit() and float(capability) >= 8.0
-
-
 def _lacking(traced: Any) -> str:
     """What a closed jaxpr needs that the kernel lacks; "" where it has all."""
     names = {one.primitive.name for one in traced.jaxpr.eqns} - PRIMITIVES

@@ -15,30 +15,39 @@ damped enough for that, and no stiffer than a step carries (vehicle.py). Source:
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from whill_mjx.vehicle.kinematics import rotation_from_quaternion
 from whill_mjx.vehicle.model import VehicleModel
+from whill_mjx.vehicle.types import World
+
+
+class Chassis(NamedTuple):
+    """Mass distribution of the chassis body."""
+
+    mass: jax.Array  # () kg
+    inertia: jax.Array  # (3,) kg m^2, about its centre of mass
+    com: jax.Array  # (3,) m
 
 
 def step(
-    model: VehicleModel, mass: jax.Array, inertia: jax.Array, com: jax.Array, gravity: jax.Array,
-    qpos: jax.Array, qvel: jax.Array, force: jax.Array, armature: jax.Array | float = 1.0,
-) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    model: VehicleModel, chassis: Chassis, world: World, qpos: jax.Array, qvel: jax.Array, force: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """qpos (9,) and qvel (8,) one physics step on.
 
     Args:
         model: static model.
-        mass, inertia, com: of the chassis body, () kg, (3,) kg m^2 about its centre of mass, (3,) m.
-        gravity: (3,) in the world frame [m/s^2].
+        chassis: of this instance.
+        world: its gravity, and its inertia of the wheels over the model's.
         qpos, qvel: the present state.
         force: (8,) as MuJoCo's qfrc_applied.
-        armature: of the wheels, over the model's.
     """
     dt = model.config.physics_dt
     rotation = rotation_from_quaternion(qpos[3:7])
-    acceleration = accelerations(model, mass, inertia, com, gravity, rotation, qvel, force, armature)
+    acceleration = accelerations(model, chassis, world, rotation, qvel, force)
     return moved(qpos, qvel + acceleration * (dt / 2), dt), qvel + acceleration * dt
 
 
@@ -48,10 +57,10 @@ def moved(qpos: jax.Array, qvel: jax.Array, dt: float) -> jax.Array:
 
 
 def accelerations(
-    model: VehicleModel, mass: jax.Array, inertia: jax.Array, com: jax.Array, gravity: jax.Array,
-    rotation: jax.Array, qvel: jax.Array, force: jax.Array, armature: jax.Array | float = 1.0,
-) -> jax.Array:  # fmt: skip
+    model: VehicleModel, chassis: Chassis, world: World, rotation: jax.Array, qvel: jax.Array, force: jax.Array
+) -> jax.Array:
     """qacc (8,): M^-1 (force - bias). Arguments as of `step`, with the rotation (3, 3), chassis to world."""
+    mass, inertia, com = chassis
     wheels = model.wheels
     total = mass + 2 * wheels.mass
     middle = jnp.array([wheels.x, 0.0, 0.0])  # of both wheels
@@ -62,7 +71,7 @@ def accelerations(
         about = about + _parallel(wheels.mass, jnp.array([wheels.x, side, 0.0]) - centre)
     rate, spin = qvel[3:6], qvel[6:8]
     push = rotation.T @ force[:3]
-    hinge = wheels.inertia + wheels.armature * armature
+    hinge = wheels.inertia + wheels.armature * world.wheel_inertia
     torque, wheel_torque = force[3:6], force[6:8]
     turning = about @ rate + jnp.array([0.0, 1.0, 0.0]) * wheels.inertia * (spin[0] + spin[1])  # angular momentum
     moment = torque - _cross(centre, push) - _cross(rate, turning)
@@ -72,7 +81,7 @@ def accelerations(
     angular = solve_symmetric(held, moment)
     linear = push / total + _cross(centre, angular) - _cross(rate, _cross(rate, centre))
     wheel = (wheel_torque - wheels.inertia * angular[1]) / hinge
-    return jnp.concatenate([rotation @ linear + gravity, angular, wheel])
+    return jnp.concatenate([rotation @ linear + world.gravity, angular, wheel])
 
 
 def solve_symmetric(matrix: jax.Array, vector: jax.Array) -> jax.Array:

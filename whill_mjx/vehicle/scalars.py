@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import operator
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import cache, reduce
 from typing import Any
 
 import jax
@@ -251,7 +251,13 @@ def _contracted_last(operand: Elements, axes: tuple[int, ...]) -> Elements:
 
 def _binary(name: str, a: Any, b: Any) -> Any:
     dtype = next(np.dtype(value.dtype) for value in (a, b))
-    return _combine(BINARY[name], {}, [a, b], dtype)
+    return _combine(BINARY[name], _product_parameters() if name == "mul" else {}, [a, b], dtype)
+
+
+@cache
+def _product_parameters() -> dict:
+    """What this version of JAX notes on a product; its reverse-mode rule asks for it."""
+    return jax.make_jaxpr(jax.lax.mul)(1.0, 1.0).jaxpr.eqns[0].params
 
 
 def _whole(equation: Any, operands: list[Parts]) -> list[Parts]:

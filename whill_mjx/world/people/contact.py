@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from whill_mjx.world.people.crowd import People, join
 from whill_mjx.world.people.law import walk
 from whill_mjx.world.scene import Footprint, Scene
 
+Ends = tuple[jax.Array, jax.Array]
+"""Both ends (N, PARTS, 3) [m] of the axes of people's capsules."""
 STANDING = 0.05
 """Speed towards a person below which the vehicle stands, as far as contact is concerned [m/s]."""
 FASTEST_FOOT = 4.8
@@ -51,6 +54,24 @@ def poses_among_people(speed: float, yaw_rate: float, duration: float, half_leng
     return max(1, math.ceil(duration * fastest / DEPTH))
 
 
+def _distances_to(people: People, first: Ends, last: Ends) -> Callable[[Footprint, jax.Array], jax.Array]:
+    """(vehicle, share () of the period) -> (N,) m from it to each person, whose parts move from `first` to `last`."""
+    radius = people.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
+
+    def apart(footprint: Footprint, share: jax.Array) -> jax.Array:
+        start, end = (a[:, : body.TOUCHING] + share * (b - a)[:, : body.TOUCHING]
+                      for a, b in zip(first, last, strict=True))  # fmt: skip
+        low = jnp.minimum(start[..., 2], end[..., 2]) - radius
+        there = jnp.broadcast_to(people.there[:, None], low.shape)
+        parts = (start[..., :2], end[..., :2], radius, low, there)
+        stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
+        far = distances(footprint, stadiums)
+        met = stadiums.mask & (stadiums.low < footprint.height)
+        return jnp.where(met, far, jnp.inf).reshape(-1, body.TOUCHING).min(-1)
+
+    return apart
+
+
 def walk_around(
     scene: Scene, before: Footprint, after: Footprint, duration: float, poses: int
 ) -> tuple[Scene, jax.Array, jax.Array]:
@@ -73,7 +94,7 @@ def walk_around(
     # The barriers keep XLA from computing the walk and the contacts again for each thing that needs them.
     walked = jax.lax.optimization_barrier(walked)
     last = jax.lax.optimization_barrier(body.skeleton(walked))
-    radius = people.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
+    apart = _distances_to(people, first, last)
     turn = duration * mover.yaw_rate
 
     def vehicle(share):
@@ -83,18 +104,6 @@ def walk_around(
             y=before.y + share * (after.y - before.y),
             yaw=before.yaw + share * turn,
         )
-
-    def apart(footprint: Footprint, share: jax.Array) -> jax.Array:
-        """(N,) m from a vehicle to each person at a share () of the period."""
-        start, end = (a[:, : body.TOUCHING] + share * (b - a)[:, : body.TOUCHING]
-                      for a, b in zip(first, last, strict=True))  # fmt: skip
-        low = jnp.minimum(start[..., 2], end[..., 2]) - radius
-        there = jnp.broadcast_to(people.there[:, None], low.shape)
-        parts = (start[..., :2], end[..., :2], radius, low, there)
-        stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
-        far = distances(footprint, stadiums)
-        met = stadiums.mask & (stadiums.low < footprint.height)
-        return jnp.where(met, far, jnp.inf).reshape(-1, body.TOUCHING).min(-1)
 
     shares = jnp.arange(1, poses + 1) / poses
     hits = jax.vmap(lambda share: apart(vehicle(share), share) <= 0.0)(shares)  # (poses, N)

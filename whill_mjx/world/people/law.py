@@ -148,11 +148,9 @@ def _aside_from_people(people: People, desired: jax.Array, looks: jax.Array) -> 
     apart = people.position[None] - people.position[:, None]  # (N, N, 2): from each one to each other
     distance = _length(apart)
     other = ~jnp.eye(distance.shape[0], dtype=bool) & people.there
-    velocity = people.velocity
-    return _influence(
-        apart, distance, 2 * RADIUS, other, velocity[:, None], velocity[None], desired[:, None], looks[:, None],
-        looks[None],
-    ).sum(1)  # fmt: skip
+    own, theirs = people.velocity[:, None], people.velocity[None]
+    person = Person(own, desired[:, None], looks[:, None])
+    return _influence(person, Neighbour(apart, distance, 2 * RADIUS, other, theirs, looks[None], apart)).sum(1)
 
 
 def _aside_from_mover(people: People, desired: jax.Array, looks: jax.Array, mover: Mover) -> jax.Array:
@@ -163,23 +161,42 @@ def _aside_from_mover(people: People, desired: jax.Array, looks: jax.Array, move
     apart = nearest - people.position
     drives = _unit(velocity, jnp.broadcast_to(mover.axis, velocity.shape))
     # Which side to pass is decided by the middle of the vehicle, for its nearest point lies straight ahead.
-    return _influence(
-        apart, _length(apart), RADIUS, people.yields, people.velocity, velocity, desired, looks, drives,
-        beside=mover.centre - people.position,
-    )  # fmt: skip
+    vehicle = Neighbour(apart, _length(apart), RADIUS, people.yields, velocity, drives, mover.centre - people.position)
+    return _influence(Person(people.velocity, desired, looks), vehicle)
 
 
-def _influence(apart, distance, contact, counts, own, other, desired, looks, other_looks, beside=None) -> jax.Array:
+class Person(NamedTuple):
+    """Who is turned aside; vectors (..., 2)."""
+
+    velocity: jax.Array  # [m/s]
+    desired: jax.Array  # direction
+    looks: jax.Array  # direction
+
+
+class Neighbour(NamedTuple):
+    """Who turns a person aside: another one, or the vehicle."""
+
+    apart: jax.Array  # (..., 2) m, from the person to it
+    distance: jax.Array  # (...) m
+    contact: float  # distance at which both touch [m]
+    counts: jax.Array  # (...) bool, whether it is one for this person
+    velocity: jax.Array  # (..., 2) m/s
+    looks: jax.Array  # (..., 2) direction
+    beside: jax.Array  # (..., 2) m, from the person to the point that is passed on one side
+
+
+def _influence(person: Person, neighbour: Neighbour) -> jax.Array:
     """(..., 2) the direction square to the desired one in which a neighbour turns a person, times its strength."""
-    towards = apart / jnp.maximum(distance, 1e-6)[..., None]
-    perceived = (_dot(desired, towards) >= 0.0) | (_dot(looks, towards) >= 0.0)  # Eq. 1
-    closing = _dot(own - other, towards) * ANTICIPATION
-    gap = jnp.maximum(distance - contact - closing, 0.0)  # Eq. 2
-    strength = STRENGTH * (1.0 + ALIGNMENT * (1.0 - _dot(desired, other_looks))) * jnp.exp(-gap / REACH)
-    later = (apart if beside is None else beside) + other * ANTICIPATION
+    desired = person.desired
+    towards = neighbour.apart / jnp.maximum(neighbour.distance, 1e-6)[..., None]
+    perceived = (_dot(desired, towards) >= 0.0) | (_dot(person.looks, towards) >= 0.0)  # Eq. 1
+    closing = _dot(person.velocity - neighbour.velocity, towards) * ANTICIPATION
+    gap = jnp.maximum(neighbour.distance - neighbour.contact - closing, 0.0)  # Eq. 2
+    strength = STRENGTH * (1.0 + ALIGNMENT * (1.0 - _dot(desired, neighbour.looks))) * jnp.exp(-gap / REACH)
+    later = neighbour.beside + neighbour.velocity * ANTICIPATION
     left = jnp.stack([-desired[..., 1], desired[..., 0]], -1)
     side = jnp.where(_dot(left, later) >= 0.0, -1.0, 1.0)  # Eq. 5; to the right where it does not matter
-    return jnp.where(perceived & counts, strength * side, 0.0)[..., None] * left
+    return jnp.where(perceived & neighbour.counts, strength * side, 0.0)[..., None] * left
 
 
 def _room_among_people(people: People, way: jax.Array) -> jax.Array:

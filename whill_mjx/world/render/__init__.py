@@ -6,6 +6,8 @@
     shading     colour of what a ray meets: light, shadow, texture, fog, anti-aliasing
     culling     which primitives a part of the image can show
     image       the renderer in jnp
+    pallas      the same as a GPU kernel
+    draw        the one of the two that suits the device
 """
 
 from whill_mjx.world.render.camera import Intrinsics, camera_rotation, look_at, pinhole

@@ -63,7 +63,8 @@ def render(
     Raises:
         ValueError: more primitives than labels, or a finish of another scene.
     """
-    view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality)
+    view, finite = make_view(position, rotation, intrinsics, scene)
+    stage = _stage(view, scene, width, quality)
     row, column = _grid(height, width)
     word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
     return unpack_colours(jnp.where(finite, word, jnp.uint32(0)))
@@ -84,7 +85,8 @@ def render_frame(
     Depth, labels and, with `normals`, normals are those at the pixel centres. A pose that is not finite is labelled sky
     at depth inf.
     """
-    view, stage, finite = _prepare(position, rotation, intrinsics, scene, width, quality, normals)
+    view, finite = make_view(position, rotation, intrinsics, scene)
+    stage = _stage(view, scene, width, quality, normals)
     row, column = _grid(height, width)
     word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
     rays = pixel_view(view, stage, row, column)
@@ -128,8 +130,8 @@ def _grid(height: int, width: int) -> tuple[jax.Array, jax.Array]:
     return (jax.lax.broadcasted_iota(jnp.float32, (height, width), axis) for axis in (0, 1))  # type: ignore[return-value]
 
 
-def _prepare(position, rotation, intrinsics, scene: Scene, width: int, quality: Quality, rows: bool = False):
-    view, finite = make_view(position, rotation, intrinsics, scene)
+def _stage(view: View, scene: Scene, width: int, quality: Quality, rows: bool = False) -> Arrays:
+    """What every pixel meets."""
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows, rows)
     # The barrier keeps XLA from computing the numbers of a box again in every pixel.
@@ -139,7 +141,7 @@ def _prepare(position, rotation, intrinsics, scene: Scene, width: int, quality: 
         bounds = upright_bounds(view, parts.boxes)
         lists = jax.lax.optimization_barrier(strip_lists(bounds, view, width, quality.strips, quality.keep))
     atlas = None if scene.finish is None else scene.finish.atlas
-    return view, Arrays(parts, tables, lit_words(scene), lists, atlas), finite
+    return Arrays(parts, tables, lit_words(scene), lists, atlas)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +86,22 @@ class Inputs:
     materials: Any = None  # (labels * NUMBERS,) of rich looks
 
 
+class Kind(NamedTuple):
+    """Solids of one kind: what the kernel reads of each, whether it is there, and of its shadow."""
+
+    table: Any  # (N, numbers)
+    mask: jax.Array
+    shadow: jax.Array | None
+
+
+class Tile(NamedTuple):
+    """A part of the image [pixels]."""
+
+    top: jax.Array
+    left: jax.Array
+    shape: tuple[int, int]
+
+
 def render_pallas(
     position: jax.Array,
     rotation: jax.Array,
@@ -102,13 +118,14 @@ def render_pallas(
     Args:
         position, rotation, intrinsics, scene, height, width, quality: as `render`; `quality.keep` has no meaning here,
             for nothing is left out.
-        tiling: how the image is cut.
+        tiling: how the image is cut; None takes larger tiles for plain looks, and for rich ones a pixel per thread, whose
+            many numbers then fit into its registers.
         interpret: run on any device, slowly, to test.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
-    tiling = tiling or Tiling()
+    tiling = tiling or (Tiling() if scene.rich is None else Tiling(8, 4))
     inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
     static = _static(scene, tiling, interpret)
@@ -125,7 +142,7 @@ def render_pallas(
         data = jax.tree.unflatten(tree, read)
         view = rebuild(data)
         rows, columns = row.astype(jnp.float32), column.astype(jnp.float32)
-        limits = _tile_limits(view, quality, rows, columns, top, left, shape)
+        limits = _tile_limits(view, quality, rows, columns, Tile(top, left, shape))
         stage = Refs(data, limits, view, **static)
         colours = pixel_colours(view, stage, quality, rows, columns)
         word = jnp.where(data.integers[1] != 0, pack_channels(stage, colours), np.uint32(0))
@@ -180,15 +197,15 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows)
     sun, corners = scene.looks.sun, {}
-    kinds = {"upright": (tables.upright, parts.boxes.mask, tables.upright_shadow)}
+    kinds = {"upright": Kind(tables.upright, parts.boxes.mask, tables.upright_shadow)}
     corners["upright"] = culling.upright_corners(parts.boxes)
     if parts.blocks is not None:
-        kinds["block"] = (tables.block, parts.blocks.mask, tables.block_shadow)  # type: ignore[assignment]
+        kinds["block"] = Kind(tables.block, parts.blocks.mask, tables.block_shadow)
         corners["block"] = culling.block_corners(parts.blocks)
     if parts.rounds is not None:
-        kinds["round"] = (tables.round, parts.rounds.mask, tables.round_shadow)  # type: ignore[assignment]
+        kinds["round"] = Kind(tables.round, parts.rounds.mask, tables.round_shadow)
         corners["round"] = culling.round_corners(parts.rounds)
-    listed = {name: _listed(view, corners[name], sun, *rest, sort) for name, rest in kinds.items()}
+    listed = {name: _listed(view, corners[name], sun, kind, sort) for name, kind in kinds.items()}
 
     seed = view.looks.seed.astype(jnp.uint32)
     integers = jnp.stack([jax.lax.bitcast_convert_type(seed, jnp.int32), finite.astype(jnp.int32)])
@@ -224,8 +241,9 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
     return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials), rebuild
 
 
-def _listed(view: View, corners, sun, table, mask, shadow, sort: bool) -> Listed:
+def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
     """Rectangles of one kind, padded to whole chunks; with `sort` in front-to-back order where there are several."""
+    table, mask, shadow = kind
     count = table.shape[0]
     extra = -count % CHUNK
     boxes = culling.bounds(view, corners, mask, culling.EDGES)
@@ -252,13 +270,13 @@ def _first_labels(scene: Scene) -> dict[str, int]:
     return {"upright": MARKER, "block": parts.first_block, "round": parts.first_round}
 
 
-def _tile_limits(view: View, quality: Quality, row, column, top, left, shape) -> tuple:
+def _tile_limits(view: View, quality: Quality, row, column, tile: Tile) -> tuple:
     """Smallest and largest u and v of a tile: of its edges, or of its very rays where the lens distorts."""
     intrinsics = view.intrinsics
     if intrinsics.distortion is None:
         inverse_x, inverse_y = 1.0 / intrinsics.fx, 1.0 / intrinsics.fy
-        u = [(left + offset - intrinsics.cx) * inverse_x for offset in (0, shape[1])]
-        v = [(top + offset - intrinsics.cy) * inverse_y for offset in (0, shape[0])]
+        u = [(tile.left + offset - intrinsics.cx) * inverse_x for offset in (0, tile.shape[1])]
+        v = [(tile.top + offset - intrinsics.cy) * inverse_y for offset in (0, tile.shape[0])]
         return (*u, *v)
     limits = None
     for shift in SAMPLES if quality.antialias else ((0.5, 0.5),):

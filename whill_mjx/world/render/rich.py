@@ -33,12 +33,12 @@ def material_table(materials: Any) -> jax.Array:
     return jnp.concatenate(columns, 1)
 
 
-def shade_rich(view: Any, stage: Any, rays: Rays, code, solid, seen, depth) -> list:
+def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     """Three arrays: the root of the linear light that comes from what rays meet, or of the sky."""
-    lights, seed = view.lights, view.looks.seed
-    depth = jnp.where(seen, depth, 0.0)
+    lights, seed, seen = view.lights, view.looks.seed, hit.seen
+    depth = jnp.where(seen, hit.depth, 0.0)
     point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
-    code = jnp.where(solid, code, 4 * GROUND)
+    code = jnp.where(hit.solid, hit.code, 4 * GROUND)
     row, m = stage.row(code), stage.material(code >> 2)
     normal = face_normal(row, *point)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)

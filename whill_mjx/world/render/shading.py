@@ -181,7 +181,7 @@ def shade(view: View, stage: Stage, quality: Quality, rays: Rays, hit: Hit) -> l
     if not stage.lit_words or stage.first_bent is not None or quality != Quality():
         rays, hit = stage.settle((rays, hit))
     if view.lights is not None:
-        return shade_rich(view, stage, rays, hit.code, hit.solid, hit.seen, hit.depth)
+        return shade_rich(view, stage, rays, hit)
     looks, origin = view.looks, view.position
     box, seen = hit.solid, hit.seen
     depth = jnp.where(seen, hit.depth, 0.0)

@@ -9,6 +9,7 @@ face is seen edge-on. Flat colours; upright boxes, marker and blocks; no texture
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,10 +51,10 @@ def render_soft(
     boxes = parts.boxes
     c, s, zero = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw), jnp.zeros_like(boxes.yaw)
     frames = jnp.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], 1).reshape(-1, 3, 3)
-    kinds = [(boxes.centre, boxes.half, frames, boxes.colour, boxes.mask)]
+    kinds = [Thing(boxes.centre, boxes.half, frames, boxes.colour, boxes.mask)]
     if parts.blocks is not None:
         blocks = parts.blocks
-        kinds.append((blocks.centre, blocks.half, blocks.rotation, blocks.colour, blocks.mask))
+        kinds.append(Thing(blocks.centre, blocks.half, blocks.rotation, blocks.colour, blocks.mask))
     things = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds)
 
     row, column = (jax.lax.broadcasted_iota(jnp.float32, (height, width), axis) for axis in (0, 1))
@@ -62,7 +63,7 @@ def render_soft(
 
     blur = intrinsics.fy / softness
     one_thing = partial(_thing, way, position, looks, blur)
-    cover, colour, depth = jax.vmap(one_thing)(*things)  # (P, H, W), (P, H, W, 3), (P, H, W)
+    cover, colour, depth = jax.vmap(one_thing)(things)  # (P, H, W), (P, H, W, 3), (P, H, W)
     back, ground = _behind(way, position, looks, blur)
 
     cover = jnp.concatenate([cover, jnp.ones_like(ground)[None]])
@@ -79,8 +80,19 @@ def render_soft(
     return jnp.clip(image, 0.0, 1.0), jnp.sum(share * jnp.concatenate([depth, ground[None]]), 0)
 
 
-def _thing(way, position, looks: Looks, blur, centre, half, frame, colour, mask) -> tuple[jax.Array, ...]:
+class Thing(NamedTuple):
+    """A box of any rotation."""
+
+    centre: jax.Array  # (3,) m
+    half: jax.Array  # (3,) m
+    frame: jax.Array  # (3, 3) world to box
+    colour: jax.Array  # (3,)
+    mask: jax.Array  # () bool, whether it is there
+
+
+def _thing(way, position, looks: Looks, blur, thing: Thing) -> tuple[jax.Array, ...]:
     """Cover (H, W) of the rays by one box, its colour (H, W, 3) and depth (H, W) [m]."""
+    centre, half, frame, colour, mask = thing
     ray = into_frame(frame, way)
     ray = jnp.where(jnp.abs(ray) < 1e-6, 1e-6, ray)
     middle = into_frame(frame, centre - position) / ray

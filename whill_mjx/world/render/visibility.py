@@ -124,7 +124,7 @@ def upright_key(rays: Rays, reach_z, numbers, code, bits: int = 10, invert: Call
     ray_y = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
     both = invert(ray_x * ray_y)  # one reciprocal serves both axes
     inverse_x, inverse_y = both * ray_y, both * ray_x
-    return _slabs(inverse_x, inverse_y, rays.inverse_z, reach_z, numbers[6:], code, bits)
+    return _slabs((inverse_x, inverse_y, rays.inverse_z), reach_z, numbers[6:], code, bits)
 
 
 # Blocks: 15 numbers each.
@@ -144,11 +144,13 @@ def block_key(rays: Rays, numbers, code, bits: int = 10, invert: Callable = reci
     x, y, z = (numbers[3 * i] * rays.u + numbers[3 * i + 1] * rays.v + numbers[3 * i + 2] for i in range(3))
     every = invert(x * y * z)
     inverse_z = every * x * y
-    return _slabs(every * y * z, every * x * z, inverse_z, jnp.abs(inverse_z), numbers[9:], code, bits)
+    inverse = (every * y * z, every * x * z, inverse_z)
+    return _slabs(inverse, jnp.abs(inverse_z), numbers[9:], code, bits)
 
 
-def _slabs(inverse_x, inverse_y, inverse_z, reach_z, numbers, code, bits):
+def _slabs(inverse, reach_z, numbers, code, bits):
     """Key from reciprocals of the ray in the box's frame; `numbers`: middle (3) and half sizes (3)."""
+    inverse_x, inverse_y, inverse_z = inverse
     middle_x, middle_y, middle_z = numbers[0] * inverse_x, numbers[1] * inverse_y, numbers[2] * inverse_z
     reach_x, reach_y = numbers[3] * jnp.abs(inverse_x), numbers[4] * jnp.abs(inverse_y)
     reach_z = numbers[5] * reach_z
@@ -187,28 +189,34 @@ def round_key(rays: Rays, square, numbers, code, bits: int = 10, invert: Callabl
     """Key of one cylinder or capsule, FAR where the ray misses it. `square`: u^2 + v^2 + 1 and its inverse."""
     ray_axis = numbers[0] * rays.u + numbers[1] * rays.v + numbers[2]
     ray_centre = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
-    along, centre2, radius2, half, capsule = (numbers[i] for i in range(6, 11))
+    seen = RoundSeen(*(numbers[i] for i in range(6, 11)))
     length2, inverse = square
-    distance, flat = round_distance(
-        length2, inverse, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert
-    )
+    distance, flat = round_distance(length2, inverse, ray_axis, ray_centre, seen, invert)
     distance = jnp.where(numbers[11] > 0, 0.0, distance)
     hit = (distance < 1e9) & (distance >= 0)
     return jnp.where(hit, key_of(distance, code + jnp.where(flat, FLAT_END, CURVED), bits), np.int32(FAR))
 
 
-def round_distance(
-    square, inverse_square, ray_axis, ray_centre, along, centre2, radius2, half, capsule, invert: Callable = reciprocal
-):
+class RoundSeen(NamedTuple):
+    """A round as seen from the origin of rays."""
+
+    along: jax.Array  # product of its centre with its axis [m]
+    centre2: jax.Array  # square of its centre [m2]
+    radius2: jax.Array  # squared radius [m2]
+    half: jax.Array  # half length [m]
+    capsule: jax.Array  # positive for round ends
+
+
+def round_distance(square, inverse_square, ray_axis, ray_centre, seen: RoundSeen, invert: Callable = reciprocal):
     """Where rays enter a round, and whether through a flat end; 1e9 where they miss it, negative behind the origin.
 
     Args:
         square, inverse_square: product of the ray direction with itself, and its inverse.
         ray_axis, ray_centre: its products with the axis, and with the centre as seen from the ray's origin.
-        along, centre2: product of that centre with the axis, and its square.
-        radius2, half: squared radius [m2], half length [m].
-        capsule: positive for round ends.
+        seen: the round.
+        invert: x -> 1 / x.
     """
+    along, centre2, radius2, half, capsule = seen
     a = jnp.maximum(square - ray_axis * ray_axis, 1e-9)
     b = ray_centre - ray_axis * along
     c = centre2 - along * along - radius2
@@ -290,5 +298,6 @@ def round_shadow(x, y, z, numbers) -> jax.Array:
     along = dx * numbers[3] + dy * numbers[4] + dz * numbers[5]
     ray_centre = dx * numbers[10] + dy * numbers[11] + dz * numbers[12]
     centre2 = dx * dx + dy * dy + dz * dz
-    distance, _ = round_distance(1.0, 1.0, numbers[9], ray_centre, along, centre2, numbers[6], numbers[7], numbers[8])
+    seen = RoundSeen(along, centre2, numbers[6], numbers[7], numbers[8])
+    distance, _ = round_distance(1.0, 1.0, numbers[9], ray_centre, seen)
     return (distance > SHADOW_GAP) & (distance < 1e8)

@@ -1,0 +1,196 @@
+"""Claims about naming what a model lacks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from benchmarks.claims.claim import Claim, Row
+
+FIT = "Fits"
+MISSING = "The missing effect"
+
+
+def _verdicts(content: dict[str, Any]) -> list[Row]:
+    kinds = {(2.0, 1.0): {}, (4.0, 1.0): {}, (2.0, 2.0): {}, (4.0, 2.0): {}}  # type: dict[tuple[float, float], dict]
+    for case in content.get("confusion", ()):
+        kind = case["scale"], case.get("noise", 1.0)
+        if case["stage"] == "scaled" and case.get("vehicle", "chair") == "chair" and kind in kinds:
+            answer = " + ".join(f"`{name}`" for name in case["named"]) or case["verdict"]
+            kinds[kind].setdefault(next(iter(case["truth"])), Counter())[answer] += 1
+    rows: list[Row] = []
+    for name in sorted({name for each in kinds.values() for name in each}):
+        size = content["sizes"].get(name)
+        cells = [
+            ", ".join(
+                f"{answer} x {count}" if count > 1 else answer for answer, count in sorted(each.get(name, {}).items())
+            ).replace(f"`{name}`", "right")
+            for each in kinds.values()
+        ]
+        rows.append(
+            (f"`{name}`", f"{size['value']:.3g} {size['unit']}" if size else "-", *(cell or "-" for cell in cells))
+        )
+    return rows
+
+
+def _shared(content: dict[str, Any]) -> list[Row]:
+    rows: list[Row] = []
+    for name, one in sorted(content.get("sets", {}).items()):
+        channel = "ground_truth" if "ground_truth" in one["before"]["held_out"] else "odometry"
+        before, after = (one[key]["held_out"].get(channel, {}).get("trajectory") for key in ("before", "after"))
+        values = ", ".join(
+            f"{key} = {p['value']:.3g} {p['unit']}" for each in one["effects"] for key, p in each["parameters"].items()
+        )
+        alike = ", ".join(f"`{member}`" for each in one["effects"] for member in each["class"][1:])
+        verdict = " + ".join(f"`{each['name']}`" for each in one["effects"]) or one["verdict"]
+        rows.append(
+            (
+                name,
+                verdict,
+                alike or "-",
+                values or "-",
+                *("-" if error is None else f"{error:.3g}" for error in (before, after)),
+            )
+        )
+    return rows
+
+
+CLAIMS = (
+    Claim(
+        MISSING,
+        "How often the verdict is right",
+        "undeclared",
+        "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
+        "it. 1x is the "
+        'size that 80 % of all logs would notice. "Right": the name or a member of its class.',
+        ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
+        tuple(
+            (
+                label,
+                *(
+                    f"{{{name}{kind}|{form}}}" if form else f"{{{name}{kind}}}"
+                    for kind in ("_2x", "_4x", "_2x_noise_2", "_4x_noise_2", "_4x_scooter")
+                ),
+            )
+            for label, name, form in (
+                ("named right", "class_accuracy", "%"),
+                ("named wrong", "wrong_name", "%"),
+                ("noticed", "noticed", "%"),
+                ("right names with a warning", "warned_right", "%"),
+                ("members of a class", "mean_class_size", ""),
+                ("beyond the catalogue: `unexplained`", "out_of_catalogue", "%"),
+            )
+        ),
+    ),
+    Claim(
+        MISSING,
+        "False alarms and other checks of the verdict",
+        "undeclared",
+        "The same logs.",
+        ("figure", "value"),
+        (
+            (
+                "false alarms, {false_alarms} of 228 logs with nothing missing; upper 95 % bound",
+                "{false_alarm_upper|%}",
+            ),
+            ("false alarms on 200 refitted simulated days of one log", "{refitted_null_alarms}"),
+            ("Kolmogorov-Smirnov p-value of the calibrated p-values (uniform if large)", "{null_ks_p}"),
+            ("two effects at once: both named right, 90 logs", "{pair_both|%}"),
+            ("the same where both are at least at 2x, 58 logs", "{pair_both_2x|%}"),
+            ("two effects at once: a wrong name, 90 logs", "{pair_wrong|%}"),
+            ("effect taken out of the catalogue, 26 logs: `unexplained`", "{left_out_unexplained|%}"),
+            ("the same: named outside its class", "{left_out_outside_class|%}"),
+            ("the same: named wrong without a warning", "{left_out_wrong|%}"),
+            ("95 % intervals that hold the planted size, of 80", "{interval_coverage|%}"),
+            ("error of the size, median", "{parameter_error|%}"),
+            ("held-out error after naming, over the replicates' difference", "{heldout_ratio}"),
+        ),
+    ),
+    Claim(
+        MISSING,
+        "Sensors and floor noisier or quieter than on the reference days",
+        "undeclared",
+        "Disturbances and sensor noise of the log times a factor; the reference days keep the usual ones. 40 logs with "
+        "nothing missing for each factor.",
+        ("figure", "0.5", "2", "4"),
+        (
+            (
+                "false alarms",
+                *(f"{{false_alarms_sensor_noise_{level}}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "upper 95 % bound of their rate",
+                *(f"{{false_alarm_upper_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+            (
+                "noise factors inside their 95 % interval, of 200",
+                *(f"{{noise_factor_coverage_sensor_noise_{level}|%}}" for level in ("0.5", "2", "4")),
+            ),
+        ),
+    ),
+    Claim(
+        MISSING,
+        "How long the loop takes",
+        "undeclared",
+        "27 drives of 22 s and six reference days, compilation included.",
+        ("what", "minutes"),
+        (
+            ("whole loop with 200 refitted simulated days, two CPU cores", "{cpu_seconds|0.0166667}"),
+            ("the same, GPU", "{gpu_seconds|0.0166667}"),
+            ("without refitted days, two CPU cores", "{cpu_quick_seconds|0.0166667}"),
+        ),
+    ),
+    Claim(
+        MISSING,
+        "Verdict by effect",
+        "undeclared",
+        'What was in the log, the size 1x, and the verdict on each log. "right": that effect was named. Another '
+        'name for an '
+        "effect of the catalogue is a member of its class, which these drives cannot separate.",
+        ("effect", "1x", "2x", "4x", "2x, twice the noise", "4x, twice the noise"),
+        _verdicts,
+    ),
+    Claim(
+        MISSING,
+        "Eight logs whose contents are not known here",
+        "undeclared_shared",
+        "Held-out position error [m] before and after, of the outside pose where there is one.",
+        ("set", "verdict", "looks the same", "values", "before", "after"),
+        _shared,
+    ),
+    Claim(
+        FIT,
+        "Whether faults of driving logs are named",
+        "logs",
+        "Logs of robots of many sizes with one fault of time or of frames each. Rightly named means that the sentence "
+        "says what it is, and no other sentence says what is not so. Faults too small to matter to a fit do not count.",
+        ("figure", "value", "logs"),
+        (
+            ("faults at the two larger sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),
+            ("healthy logs of which something is said", "{time_faults_false|%}", "{time_faults_false|n}"),
+        ),
+    ),
+    Claim(
+        FIT,
+        "Robots of one's own, and the usual first calibration",
+        "logs",
+        "A robot of 1.2 kg on the contact plant, whose wheels, track and markers are not where its owner believes: "
+        "fitted by its URDF file, then asked which effect other days have. Markers far off are those of a "
+        "chair, a scooter and a robot of 21 kg, the worst of three. Public robot files are listed in docs/models.md.",
+        ("figure", "value"),
+        (
+            ("held-out position over what replicates differ by", "{small_robot_replicate_ratio}"),
+            ("error of the wheel radius", "{small_robot_radius_error|%}"),
+            ("error of the track", "{small_robot_track_error|%}"),
+            ("error of the markers' place, 5 cm off [mm]", "{mount_offset_mm}"),
+            ("error of the markers' heading, 8 degrees off [degrees]", "{mount_offset_deg}"),
+            ("markers 20 cm off [mm]", "{far_mount_offset_mm}"),
+            ("markers 15 degrees off [degrees]", "{far_mount_offset_deg}"),
+            ("logs with one effect that were named in the right class", "{own_robot_loop_right}"),
+            ("such logs", "{own_robot_loop_logs}"),
+            ("robot files that load, settle and drive straight", "{robot_files_loaded}"),
+            ("robot files tried", "{robot_files_tried}"),
+            ("a bag of an hour to an inspected dataset [s]", "{bag_hour_s}"),
+        ),
+    ),
+)

@@ -1,0 +1,75 @@
+"""Claims about the code, what it promises, and the bridge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.claims.claim import Claim, Row
+
+BRIDGE = "ROS 2 bridge"
+
+
+def _promises(content: dict[str, Any]) -> list[Row]:
+    every = (
+        ("damaged files: undocumented exceptions", "fuzz_undocumented", "{fuzz_undocumented|.readers} readers"),
+        ("damaged files: hangs", "fuzz_hangs", "{fuzz_hangs|.readers} readers"),
+        ("damaged files: more than 500 MB", "fuzz_memory", "{fuzz_memory|.readers} readers"),
+        ("mistaken commands: tracebacks", "option_tracebacks", "{option_tracebacks|.command_lines} lines"),
+        ("kills: work lost beyond a minute", "kills_lost", "{kills_lost|.kills} kills"),
+        ("kills: other bits in the end", "kills_different", "{kills_different|.kills} kills"),
+        ("kills: half-written files", "kills_half_written", "{kills_half_written|.kills} kills"),
+        ("Ctrl-C: ends without exit code 130", "ctrl_c_wrong_ends", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
+        ("Ctrl-C to exit, 95 % [s]", "ctrl_c_p95_s", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
+    )
+    return [(what, f"{{{name}}}", of) for what, name, of in every if name in content["figures"]]
+
+
+CLAIMS = (
+    Claim(
+        "The code itself",
+        "How easily the code is entered",
+        "house",
+        "Counted from the sources. A floor is a step of the longest chain of imports inside a package.",
+        ("figure", "value"),
+        (
+            ("import circles", "{import_circles}"),
+            ("floors of `sysid`", "{import_floors_sysid}"),
+            ("files at the top of `sysid`", "{files_top_sysid}"),
+            ("files at the top of `whill_mjx`", "{files_top_whill_mjx}"),
+            ("files for a new effect that can be named", "{files_per_new_effect}"),
+            ("functions over 60 lines", "{functions_over_60}"),
+            ("functions with more than 6 arguments", "{functions_over_6_arguments}"),
+            ("lines of `sysid`", "{lines_sysid}"),
+            ("sentences over 35 words in README and docs", "{sentences_over_35_words}"),
+        ),
+    ),
+    Claim(
+        "The code itself",
+        "Nothing lost, nothing silent",
+        "reliability",
+        "Damaged files, mistaken commands, kills and Ctrl-C at random moments; each count should be 0.",
+        ("figure", "value", "of"),
+        _promises,
+    ),
+    Claim(
+        BRIDGE,
+        "Latency, delivery and stops",
+        "bridge",
+        'Measured between processes on two busy CPU cores. "Real time": `--realtime 20`.',
+        ("figure", "usual", "real time"),
+        (
+            ("frame to command, median [ms]", "{frame_to_command_p50_ms}", "{frame_to_command_p50_realtime_ms}"),
+            ("frame to command, 99 % [ms]", "{frame_to_command_p99_ms}", "{frame_to_command_p99_realtime_ms}"),
+            ("frame to command, largest [ms]", "{frame_to_command_max_ms}", "{frame_to_command_max_realtime_ms}"),
+            ("720p frame to command, 99 % [ms]", "{frame_720p_p99_ms}", "{frame_720p_p99_realtime_ms}"),
+            ("720p frames delivered", "{frames_720p_delivered|%}", "{frames_720p_delivered_realtime|%}"),
+            ("error of the pace, 99 % [ms]", "{tick_error_p99_ms}", "{tick_error_p99_realtime_ms}"),
+            ("policy step, 99 % [ms]", "{policy_p99_ms}", "-"),
+            ("cold start [s]", "{cold_start_s}", "-"),
+            ("stop when images cease [ms]", "{stop_input_ms}", "-"),
+            ("stop on a bad action [ms]", "{stop_action_ms}", "-"),
+            ("stop when the policy node is killed [ms]", "{stop_killed_ms}", "-"),
+            ("commands from before a reset, 19 resets", "{stale_after_reset}", "-"),
+        ),
+    ),
+)
