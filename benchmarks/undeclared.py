@@ -80,6 +80,8 @@ class Benchmark:
     """The logs of 4 times that size against a catalogue that lacks the effect; after those logs are driven."""
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
+    labels: tuple[str, ...] = ()
+    """Only logs of these names, of all that the other options ask for."""
     full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -156,7 +158,8 @@ def plant(settings: Benchmark) -> None:
 
     def judge(listed: Sequence[contact.Job]) -> None:
         for number, job in enumerate(listed):
-            if (work / "verdicts" / f"{job.label}.json").exists():
+            if settings.labels and job.label not in settings.labels or (
+                    work / "verdicts" / f"{job.label}.json").exists():
                 continue
             if settings.share and not contact.claimed(work, job.label):
                 continue

@@ -321,5 +321,6 @@ def brief(result: Result) -> dict[str, Any]:
                        "scatter_least": one.agreement.least,
                        "predictions": [[each.falsifier.by, each.outcome, each.power] for each in one.falsifiers]}
                       for one in result.stood],
+            "steps": found.steps,
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
                            for each in found.rounds]}

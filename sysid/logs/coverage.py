@@ -132,7 +132,7 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
-        said: list[str] = []
+        seen: list[str] = []
         shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
             gains = _gains(trials, channel, index, list(shifts.values()))
@@ -145,19 +145,19 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
             where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
             odd = not least < gain < 2.0
             if odd and abs(follows) < FOLLOWS:
-                said.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
+                seen.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
             elif gain < 0:
-                said.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
+                seen.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
             elif odd and (limit := _limit(trials, channel, index)) is not None:
                 found.append(f"{where}, but follows commands below {limit:.2g} {unit}: it is limited to about that. "
                              "State it as command_limits, so that replays take commands as the vehicle does.")
             elif odd:
-                said.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
+                seen.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
-        late = another_clock(channel, trials, "commands") if said else ""
-        found += [late] if late else said  # such a log shows neither sign nor unit
+        late = another_clock(channel, trials, "commands") if seen else ""
+        found += [late] if late else seen  # such a log shows neither sign nor unit
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
         ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:

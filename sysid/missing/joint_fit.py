@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -65,3 +67,23 @@ class Start:
     def at(cls, refit: Refit) -> Start:
         """Where a fit ended."""
         return cls(refit.hypotheses, refit.u, refit.q, refit.jacobian[..., : len(refit.u)])
+
+
+class Replays(Protocol):
+    """What a fit was made with: `sysid.missing.refit.Refitter`."""
+
+    drives: Any
+    reference: Any
+    precision: np.ndarray
+
+    def white(self, series: np.ndarray) -> np.ndarray:
+        """White and flat features."""
+
+    def values_at(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
+
+
+def without_each(fit: Refit, refitter: Replays) -> list[np.ndarray]:
+    """All parameters of a joint fit without one effect, for each of them."""
+    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
+            for i, part in enumerate(fit.parts)]

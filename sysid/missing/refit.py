@@ -232,9 +232,3 @@ def _advanced_together(fits: Sequence[tuple[Refitter, Start]], iterations: int) 
             place += len(mine)
         asked = following
     return [done[number] for number in range(len(fits))]
-
-
-def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:
-    """All parameters of a joint fit without one effect, for each of them."""
-    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
-            for i, part in enumerate(fit.parts)]

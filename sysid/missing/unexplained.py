@@ -17,7 +17,8 @@ from sysid.errors.features import CHANNELS
 from sysid.logs.records import Trial, command_in_force
 
 TERMS = 8  # smooth functions of one quantity
-LAGS = 3  # bins over which the motion answers
+MEMORY = (0.5, 2.0)
+"""Time constants [s] of what the motion remembers: a controller answers a force for a second or two."""
 WAVES = 2  # harmonics of an angle
 PHASES = np.arange(24) * 2 * np.pi / 24  # start angles of a wheel that are tried
 ANGLE_PRICE = 4.0  # what fitting its start angle brings a trial in noise; taken off
@@ -39,12 +40,13 @@ def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, wi
     for name in found[0]:
         if any(name not in one for one in found):
             continue
-        design = np.stack([with_lags(one[name]) for one in found])  # (B, K, F)
-        gain = 0.0
+        design = np.stack([with_memory(one[name], width) for one in found])  # (B, K, F)
+        x, y = (np.einsum("bkf,bkg->bfg", design, each, optimize=True) for each in (design, residual))
+        turns, gain = np.eye(x.shape[1])[None], 0.0
+        if name in WHEELS:
+            turns = np.kron(np.eye(1 + len(MEMORY)), wave_turns(WAVES, False))
         for part in range(3):
             fit, test = fold != part, fold == part
-            x, y = (np.einsum("bkf,bkg->bfg", design, each, optimize=True) for each in (design, residual))
-            turns = np.kron(np.eye(LAGS), wave_turns(WAVES, False)) if name in WHEELS else np.eye(x.shape[1])[None]
             solution, _ = align(x[fit], y[fit], turns, RIDGE * np.eye(x.shape[1]))
             gain += float(gains_at(solution, x[test], y[test], turns).max(1).sum())
         if name in WHEELS:
@@ -95,8 +97,9 @@ def quantities(trial: Trial, bins: int, width: float, spec: Any) -> dict[str, np
         x, y, yaw = (np.interp(t, truth.t, series) for series in (truth.x, truth.y, truth.yaw))
         across = np.concatenate([bumps(x, -4.0, 4.0), bumps(y, -4.0, 4.0)], axis=1)
         found["place in the room"] = across * np.sign(v)[:, None] * moving
-        found["heading in the room"] = waves(yaw) * np.concatenate([np.ones((bins, 1)), np.sign(v)[:, None]],
-                                                                   axis=1).repeat(2, axis=1)
+        turn = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
+        way = np.sign(v)[:, None] * moving
+        found["heading in the room"] = np.concatenate([turn, turn * way, way], axis=1)
     return {name: np.where(inside, each, 0.0) for name, each in found.items()}
 
 
@@ -173,9 +176,9 @@ def waves(angle: np.ndarray) -> np.ndarray:
     return np.stack([wave(k * angle) for k in range(1, WAVES + 1) for wave in (np.sin, np.cos)], axis=-1)
 
 
-def with_lags(design: np.ndarray) -> np.ndarray:
-    """(K, F LAGS) the functions now and in the bins before."""
-    parts = [design]
-    for lag in range(1, LAGS):
-        parts.append(np.concatenate([np.zeros_like(design[:lag]), design[:-lag]]))
-    return np.concatenate(parts, axis=1)
+def with_memory(design: np.ndarray, width: float) -> np.ndarray:
+    """(K, F (1 + M)) functions (K, F) now, and their low-passed past, in bins of a width [s]."""
+    from scipy.signal import lfilter
+
+    kept = np.exp(-width / np.array(MEMORY))
+    return np.concatenate([design, *(lfilter([1 - one], [1.0, -one], design, axis=0) for one in kept)], axis=1)

@@ -28,9 +28,11 @@
     missing           p-value of "nothing is missing", against reference days calibrated
     (`sysid.follow_up.calibrated`), and
                       `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
-                      noise, as a share of it, before and after; share of it explained; of simulated days that were
-                      refitted (`--refit-nulls`, else null) count, calibrated p-value, false alarms and the upper 95 %
-                      bound of their rate
+                      noise, as a share of it, before and after; share `explained` of what could be predicted; of
+                      simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
+                      alarms and the upper 95 % bound of their rate
+    steps             the numbers behind the verdict: gain of each set of effects, and what it leaves that replicates
+                      have in common, smooth functions predict, or may be at random (`sysid.verdict.rounds.Asked`)
     operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
                       of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
                       the share of simulated days on which it would be noticed, at factors on its size
@@ -91,6 +93,7 @@ from sysid.pages.report import code_hashes, error_rows
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
+from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before
 from whill_mjx.effects import EFFECTS, equation
@@ -150,6 +153,7 @@ def make_report(result: Result) -> dict[str, Any]:
                     "null_refits": None if nulls is None else {
                         "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
                         "upper": nulls.upper}},
+        "steps": found.steps,
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
@@ -241,7 +245,7 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
             if one.key in kept:
                 number = result.hypotheses.index(one)
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
-    return {"alpha": alpha, "decisions": result.config.thresholds.rounds + 2, "days": "simulated, linear",
+    return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
 
 

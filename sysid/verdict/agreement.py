@@ -109,18 +109,6 @@ def sizes_apart(
     return np.array(factors), np.array(errors)
 
 
-def disagreement(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> float:
-    """By how much the size of an effect differs from manoeuvre to manoeuvre beyond the noise, as a share of it: the
-    root mean square about the mean, each manoeuvre weighted by its information."""
-    factor, error = sizes_apart(fit, part, groups, precision)
-    weight = error**-2
-    if weight.sum() < 1e-6:
-        return 0.0
-    mean = float((weight * factor).sum() / weight.sum())
-    beyond = float((weight * (factor - mean) ** 2).sum()) - (len(factor) - 1)
-    return float(np.sqrt(max(beyond, 0.0) / weight.sum()))
-
-
 def foretold(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> np.ndarray:
     """(G,) by how much some coordinates, fitted to all other manoeuvres, lower the squared residual of each manoeuvre.
 

@@ -15,18 +15,12 @@ still stands out beside it may have one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
-from sysid.missing.catalogue import Hypothesis
-from sysid.missing.days import Wander
-from sysid.missing.evidence import Evidence
-from sysid.missing.refit import Refitter
-from sysid.search.result import Progress
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import LARGEST, Search, Thresholds, missing
-from sysid.verdict.rounds import NOTHING, Asked, begin, candidates_of, class_of, held_back
+from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search, missing
+from sysid.verdict.rounds import NOTHING, Asked, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
 UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
@@ -37,23 +31,21 @@ def stands_alone(trials: Sequence[Trial], known: bool) -> bool:
     return not known and not repeated(trials)
 
 
-def search_alone(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    wheels: bool = True, draws: int = 1000, seed: int = 0, progress: Progress | None = None,
-) -> Search:
+def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = True) -> Search:
     """The verdict on drives that stand alone: effects are added one after the other, as long as they make the rest of
     the drives better predicted.
 
     Args:
+        pairs: not asked, since nothing shows their noise.
         wheels: whether any trial has an odometry.
     """
-    asked, far = begin(evidence, hypotheses, refitter, wander, thresholds, draws, seed, progress)
+    thresholds = asked.thresholds
     found = Search("none", asked.base, asked.base, asked.scan)
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
     against, unseen = "what stands out in a linear scan does not hold in a refit", ""
-    while len(found.accepted) < thresholds.rounds and len(found.rounds) < 2 * thresholds.rounds:
-        candidates = candidates_of(asked, found, found.final, far)
+    while len(found.accepted) < EFFORT.rounds and len(found.rounds) < 2 * EFFORT.rounds:
+        candidates = candidates_of(asked, found, found.final)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]
         if not standing:
@@ -71,7 +63,7 @@ def search_alone(
         taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
         mine = taken_on.hypothesis.effect
         members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
-        found.accepted.append(replace(taken_on, own=True))
+        found.accepted.append(taken_on)
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
         found.final, found.share = taken_on.refit, taken_on.share
@@ -87,6 +79,6 @@ def search_alone(
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:
     """The search with its reason, and what exceeds the noise before and after."""
-    found.excess = asked.excess(asked.base), asked.excess(found.final)
+    found.excess = asked.excess(asked.base.residual), asked.excess(found.final.residual)
     found.reason = f"{reason}; {UNTOLD}"
     return found

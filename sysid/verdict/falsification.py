@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 
 from sysid.logs.records import Trial, command_in_force
-from sysid.missing.joint_fit import Refit, moved_last
-from sysid.missing.refit import Refitter, without_each
+from sysid.missing.joint_fit import Refit, moved_last, without_each
+from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import beside
 from sysid.verdict.falsifiers import QUIET, SPLITS, Course, Tested
 from whill_mjx.effects import card_of

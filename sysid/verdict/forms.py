@@ -1,8 +1,9 @@
-"""What other forms of the effects found so far could do instead of a further effect.
+"""A further effect beside other forms of those before it.
 
 No vehicle follows the catalogue's laws exactly. What such a law leaves is again the effect's own signature, only larger
-or smaller with speed, turning, time or manoeuvre, or earlier or later. A further effect that such columns imitate, or
-that explains no more than they do, may only mend the form of those before it.
+or smaller with speed, turning, time or manoeuvre, or earlier or later. Every effect may therefore have another form,
+whose columns have a prior of `Thresholds.form` times its size (Kennedy and O'Hagan 2001). What these explain, no
+further effect is needed for.
 """
 
 from __future__ import annotations
@@ -12,49 +13,55 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.missing.joint_fit import Refit
-from sysid.missing.refit import Refitter, without_each
+from sysid.missing.joint_fit import Refit, Replays, without_each
 
-USUAL = 0.5
-"""Standard deviation of the sizes of such columns, as a share of the effect."""
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
 RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class Forms:
+class Beside:
     """The last effect of a joint fit beside other forms of those before it."""
 
-    own: float
-    """Share of its signature's square, beside base parameters and the other effects, that they do not imitate."""
-    instead: float
-    """By how much they lower the cost without it, as a share of what it does."""
+    gain: float
+    """By how much it lowers the cost there."""
+    residual: np.ndarray  # (B, n) what is left where every effect may have another form
 
 
-def other_forms(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
-    """Let every effect but the last of a joint fit have another form. Linear, around the fit.
+def beside_forms(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
+    """Let the effects of a joint fit have other forms. Base parameters and sizes move linearly around the fit; the last
+    effect is taken away whole, since its columns say little of a dead zone or a limit without it.
 
     Args:
         groups: trials of each manoeuvre.
+        form: root mean square of all forms of an effect together, as a share of what it changes.
     """
-    whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)[:-1]]))
-    bent = np.concatenate([refitter.white(modulated(whole - one, whole, groups)) for one in less], axis=-1)
-    size, part = len(fit.u), fit.parts[-1]
-    columns = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    others, mine = np.split(columns, [size + part.start], axis=1)  # the last effect's columns are the last
-    bent = bent.reshape(len(columns), -1)
-    prior = np.zeros((others.shape[1],) * 2)
-    prior[:size, :size] = refitter.precision
-    wide = np.pad(prior, (0, bent.shape[1]))
-    wide[np.diag_indices(len(wide))] += np.repeat([0.0, USUAL**-2], [len(prior), bent.shape[1]])
-    signature = mine @ fit.q[part]
-    without_it = fit.residual.reshape(-1) + signature
-    forms = np.concatenate([others, bent], axis=1)
-    cost = left(without_it, others, prior)
-    gain = cost - left(without_it, columns, np.pad(prior, (0, mine.shape[1])))
-    return Forms(left(signature, forms, wide) / max(left(signature, others, prior), 1e-9),
-                 (cost - left(without_it, forms, wide)) / max(gain, 1e-9))
+    whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
+    changes = [refitter.white(whole - one) for one in less]
+    bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
+    bent = [one * (np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5
+            for one, change in zip(bent, changes, strict=True)]
+    size, last = len(fit.u), len(fit.u) + fit.parts[-1].start
+    columns, mine = fit.jacobian.reshape(-1, fit.jacobian.shape[-1]), changes[-1].reshape(-1, 1)
+    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u) + mine[:, 0]
+    forms = np.concatenate([one.reshape(len(columns), -1) for one in bent], axis=1)
+    before = forms[:, : sum(one.shape[-1] for one in bent[:-1])]
+    columns = np.concatenate([columns, mine], axis=1)
+
+    def ridge(effects: np.ndarray, others: np.ndarray) -> tuple[float, np.ndarray]:
+        """Least cost of the target, and what is then left (n,)."""
+        design = np.concatenate([effects, others], axis=1)
+        prior = np.diag(np.repeat([0.0, form**-2], [effects.shape[1], others.shape[1]]))
+        prior[:size, :size] = refitter.precision
+        matrix = design.T @ design + prior
+        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
+        right = design.T @ target
+        solution = np.linalg.solve(matrix, right)
+        return float(target @ target - right @ solution), target - design @ solution
+
+    gain = ridge(columns[:, :last], before)[0] - ridge(columns, before)[0]
+    return Beside(max(gain, 0.0), ridge(columns, forms)[1].reshape(fit.residual.shape))
 
 
 def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:
@@ -68,11 +75,3 @@ def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[
     early, late = np.zeros_like(change), np.zeros_like(change)
     early[:, :-1], late[:, 1:] = change[:, 1:], change[:, :-1]
     return np.stack([*(change * one[..., None] for one in factors), (early - late) / 2, early + late - 2 * change], -1)
-
-
-def left(values: np.ndarray, columns: np.ndarray, prior: np.ndarray) -> float:
-    """Least cost of values (n,) after a fit of columns (n, m) with the precision (m, m) of their sizes."""
-    matrix = columns.T @ columns + prior
-    matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
-    right = columns.T @ values
-    return float(values @ values - right @ np.linalg.solve(matrix, right))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -15,76 +16,38 @@ LARGEST = 4  # members of a class
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When the search takes something for real. Frozen before any drive is looked at; part of the manifest."""
+    """What decides. Frozen before any drive is looked at; part of the manifest."""
 
     alpha: float = 0.005
     """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
     the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
-    alarms."""
+    alarms. Of two effects the one whose posterior weight is a smaller share of the other's is not in its class."""
+    form: float = 0.5
+    """Standard deviation of an effect's form from the catalogue's law, as a share of its size."""
     share: float = 0.6
-    """Least share of the excess residual that named effects explain together."""
-    most: float = 0.5
-    """The same where manoeuvres agree on the size of each: then it is the form, or another effect, that is missing."""
-    excess: float = 0.06
-    """Excess of the squared residual over the noise, as a share of the noise, below which shares mean nothing."""
-    excess_alone: float = 1e-3
-    """p-value of the excess below which something without a name is missing, whatever the search says."""
-    search_alone: float = 1e-10
-    """The same of the search, whatever the excess. Small p-values come more often than they say, so otherwise both must
-    be below alpha: on 420 days with nothing missing the least one with no such excess was 8e-10."""
-    quiet: float = 0.05
-    """p-value of the excess that is left from which it passes for a day's own."""
-    second: float = 0.25
-    """Least gain of a further effect, as a share of the first one's: less may only mend the form of the first."""
-    step: float = 0.15
-    """Least further share of the excess that it explains."""
-    own: float = 0.3
-    """Least share of what the effects before it left that a smaller one must explain."""
-    rest: float = 0.9
-    """The same from which no more is asked of one that is needed beside them: what mends their form leaves a rest."""
-    agree: float = 0.6
-    """Largest change of its size from a fit without the others, as a share of it in the measure of what the drives tell
-    of it, at which it is there for its own sake."""
-    alone: float = 1.8
-    """Largest factor by which its gain may then change."""
-    differ: float = 0.35
-    """Largest disagreement of manoeuvres on its size."""
-    half: float = 0.5
-    """Least share of what the effects before it left that one must explain whose columns other forms of them do not
-    imitate (`sysid.verdict.forms`)."""
-    slight: float = 0.05
-    """Least gain of such an effect, as a share of the first one's."""
-    unlike: float = 0.75
-    """Least share of its signature that such forms do not imitate."""
-    instead: float = 0.7
-    """Most that they may gain instead of it, as a share of what it gains."""
-    little: float = 0.1
-    """Minimum share of the remaining error that an effect must explain on left-out manoeuvres."""
-    foretold: float = 0.7
-    """Least share of its gain that the other manoeuvres foretell of each; at most its inverse."""
-    same: float = 0.2
-    """Largest disagreement of manoeuvres on the size of such an effect, and of one that explains `most` only."""
-    loss: float = 0.1
-    """Largest loss in manoeuvres where that goes wrong, as a share of the gain in the others."""
-    scatter: float = 1.0
-    """What manoeuvres that excite an effect may differ by on its size, as a share of it, with 95 % confidence: with
-    more one in six would find the opposite."""
+    """Least share that effects explain of what they explain and what is then left that replicates share, or that smooth
+    functions predict."""
+    doubt: float = 1e-10
+    """p-value of the search below which something without a name is missing, whatever the excess. Small p-values come
+    more often than they should: on 420 days with nothing missing the least one without such an excess was 8e-10."""
+
+    @property
+    def alike(self) -> float:
+        """|cos| of two effects' signatures above which another form of one may be the other."""
+        return (1 + self.form**2) ** -0.5
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is tried."""
+
     rounds: int = 3
     """Effects that are searched for one after the other, at most."""
-    pairs: int = 3
-    """Pairs of effects that are refitted."""
-    worthwhile: float = 0.15
-    """Least scanned gain of an effect that is refitted, as a share of the best one's."""
     candidates: int = 4
-    """Effects refitted in a round, of each scan."""
-    close: float = 0.5
-    """Share of the best refit's gain from which another one is polished too."""
-    rival: float = 0.4
-    """|cos| of two effects' signatures above which one is not named before the other was refitted."""
-    between: float = 0.5
-    """Share of the best gain, beyond what imitating the best brings, from which another effect stays in its class."""
-    alike: float = 0.9
-    """|cos| of two effects' signatures above which they are not separated."""
+    """Effects refitted in a round, of each scan; pairs refitted; effects that might imitate the best one."""
+
+
+EFFORT = Effort()
 
 
 @dataclass
@@ -98,8 +61,6 @@ class Candidate:
     """Family-wise, of that gain."""
     share: float
     refit: Refit
-    own: bool = False
-    """Small beside the first, but as large and as useful without it, and most of what the others left."""
 
 
 @dataclass
@@ -120,6 +81,8 @@ class Search:
     """Squared white residual over its number, less 1: before and after."""
     reason: str = ""
     pairs: PairScan | None = None
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    """The numbers behind each step."""
     together: float | None = None
     """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
 
@@ -133,9 +96,10 @@ class Search:
 
 
 def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
-    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt."""
+    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt. The
+    excess alone is one of five looks at the drives."""
     both = max(search_p, excess_p) < thresholds.alpha
-    return both or excess_p < thresholds.excess_alone or search_p < thresholds.search_alone
+    return both or excess_p < thresholds.alpha / 5 or search_p < thresholds.doubt
 
 
 @dataclass(frozen=True)

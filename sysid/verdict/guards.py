@@ -33,6 +33,6 @@ def guarded(found: Search, stood: Sequence[Stood], thresholds: Thresholds) -> Se
     against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
     if against:
         found.verdict = "unexplained"
-        found.reason = (f"{' and '.join(sorted(named))} would explain {found.share:.0%} of what exceeds the noise, but "
+        found.reason = (f"{' and '.join(sorted(named))} would explain {found.share:.0%} of what can be explained, but "
                         f"{'; '.join(against)}")
     return found

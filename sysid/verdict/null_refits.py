@@ -1,40 +1,28 @@
 """Days with nothing missing, put through the same fits as the drives in question.
 
-The nulls of `sysid.verdict.scan` are linear: they move along the columns of the base parameters. Those here are
-drives of
-the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
-day is added, and base fit, scan and refits see it as they see measured drives. They tell how often this very set of
-drives would raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
+The nulls of `sysid.verdict.scan` are linear: they move along the columns of the base parameters. Those here are drives
+of the simulator. A vehicle is drawn from the day-to-day spread and replayed, what the model left of one whole reference
+day is added, and the whole search sees it as it sees measured drives. They show how often this very set of drives would
+raise a false alarm, and calibrate its p-value without the assumption that the model is linear.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander, alike
-from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.evidence import Solver, at_fit
 from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
 from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
-from sysid.verdict.classes import imitation
-from sysid.verdict.found import (
-    NullRefits,
-    PairScan,
-    Scan,
-    Search,
-    Thresholds,
-    family,
-    missing,
-    tail,
-)
+from sysid.verdict.found import NullRefits, PairScan, Search, Thresholds, tail
 from sysid.verdict.pairs import scan_again
-from sysid.verdict.rounds import Asked, pair_round, refitted
+from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
 
 TOGETHER, ACCELERATED = 16, 100
@@ -42,40 +30,29 @@ TOGETHER, ACCELERATED = 16, 100
 
 
 def run(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, scan: Scan,
-    thresholds: Thresholds, count: int, seed: int = 0, progress: Progress | None = None,
-    pairs: PairScan | None = None,
+    asked: Asked, judge: Callable[[Asked, PairScan | None], Search], pairs: PairScan | None, count: int, seed: int = 0,
+    progress: Progress | None = None,
 ) -> NullRefits:
     """Simulate and judge `count` days.
 
     Args:
-        evidence: of the drives in question around the reference, as `gather` made it.
-        scan: of the drives in question: its linear nulls are what the first look at each day is held against.
+        judge: what the drives in question are judged by (`sysid.verdict.search.settle`).
+        asked: of the drives in question; its linear nulls are what the first look at each day is held against.
         pairs: likewise of pairs of effects; None where pairs do not decide.
     """
-    reference = refitter.reference
+    scan, hypotheses, wander, reference = asked.scan, asked.hypotheses, asked.wander, asked.refitter.reference
     rng = np.random.default_rng((seed, 1))
     factor = np.linalg.cholesky(reference.spread + 1e-14 * np.eye(len(reference.u)))
-    similar = imitation(evidence, hypotheses)
     p, alarms = np.ones(count), 0
-    for n, (one, base) in enumerate(_days(refitter, factor, rng, count)):
-        around = at_fit(evidence, base.residual, base.jacobian, base.u - reference.u)
-        day = Asked(around, hypotheses, one, wander, thresholds, base, scan, similar)
-        looked = best(Solver(around), hypotheses, wander)
-        p[n] = family(scan.smallest, min(float(tail(scan.null[:, h], looked[1][h])) for h in range(len(hypotheses))))
-        if p[n] < thresholds.alpha:
-            p[n] = max(p[n], min((each.p for each in refitted(day, base, [looked])), default=0.0))
-        # An effect that stays significant in a refit may be named; without one, the rule of the verdict holds.
-        alarm = p[n] < thresholds.alpha or missing(p[n], day.p_left(base), thresholds)
-        if not alarm and pairs is not None:
-            again = scan_again(pairs, around, hypotheses, wander)
-            if again.p_family < thresholds.alpha:
-                found = Search("none", base, base, replace(scan, gain=looked[0], worth=looked[1], q=looked[2]),
-                               pairs=again)
-                pair_round(day, found, set())
-                alarm = bool(found.accepted)
-                p[n] = min(p[n], found.p_value) if alarm else p[n]
-        alarms += bool(alarm)
+    for n, (one, base) in enumerate(_days(asked.refitter, factor, rng, count)):
+        around = at_fit(asked.evidence, base.residual, base.jacobian, base.u - reference.u)
+        gain, worth, q = best(Solver(around), hypotheses, wander)
+        p_each = np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))])
+        day = replace(asked, evidence=around, refitter=one, base=base, far=None, steps=[], report=lambda _: None,
+                      scan=replace(scan, gain=gain, worth=worth, q=q, p=p_each))
+        found = judge(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
+        p[n] = found.p_value
+        alarms += found.verdict != "none"
         if progress is not None:
             progress(1, f"null refits, {alarms} of {n + 1} alarms")
     return NullRefits(p, alarms)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,15 @@ from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from sysid.verdict.alone import search_alone, stands_alone
 from sysid.verdict.floor import floor_change
+from sysid.verdict.found import PairScan, Search
 from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
-from sysid.verdict.search import search
+from sysid.verdict.rounds import Asked, begin
+from sysid.verdict.search import pairs_of, settle
 from sysid.verdict.sensor_noise import compared, with_noise
 
 
@@ -70,18 +73,17 @@ def find_missing(
     def anything(residual: np.ndarray) -> float:
         return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
+    asked = begin(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
     alone = stands_alone(log.training, reference.known)
+    judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
-        wheels = any(trial.odometry is not None for trial in log.training)
-        outcome = search_alone(evidence, found, refitter, ready.wander, config.thresholds, wheels, draws, config.seed,
-                               progress)
-    else:
-        outcome = search(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed,
-                         progress)
+        judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
+    pairs = None if alone else pairs_of(asked, config.seed)
+    outcome = judge(asked, pairs)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(evidence, found, refitter, usual.wander, outcome.scan, config.thresholds,
-                                config.refit_nulls, config.seed, progress, outcome.pairs)
+        nulls = run_null_refits(replace(asked, wander=usual.wander, steps=[]), judge, pairs, config.refit_nulls,
+                                config.seed, progress)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":

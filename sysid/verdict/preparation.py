@@ -22,6 +22,7 @@ from sysid.replay.models import gyro_effects, with_effects
 from sysid.replay.records import Plant
 from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
+from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
@@ -66,7 +67,7 @@ def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
     iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     base = 0 if fitted else iterations + max(iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * config.thresholds.rounds + 1) + config.refit_nulls
+    return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * EFFORT.rounds + 1) + config.refit_nulls
 
 
 def days_of(references: Sequence[Log]) -> tuple[Log, ...]:

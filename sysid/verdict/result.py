@@ -40,7 +40,7 @@ class Stood:
         """What contradicts the effect, in words."""
         out = [in_words(one) for one in self.falsifiers if one.outcome == "falsified"]
         seen = int(self.agreement.asked.sum())
-        if self.agreement.outcome == "differ" and self.agreement.least > thresholds.scatter:
+        if self.agreement.outcome == "differ" and self.agreement.least > 2 * thresholds.form:
             out.append(f"the {seen} manoeuvres that excite {self.effect} differ on its size by "
                        f"{self.agreement.scatter:.0%} of it (at least {self.agreement.least:.0%})")
         if seen > 1 and self.interval[1] <= 0:

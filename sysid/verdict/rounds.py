@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
-from sysid.verdict.agreement import beside, disagreement, foretold, interval_of_sum
+from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import Candidate, Scan, Search, Thresholds
+from sysid.verdict.forms import Beside, beside_forms
+from sysid.verdict.found import EFFORT, Candidate, Scan, Search, Thresholds
 from sysid.verdict.scan import best, run
 
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
@@ -43,33 +45,86 @@ class Asked:
     scan: Scan
     """Of all hypotheses beside the base."""
     similar: np.ndarray  # (H, H) |cos| of signatures
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0
+    """By how much the best of the smooth functions that know no physics lowers the sum of squares of a white residual
+    (B, n), on drives held back from it."""
     report: Callable[[str], None] = lambda _: None
     """Says what was just done."""
+    far: Looked | None = None
+    """A scan around the reference: a large effect shows best there."""
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    """The numbers behind each step so far."""
 
     @cached_property
     def count(self) -> float:
         """Squared white residual where nothing is missing."""
         return float((self.refitter.drives.mask > 0).sum()) * self.wander.level
 
-    def excess(self, fit: Refit) -> float:
-        """Squared white residual of a fit over its number of values, less 1."""
-        return float(np.square(fit.residual).sum()) / self.count - 1
+    def excess(self, residual: np.ndarray) -> float:
+        """Squared white residual (B, n) over its number of values, less 1."""
+        return float(np.square(residual).sum()) / self.count - 1
 
-    def p_left(self, fit: Refit) -> float:
+    def p_left(self, residual: np.ndarray) -> float:
         """Probability of so much excess on a day with nothing missing."""
-        return self.wander.p_excess(self.excess(fit))
+        return self.wander.p_excess(self.excess(residual))
 
     def explained(self, fit: Refit) -> float:
-        """Share of the base fit's excess that a fit removes; where there is hardly any, of one worth a word."""
-        before = self.excess(self.base)
-        return float(np.clip((before - self.excess(fit)) / max(before, self.thresholds.excess), 0.0, 1.0))
+        """Share of the base fit's excess that a fit removes; where there is hardly any, of what a day's varies by."""
+        before = self.excess(self.base.residual)
+        return float(np.clip((before - self.excess(fit.residual)) / max(before, self.wander.excess), 0.0, 1.0))
+
+    def share(self, fit: Refit, gain: float, residual: np.ndarray, random: float) -> float:
+        """What effects of a fit gain, as a share of that and of what they leave (B, n) though it could be predicted.
+
+        That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
+        of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing predicts:
+        a share of it counts (`random`).
+        """
+        wander, excess = self.wander, self.excess(residual)
+        common = excess - wander.unshared(residual, self.refitter.drives.repeats)
+        left = {"common": common * self.count, "any": random * excess * self.count}
+        p = {"common": wander.p_excess(common), "any": wander.p_excess(excess)}
+        most = max((left[name] for name in left if p[name] < self.thresholds.alpha), default=0.0)
+        if gain >= self.thresholds.share * (gain + most):  # else smooth functions change nothing
+            left["smooth"] = self.anything(residual) - wander.usual * len(residual)
+            most = max(most, left["smooth"])
+        share = gain / max(gain + most, 1e-9)
+        self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "left": left, "p": p,
+                           "share": share})
+        return share
+
+    def beside_forms(self, fit: Refit) -> Beside:
+        """The last effect of a joint fit beside other forms of those before it."""
+        return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
+
+    def calm(self, fit: Refit) -> bool:
+        """Whether other forms of the effects of a joint fit leave no more than days differ by, or nothing that smooth
+        functions predict better than on usual days."""
+        residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
+        p = self.p_left(residual)
+        known = p < self.thresholds.alpha and np.isfinite(limit)  # whether smooth functions have a say
+        smooth = self.anything(residual) / len(residual) if known else None
+        self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
+                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if known else None})
+        return p >= self.thresholds.alpha or smooth is not None and smooth <= limit
+
+    def named(self, fit: Refit) -> float:
+        """Share of what could be predicted that the effects of a fit explain. They may act at random in part: in energy
+        `Thresholds.form` squared of what they leave so counts against them."""
+        return self.share(fit, self.base.cost - fit.cost, fit.residual, self.thresholds.form**2)
+
+    def own(self, fit: Refit) -> bool:
+        """Whether the last effect of a joint fit does more than to mend the form of those before it."""
+        found = self.beside_forms(fit)
+        return self.share(fit, found.gain, found.residual, 1.0) >= self.thresholds.share
 
 
 def begin(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    draws: int, seed: int, progress: Progress | None,
-) -> tuple[Asked, Looked]:
-    """What a search asks, around the base refitted to the drives; and a scan around the reference."""
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0, draws: int = 1000, seed: int = 0,
+    progress: Progress | None = None,
+) -> Asked:
+    """What a search asks, around the base refitted to the drives."""
     def report(text: str) -> None:
         if progress is not None:
             progress(1, text)
@@ -81,13 +136,13 @@ def begin(
     scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
     report("scan")
     return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
-                 report), far
+                 anything, report, far)
 
 
-def candidates_of(asked: Asked, found: Search, current: Refit, far: Looked) -> list[Candidate]:
+def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate]:
     """The next round of a search, which is kept."""
-    scan = asked.scan
-    scans = [rescan(asked, current)] if found.rounds else [far, (scan.gain, scan.worth, scan.q)]
+    near = (asked.scan.gain, asked.scan.worth, asked.scan.q)
+    scans = [rescan(asked, current)] if found.rounds else [near] if asked.far is None else [asked.far, near]
     found.rounds.append(refitted(asked, current, scans, len(found.rounds) + 1))
     return found.rounds[-1]
 
@@ -105,7 +160,7 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
 
     fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
     asked.report(f"refits, round {number}")
-    least = current.cost - asked.thresholds.close * max((current.cost - fit.cost for fit in fits), default=0.0)
+    least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
         fits[i] = fit
@@ -113,7 +168,8 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
         again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
         fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
     asked.report(f"polish, round {number}")
-    rivals = _rivals(hypotheses, asked.similar, [h for h, _ in chosen], fits, taken, asked.thresholds)
+    similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
+    rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
     fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
     asked.report(f"rivals, round {number}")
@@ -142,25 +198,22 @@ def _starts(
     for number, (gain, worth, q) in enumerate(scans):
         standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
         chosen = sorted(standing, key=lambda h: -gain[h])
-        chosen = [h for h in chosen if gain[h] >= thresholds.worthwhile * gain[chosen[0]]]
         if number == len(scans) - 1:
-            chosen = [*chosen[: thresholds.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
+            chosen = [*chosen[: EFFORT.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
         new = 0
         most = [h for h in sorted(left, key=lambda h: -gain[h])[:1] if gain[h] > 0]
         for h in [*chosen, *most]:
             wide, start = _widest(hypotheses, h, q, standing)
-            if hypotheses[wide].key not in order and (new < thresholds.candidates or h not in chosen):
+            if hypotheses[wide].key not in order and (new < EFFORT.candidates or h not in chosen):
                 order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
 
 
 def _rivals(
-    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str],
-    thresholds: Thresholds,
+    hypotheses: Sequence[Hypothesis], similar: np.ndarray, tried: Sequence[int], fits: Sequence[Refit], taken: set[str]
 ) -> list[int]:
-    """What might imitate the best fit, or be imitated by it, and was not tried: it must have had its chance before
-    another is named."""
+    """What is most like the best fit, and was not tried: it must have had its chance before another is named."""
     if not fits:
         return []
     winner = tried[int(np.argmin([fit.cost for fit in fits]))]
@@ -168,10 +221,10 @@ def _rivals(
     out: list[int] = []
     alike = np.maximum(similar[winner], similar[:, winner])
     for h in np.argsort(-alike):
-        if alike[h] > thresholds.rival and hypotheses[h].effect not in done:
+        if alike[h] > 0 and hypotheses[h].effect not in done:
             done.add(hypotheses[h].effect)
             out.append(int(h))
-    return out[: thresholds.candidates]
+    return out[: EFFORT.candidates]
 
 
 def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
@@ -233,8 +286,8 @@ def candidate_of(asked: Asked, h: int, fit: Refit, current: Refit) -> Candidate:
 def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
     """Two effects instead of what was accepted, where only together they explain the drives.
 
-    Each must be significant and worth a name beside the other, manoeuvres must agree on its size and foretell one
-    another, and together they must explain more than what was accepted one by one.
+    Each must be significant and do more than to mend the form of the other, and together they must explain more than
+    what was accepted one by one.
 
     Args:
         tried: effects whose pairs had their chance, with the other one as a further effect.
@@ -250,7 +303,7 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
             seen.add(names)
             order.append(int(m))
     starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
-              for m in order[: thresholds.pairs]]
+              for m in order[: EFFORT.candidates]]
     if not starts:
         return
     fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
@@ -259,16 +312,14 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
                              POLISH)
     if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
         both, alone = moved_last(both, 0), alone[::-1]
-    if asked.explained(both) - (found.accepted[-1].share if found.accepted else 0.0) < thresholds.step:
+    if found.accepted and both.cost >= found.accepted[-1].refit.cost:
         return
     members = []
     for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
         one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
-        if (one.p >= thresholds.alpha or asked.explained(fit) - asked.explained(other) < thresholds.step
-                or disagreement(fit, fit.parts[-1], asked.evidence.groups, refitter.precision) > thresholds.differ
-                or interval_of_sum(held_back(asked, fit))[0] <= 0):
+        if one.p >= thresholds.alpha or not asked.own(fit):
             return
-        members.append(replace(one, own=True))
+        members.append(one)
     members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
     found.accepted = members
     found.classes = [class_of(asked, one, [one]) for one in members]
@@ -282,8 +333,12 @@ def held_back(asked: Asked, fit: Refit) -> np.ndarray:
 
 
 def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> list[str]:
-    """Effects that these drives do not separate from the best: nearly as good a fit, alike signatures, or a
-    fit so much better than imitating the best would bring that the truth may lie between the two."""
+    """Effects that these drives do not separate from the best, nearest first.
+
+    Another form of the best could be such an effect (`Thresholds.alike`), or its posterior weight is not a negligible
+    share of the best one's, or it gains so much more than imitating the best would bring that the truth may lie between
+    the two.
+    """
     hypotheses, similar, thresholds = asked.hypotheses, asked.similar, asked.thresholds
     mine = hypotheses.index(best.hypothesis)
     near: dict[str, float] = {}
@@ -291,7 +346,7 @@ def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> 
         imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
         ratio = other.gain / best.gain
         own = (ratio - imitated) / max(1 - imitated, 1e-9)
-        if best.gain - other.gain < max(12.0, 0.1 * best.gain) or own > thresholds.between:
+        if best.gain - other.gain < -2 * np.log(thresholds.alpha) or own > thresholds.form:
             near[other.hypothesis.effect] = ratio
     for j, one in enumerate(hypotheses):
         if similar[mine, j] > thresholds.alike:

@@ -36,7 +36,21 @@ class Linear:
     def __init__(self, evidence):
         self.evidence, self.precision = evidence, evidence.precision
         self.reference = SimpleNamespace(u=np.zeros(1), spread=SPREAD)
-        self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), repeats=np.arange(len(evidence.residual)))
+        self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), repeats=np.arange(len(evidence.residual)),
+                                      simulate=self.simulate)
+
+    def simulate(self, sets):
+        """(N, B, K, 5) features with values (N, 5) of the base parameter and the four effects."""
+        series = np.einsum("bnj,sj->sbn", self.evidence.design, sets)
+        return series.reshape(*series.shape[:2], -1, 5)
+
+    def white(self, series):
+        return series.reshape(len(series), -1, *series.shape[3:])
+
+    def values_at(self, chosen, u, q):
+        values = np.concatenate([u, np.zeros(len(EFFECTS))])
+        values[[1 + EFFECTS.index(one) for one in chosen]] = q
+        return values
 
     def fit(self, chosen, _):
         columns = self.evidence.design[..., [0, *(1 + EFFECTS.index(one) for one in chosen)]]
@@ -46,7 +60,8 @@ class Linear:
         solution = np.linalg.solve(matrix, flat.T @ self.evidence.residual.reshape(-1))
         residual = self.evidence.residual - columns @ solution
         cost = float(np.square(residual).sum() + solution[:1] @ self.precision @ solution[:1])
-        return Refit(tuple(chosen), solution[:1], solution[1:], cost, residual, columns, solution)
+        values = self.values_at(chosen, solution[:1], solution[1:])
+        return Refit(tuple(chosen), solution[:1], solution[1:], cost, residual, columns, values)
 
     def stuck(self, _):
         return False

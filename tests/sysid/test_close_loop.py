@@ -20,7 +20,7 @@ from sysid.logs.metrics import own_floor, score
 from sysid.logs.synthetic import write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
-from sysid.missing.refit import without_each
+from sysid.missing.joint_fit import without_each
 from sysid.pages.loop_report import effects, make_report, manifest, replay, shifts, write_run
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
@@ -32,6 +32,8 @@ from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
+from sysid.verdict.rounds import Asked
+from sysid.verdict.search import settle
 from sysid.verdict.vehicles import (
     drives_of,
     fitted_alone,
@@ -175,10 +177,14 @@ def test_simulated_days_are_refitted_and_take_back_what_they_show_too(drives, sl
     assert not weak.accepted
 
 
+def asked_of(result):
+    return Asked(result.evidence, result.hypotheses, refitter_of(result), result.prepared.wander, CONFIG.thresholds,
+                 result.search.base, result.search.scan, np.eye(len(result.hypotheses)))
+
+
 def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, monkeypatch):
     def days():
-        return run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
-                               sloping.search.scan, CONFIG.thresholds, 3).p
+        return run_null_refits(asked_of(sloping), settle, None, 3).p
 
     together = days()
     monkeypatch.setattr("sysid.verdict.null_refits.TOGETHER", 1)
@@ -192,9 +198,9 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
             found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
 
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
-    monkeypatch.setattr("sysid.verdict.null_refits.pair_round", rounds)
-    nulls = run_null_refits(sloping.evidence, sloping.hypotheses, refitter_of(sloping), sloping.prepared.wander,
-                            sloping.search.scan, CONFIG.thresholds, 2, pairs=sloping.search.pairs)
+    monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
+    monkeypatch.setattr(Asked, "named", lambda *_: 1.0)
+    nulls = run_null_refits(asked_of(sloping), settle, sloping.search.pairs, 2)
     assert nulls.alarms == (2 if accepted else 0)
     assert (nulls.p == 1e-4).all() == accepted
 

@@ -18,9 +18,9 @@ from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.found import Candidate, Effort, Thresholds
 from sysid.verdict.preparation import days_of
-from sysid.verdict.rounds import NOTHING, Asked
+from sysid.verdict.rounds import NOTHING, Asked, begin
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -72,7 +72,8 @@ def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not(
 def verdict(sizes, wheels=True, **more):
     """The verdict on linear drives that stand alone."""
     evidence = drives(sizes, **more)
-    return search_alone(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), wheels, 300)
+    asked = begin(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
+    return search_alone(asked, wheels=wheels)
 
 
 def named(found):
@@ -122,7 +123,7 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
     evidence = drives(np.zeros(4))
     linear = Linear(evidence)
     base = linear.fit((), None)
-    asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(rounds=1), base,
+    asked = Asked(evidence, EFFECTS, linear, no_wander(evidence.columns), Thresholds(), base,
                   SimpleNamespace(p_family=0.0), np.eye(4))
     listed = [candidate(*each) for each in (
         ("acceleration_limit", 3, 60.0), ("command_delay", 1, 50.0), ("slope", 1, 20.0))]
@@ -132,11 +133,11 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
         found.rounds.append(listed)
         return listed
 
-    monkeypatch.setattr(alone, "begin", lambda *_: (asked, None))
+    monkeypatch.setattr(alone, "EFFORT", Effort(rounds=1))
     monkeypatch.setattr(alone, "candidates_of", candidates_of)
     monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
     monkeypatch.setattr(alone, "class_of", lambda asked, best, _: [best.hypothesis.effect])
-    found = search_alone(evidence, EFFECTS, linear, asked.wander, asked.thresholds)
+    found = search_alone(asked)
     assert named(found) == ("named", [result])
     assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
 

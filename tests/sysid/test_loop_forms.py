@@ -7,10 +7,9 @@ import pytest
 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
-from sysid.verdict.forms import modulated, other_forms
-from sysid.verdict.found import Candidate, Thresholds
+from sysid.verdict.forms import beside_forms, modulated
+from sysid.verdict.found import Thresholds
 from sysid.verdict.rounds import _rivals, _starts
-from sysid.verdict.search import _own
 
 pytestmark = pytest.mark.quick
 TRIALS, BINS = 6, 80
@@ -31,6 +30,7 @@ class Linear:
         first = rng.standard_normal((TRIALS, BINS, 5)) * (np.arange(5) > 1)  # speeds are those of the motion
         self.signatures = np.stack([first[::-1], first, second(self, first)], -1)
         self.precision, self.groups = np.eye(1), GROUPS
+        self.reference = SimpleNamespace(u=np.zeros(1))
         self.drives = SimpleNamespace(simulate=lambda sets: np.stack([self.features(one) for one in sets]))
         law = first * (1 + form * np.abs(self.motion[..., :1]))
         self.data = self.features(np.array([0.0, 0.0, truth[1]])) + truth[0] * law + rng.standard_normal(first.shape)
@@ -64,29 +64,15 @@ def stronger_when_fast(model, first):
     return first * np.abs(model.motion[..., :1])
 
 
-def test_an_effect_of_its_own_is_not_imitated_by_other_forms_of_the_first():
-    model = Linear(unrelated, (3.0, 1.0))
-    forms = other_forms(model, model.fit(2), GROUPS)
-    assert forms.own > 0.95 and forms.instead < 0.05
-
-
-def test_what_grows_with_the_speed_where_the_first_effect_does_is_imitated():
-    model = Linear(stronger_when_fast, (3.0, 0.0), form=0.5)
-    fit = model.fit(2)
-    assert abs(fit.q[1]) > 1  # it explains what the law of the first leaves
-    forms = other_forms(model, fit, GROUPS)
-    assert forms.own < 0.05 and forms.instead > 0.95
-
-
 @pytest.mark.parametrize(("second", "form", "own"), [(unrelated, 0.0, True), (stronger_when_fast, 0.5, False)])
-def test_half_of_what_is_left_makes_a_second_effect_unless_another_form_of_the_first_would_do(second, form, own):
+def test_what_other_forms_of_the_first_effect_explain_is_no_gain_of_a_second(second, form, own):
     model = Linear(second, (3.0, 0.0 if form else 1.0), form)
-    alone, both = model.fit(1), model.fit(2)
-    one = Candidate(effect("second"), alone.cost - both.cost, 0.0, 0.8, both)
-    found = SimpleNamespace(accepted=[SimpleNamespace(gain=4 * one.gain)])
-    asked = SimpleNamespace(refitter=model, evidence=SimpleNamespace(groups=GROUPS), explained=lambda fit: 0.8,
-                            thresholds=Thresholds(same=-1.0, own=2.0))
-    assert _own(asked, one, found, 0.5) is own
+    fit = model.fit(2)
+    assert abs(fit.q[1]) > 0.9  # it explains what the law of the first leaves
+    plain, found = model.fit(1).cost - fit.cost, beside_forms(model, fit, GROUPS, 0.5)
+    assert found.gain > 0.9 * plain if own else found.gain < 0.1 * plain
+    assert np.square(found.residual).mean() == pytest.approx(1.0, abs=0.05)
+    assert own or np.square(model.fit(1).residual).mean() > 1.2  # by its law alone the first leaves more
 
 
 def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():
@@ -115,5 +101,5 @@ def test_what_the_best_fit_imitates_has_its_chance_as_what_imitates_it(imitates)
     effects = [effect(name) for name in ("payload", "traction", "slope")]
     similar = np.eye(3)
     similar[imitates] = 0.8
-    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == [1]
-    assert _rivals(effects, np.eye(3), [0], [SimpleNamespace(cost=1.0)], set(), Thresholds()) == []
+    assert _rivals(effects, similar, [0], [SimpleNamespace(cost=1.0)], set()) == [1]
+    assert _rivals(effects, np.eye(3), [0], [SimpleNamespace(cost=1.0)], set()) == []

@@ -14,8 +14,10 @@ from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
 from sysid.verdict.found import Thresholds
 from sysid.verdict.pairs import scan_again, scan_pairs, tail
+from sysid.verdict.rounds import begin
 from sysid.verdict.scan import run
-from sysid.verdict.search import search
+from sysid.verdict.search import pairs_of as pairs_of_effects
+from sysid.verdict.search import settle
 
 pytestmark = pytest.mark.quick
 def pairs_of(evidence, wander):
@@ -54,7 +56,8 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 def verdict(evidence, wander):
-    return search(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), lambda _: 0.0, 300)
+    asked = begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300)
+    return settle(asked, pairs_of_effects(asked))
 
 
 def named(found):
@@ -62,7 +65,7 @@ def named(found):
 
 
 def test_a_hidden_pair_is_named_and_a_single_effect_stays_one(wander):
-    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.88), wander)
+    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.86), wander)
     assert named(pair) == ("named", {"slope", "track_width"})
     assert pair.scan.p_family > 0.01 > pair.p_value and pair.share > 0.7
     assert named(verdict(drives((0.0, 0.0, 1.0, 0.0)), wander)) == ("named", {"side_force"})
