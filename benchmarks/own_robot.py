@@ -44,7 +44,7 @@ TIMES = 2.0  # of the base size
 SPEEDS = {"m/s": SLOWER, "s^2/m": 1 / SLOWER}
 """By unit, of a size on a vehicle that drives at other speeds."""
 DRIVES = (*MANOEUVRES, "random", "reverse", "creep")
-"""Creeping shows dead zones and dry friction; no wheel of the others is ever told to turn so slowly."""
+"""Creeping shows dead zones and dry friction; no wheel turns so slowly in the other drives."""
 FIRST_SEED, LOG_SEED = 300, 400
 
 

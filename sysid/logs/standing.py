@@ -31,7 +31,8 @@ def stood(trials: Sequence[Trial], reach: float) -> list[str]:
     seen = {trial.name: sizes_of(trial, reach) for trial in trials}
     asked = {name: _size(one[0]) for name, one in seen.items()}
     stands = {name: _size(one[1]) < STANDS * asked[name] for name, one in seen.items()}
-    moved = [told[(told > STILL) & (size > FOLLOWS * told)] for name, (told, size) in seen.items() if not stands[name]]
+    moved = [wanted[(wanted > STILL) & (size > FOLLOWS * wanted)]
+             for name, (wanted, size) in seen.items() if not stands[name]]  # fmt: skip
     instants = np.concatenate(moved) if moved else np.zeros(0)
     least = float(np.quantile(instants, SLOWEST)) if len(instants) else 0.0
     return [name for name in seen if stands[name] and asked[name] > max(STILL, least)]

@@ -67,14 +67,14 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
         found.final, found.share = taken_on.refit, taken_on.share
-    told = unseen and f"{unseen} stands out, but without odometry nothing shows what the wheels did: log their speeds"
+    lacking = unseen and f"{unseen} stands out, but without odometry nothing shows what wheels did: log their speeds"
     if found.accepted:
         found.verdict = "named"
-        return _said(asked, found, "; ".join(filter(None, ("predicts blocks of drives that were held back", told))))
+        return _said(asked, found, "; ".join(filter(None, ("predicts blocks of drives that were held back", lacking))))
     found.final = found.base
     if unseen or missing(found.p_value, 1.0, thresholds):
         found.verdict = "unexplained"
-    return _said(asked, found, told or against)
+    return _said(asked, found, lacking or against)
 
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:
