@@ -24,6 +24,7 @@ from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
 from whill_mjx.io.command_line import WRITING, Range
 from whill_mjx.io.fields import COLUMNS
+from whill_mjx.io.folders import unfinished
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
 
@@ -436,8 +437,7 @@ def write_dataset(
         if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
             raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
                              "trials is another. Choose another --out.")
-    made, partial = not folder.exists(), folder / ".partial"
-    shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
+    made, partial = not folder.exists(), unfinished(folder)
     try:
         accepted, refused = _write_accepted(partial, drives)
         notes = [f"left out: {str(error).replace(str(partial), str(folder))}" for error in refused.values()]

@@ -152,7 +152,7 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
                              f"and yaw; negate it.")
             elif odd and (limit := _limit(trials, channel, index)) is not None:
                 found.append(f"{where}, but follows commands below {limit:.2g} {unit}: it is limited to about that. "
-                             "State it as command_limits, so that replays take commands as the vehicle does.")
+                             "Larger commands act as that one; cut them in command.csv before a fit.")
             elif odd:
                 seen.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")

@@ -76,23 +76,7 @@ def load_log(folder: str | Path) -> Log:
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
-    elif "command_limits" in fields:
-        trials, said = _within_limits(trials, *fields["command_limits"])
-        notes += said
     return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
-
-
-def _within_limits(trials: tuple[Trial, ...], v: float, omega: float) -> tuple[tuple[Trial, ...], list[str]]:
-    """Trials with commands as a vehicle takes them that limits them to so much [m/s, rad/s], and a note where it
-    does."""
-    over = sum(int(((np.abs(one.command.v) > v) | (np.abs(one.command.omega) > omega)).sum()) for one in trials)
-    if not over:
-        return trials, []
-    every = sum(len(one.command.t) for one in trials)
-    limited = tuple(replace(one, command=replace(one.command, v=np.clip(one.command.v, -v, v),
-                                                 omega=np.clip(one.command.omega, -omega, omega))) for one in trials)
-    return limited, [f"{over} of {every} commands are beyond command_limits: they are taken as the limits, {v:g} m/s "
-                     f"and {omega:g} rad/s"]
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
@@ -256,7 +240,8 @@ def hash_files(folder: Path) -> str:
     digest = hashlib.sha256()
     results = {path.parent for path in folder.rglob(RUN_FILE)}  # of commands that were given a place in here
     for path in sorted(folder.rglob("*")):
-        if not results.isdisjoint(path.parents):
+        unfinished = any(part.startswith(".") for part in path.relative_to(folder).parts)  # of a killed conversion
+        if unfinished or not results.isdisjoint(path.parents):
             continue
         if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
             digest.update(str(path.relative_to(folder)).encode() + b"\0")

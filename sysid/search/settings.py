@@ -40,7 +40,7 @@ class FitConfig:
     """Iterations of the gradient search, after the first one on features."""
     elsewhere: bool = True
     """Whether the gradient search also starts far away along ranges where that costs little, from other delays, and
-    from random points close to its end. A quick fit of a robot file does not: that takes four times as long."""
+    from random points close to its end. A fit of a robot file does not: that takes four times as long."""
     seed: Annotated[int, SEED] = 0
     """Seed of both searches."""
     quick: bool = False

@@ -36,6 +36,8 @@ GROUPS = {
 """What is measured in one way, and so known or unknown together."""
 DAMPING = 1e-3
 ITERATIONS = 15
+LARGEST = 1e30
+"""Error of a replay that diverged."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def chosen_sizes(
     held = np.array([[any(name in groups[group] for group in one) for name in space.names] for one in options])
     follow = _Follow(objective, evidence, space.to_unit(space.initial))
     left = _held_back(follow, poses, held, robust) if groups else np.zeros((1, 1))
-    best = simplest(np.log(np.maximum(left, 1e-300)), held.sum(1))  # noise of a manoeuvre has a size of its own
+    left = np.where(np.isfinite(left), left, LARGEST)  # a replay that diverged
+    best = simplest(np.log(np.clip(left, 1e-300, LARGEST)), held.sum(1))  # noise of a manoeuvre has a size of its own
     if not held[best].any():
         return Choice((), u, cost)
     names = tuple(name for name, one in zip(space.names, held[best], strict=True) if one)

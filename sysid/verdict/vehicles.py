@@ -30,7 +30,8 @@ def vehicle_before(result: Result) -> Any:
 
 
 def vehicle_after(result: Result) -> Any:
-    """The vehicle with the accepted effects in it, and only these."""
+    """The vehicle with the effects of the last fit in it: those that were named, and one without a name that only wheels
+    would show."""
     if result.search.verdict != "named":
         return vehicle_before(result)
     final = result.search.final

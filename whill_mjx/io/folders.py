@@ -202,11 +202,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     if out.exists():
         raise FolderRefused(f"--out {out}: exists already and is not replaced. Choose another --out.")
     check_place("--out", out)
-    stem = f".{out.name}.partial-{socket.gethostname()}-"
-    for leftover in out.parent.glob(f"{stem}*"):
-        if not _runs(leftover.name.removeprefix(stem)):
-            shutil.rmtree(leftover, ignore_errors=True)
-    partial = out.with_name(f"{stem}{os.getpid()}")
+    partial = unfinished(out.parent, out.name)
     try:
         partial.mkdir(parents=True)
         yield partial
@@ -214,6 +210,15 @@ def new_folder(out: Path) -> Iterator[Path]:
             os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def unfinished(folder: Path, name: str = "") -> Path:
+    """A place in `folder` for what this process has not finished; those of processes that were killed are removed."""
+    stem = f".{name}.partial-{socket.gethostname()}-" if name else f".partial-{socket.gethostname()}-"
+    for leftover in folder.glob(f"{stem}*"):
+        if not _runs(leftover.name.removeprefix(stem)):
+            shutil.rmtree(leftover, ignore_errors=True)
+    return folder / f"{stem}{os.getpid()}"
 
 
 def _runs(pid: str) -> bool:
