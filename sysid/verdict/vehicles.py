@@ -30,7 +30,7 @@ def vehicle_before(result: Result) -> Any:
 
 
 def vehicle_after(result: Result) -> Any:
-    """The vehicle with the effects of the last fit in it: those that were named, and one that only wheels would show."""
+    """The vehicle with the effects of the last fit in it: those named, and one that only wheels would show."""
     if result.search.verdict != "named":
         return vehicle_before(result)
     final = result.search.final
