@@ -194,7 +194,7 @@ class TrialWriter:
                 self._add("command", t, *self._waiting)
         if self._is_early(stream, t):
             return  # stamped before the start, or two messages within a microsecond
-        t = round(t - self._origin, 6)
+        t = round(t - self._origin, 6) + 0.0  # a time a little before the start is 0 and not -0
         self._last[stream] = t
         self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
         self.rows[stream] += 1

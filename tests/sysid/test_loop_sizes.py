@@ -111,7 +111,8 @@ def test_a_fit_at_the_end_of_a_range_starts_anew_with_the_effect_alone():
     assert not refitter.stuck(fit)
     assert refitter.stuck(replace(fit, u=np.zeros(1))) and refitter.stuck(replace(fit, q=np.array([2.0, 5.0, -12.0])))
     starts = elsewhere(refitter, fit, 1)
-    assert [start.q.tolist() for start in starts] == [[2.0, 5.0, 0.0], [2.0, 12.0, 0.0]]
+    found = [start.q.tolist() for start in starts]
+    assert found == [[2.0, 5.0, 0.0], [2.0, 12.0, 0.0], [2.0, 5.0, -2.0], [2.0, 5.0, 2.0]]
     assert all(start.u == 0.5 for start in starts)
 
 

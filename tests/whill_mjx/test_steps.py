@@ -6,20 +6,21 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
 import tiny_steps
-from test_chaos_training import SIGNALS, finished, started
+from test_chaos_training import SIGNALS, Process, finished
 
 from whill_mjx.io import steps
 from whill_mjx.io.steps import keep_steps, step
 
 pytestmark = pytest.mark.quick
 IDENTITY = {"data": "a", "seed": 0}
-TINY = [sys.executable, str(Path(__file__).with_name("tiny_steps.py"))]
+TINY = partial(Process, [sys.executable, str(Path(__file__).with_name("tiny_steps.py"))])
 
 
 class Stop(BaseException):
@@ -151,10 +152,11 @@ def test_a_command_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_p
     straight, broken, random = tmp_path / "straight", tmp_path / "broken", Random(7)
     assert finished(TINY, straight, "--pause", "0")[0] == 0
     for number in SIGNALS * 3:
-        child = started(TINY, broken)
+        child = TINY(["--out", str(broken)], tmp_path / "said")
         time.sleep(random.uniform(0.0, 0.4))
         child.send_signal(number)
-        told = child.communicate()[1]
+        child.wait()
+        told = child.said.read_text()
         if child.returncode == 0:
             break
         assert child.returncode == (-number if number == signal.SIGKILL else 130)
