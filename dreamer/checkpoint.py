@@ -12,6 +12,8 @@ import logging
 import os
 import re
 import shutil
+import sys
+import uuid
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -68,7 +70,7 @@ def save(
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
     if not parallel.is_first_process():
         return target
-    temporary = folder / f"{UNFINISHED}{target.name}"
+    temporary = folder / f"{UNFINISHED}{target.name}-{uuid.uuid4().hex}"  # an interrupted writer may still use its own
     temporary.mkdir()  # with the user's own rights: colleagues resume and evaluate too
     try:
         with _os_errors(target), _checkpointer(ocp) as writer:
@@ -85,6 +87,9 @@ def save(
             os.replace(target, temporary.with_name(f"{temporary.name}.old"))
         os.replace(temporary, target)
         _remove_unfinished(folder)
+    except (KeyboardInterrupt, SystemExit):
+        _hush_writer()
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     for old in complete(folder)[:-KEEP]:
@@ -111,6 +116,18 @@ def _os_errors(target: Path) -> Iterator[None]:
 def is_whole(state: Any) -> bool:
     """Whether all arrays of an interrupted run are there: an interrupt may come while the next ones replace them."""
     return not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in jax.tree.leaves(state))
+
+
+def _hush_writer() -> None:
+    """Threads of an interrupted writer lose their folder and their loop: that is no news to whoever stopped it."""
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    show = sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        if "Event loop is closed" not in str(error):
+            show(kind, error, trace)
+
+    sys.excepthook = hook
 
 
 def _remove_unfinished(folder: Path) -> None:

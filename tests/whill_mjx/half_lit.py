@@ -1,6 +1,6 @@
 """A tiny problem for PPO, and its training as a command of seconds: folder, signals and resuming are the real ones.
 
-    python -m tests.whill_mjx.half_lit --out RUN --seed 0
+    python tests/whill_mjx/half_lit.py --out RUN --seed 0
 """
 
 from __future__ import annotations
@@ -91,10 +91,5 @@ def main(options):
             save_arrays(path, flatten_weights(params))
 
 
-def cli():
-    """Command line."""
-    run(Options, main, __doc__, positional=False)
-
-
 if __name__ == "__main__":
-    cli()
+    run(Options, main, __doc__, positional=False)

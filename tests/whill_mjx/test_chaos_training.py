@@ -3,35 +3,31 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
-from warm_starter import Warm
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 ROOT = Path(__file__).parents[2]
-TINY = "tests.whill_mjx.half_lit"
+TINY = [sys.executable, str(Path(__file__).with_name("half_lit.py"))]
 REAL = [sys.executable, "-m", "whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "800",
         "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "1"]  # fmt: skip
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
-class Process(subprocess.Popen):
-    """A command as users start it, with stderr in `said`; begun when it has taken its signals over."""
-
-    def __init__(self, command, words, said):
-        self.said = said
-        with said.open("w") as file:
-            super().__init__([*command, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file)
-        while self.poll() is None and not catches(self.pid, signal.SIGTERM):
-            time.sleep(0.01)
+def started(command, out, *more):
+    """A process of the command that has taken its signals over."""
+    child = start(command, out, *more)
+    while child.poll() is None and not catches(child.pid, signal.SIGTERM):
+        time.sleep(0.01)
+    return child
 
 
 def catches(pid, number):
@@ -44,10 +40,15 @@ def catches(pid, number):
     return bool(int(mask, 16) >> (number - 1) & 1)
 
 
-def finished(start, out, *more):
-    """Exit code and stderr of a command that nobody ends."""
-    child = start(["--out", str(out), *more], out.with_name("said"))
-    return child.wait(), child.said.read_text()
+def start(command, out, *more):
+    return subprocess.Popen([*command, "--out", str(out), *more], cwd=ROOT, stdout=subprocess.DEVNULL,
+                            stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+
+
+def finished(command, out, *more):
+    child = started(command, out, *more)
+    told = child.communicate()[1]
+    return child.returncode, told
 
 
 def steps_of(out):
@@ -63,28 +64,26 @@ def check_whole(out):
             np.load(path).files  # noqa: B018
 
 
-def killed_again_and_again(start, start_anew, out, kills, last):
-    """Start the command and end it at a random moment, `kills` times with each signal; some fall into its start."""
+def killed_again_and_again(command, out, kills, last):
+    """Start the command and end it at a random moment, `kills` times with each signal."""
     random = Random(5)
     signals = [number for number in SIGNALS for _ in range(kills)]
     random.shuffle(signals)
     for index, number in enumerate(signals):
-        wanted = (index + 1) * last // (len(signals) + 1) if index % 3 else 0
-        child = (start if wanted else start_anew)(["--out", str(out)], out.with_name("said"))
+        wanted = (index + 1) * last // (len(signals) + 1) if index % 3 else 0  # some fall into its start
+        child = started(command, out)
         deadline = time.monotonic() + 300
         while wanted and child.poll() is None and steps_of(out) < wanted and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(random.uniform(0.0, 3.0) if not wanted else random.uniform(0.0, 0.1))
-        if (code := child.poll()) is None:
-            child.send_signal(number)
-            code = child.wait()
-        told = child.said.read_text()
+        child.send_signal(number)
+        told = child.communicate()[1]
         if number == signal.SIGKILL:
-            assert code in (-number, 0), told
+            assert child.returncode in (-number, 0), told
         else:
-            assert code in (130, 0), told
+            assert child.returncode in (130, 0), told
             assert "Traceback" not in told
-            assert code == 0 or told.strip().splitlines()[-1].startswith("stopped")
+            assert child.returncode == 0 or told.strip().splitlines()[-1].startswith("stopped")
         check_whole(out)
 
 
@@ -103,13 +102,10 @@ def log(out):
 
 def test_a_training_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_path):
     straight, broken = tmp_path / "straight", tmp_path / "broken"
-    with Warm(TINY) as warm:
-        start = partial(warm.start, TINY)
-        assert finished(start, straight)[0] == 0
-        anew = partial(Process, [sys.executable, "-m", TINY])
-        killed_again_and_again(start, anew, broken, kills=3, last=steps_of(straight))
-        assert finished(start, broken)[0] == 0
-        code, told = finished(start, broken, "--seed", "3")
+    assert finished(TINY, straight)[0] == 0
+    killed_again_and_again(TINY, broken, kills=3, last=steps_of(straight))
+    assert finished(TINY, broken)[0] == 0
+    code, told = finished(TINY, broken, "--seed", "3")
     assert code == 2 and "seed is 0 there and 3 here" in told
     assert_same_arrays(straight / "result.npz", broken / "result.npz")
     assert log(broken) == log(straight)
@@ -119,20 +115,21 @@ def test_a_training_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_
 @pytest.mark.long
 @pytest.mark.parametrize("learner", ["dreamer", "ppo"])
 def test_the_real_command_killed_ten_times_by_each_signal_ends_in_the_same_bits(learner, tmp_path):
-    start = partial(Process, [*REAL, "--learner", learner])
+    command = [*REAL, "--learner", learner]
     straight, broken = tmp_path / "straight", tmp_path / "broken"
-    assert finished(start, straight)[0] == 0
-    killed_again_and_again(start, start, broken, kills=10, last=steps_of(straight))
-    assert finished(start, broken)[0] == 0
+    assert finished(command, straight)[0] == 0
+    killed_again_and_again(command, broken, kills=10, last=steps_of(straight))
+    assert finished(command, broken)[0] == 0
     assert_same_arrays(straight / "policy" / "weights.npz", broken / "policy" / "weights.npz")
     evaluations = [json.loads((out / "evaluation.json").read_text()) for out in (straight, broken)]
     assert evaluations[0]["policy"] == evaluations[1]["policy"]
-    code, told = finished(start, broken, "--seed", "3")
+    code, told = finished(command, broken, "--seed", "3")
     assert code == 2 and "seed is 0 there and 3 here" in told
 
 
 @pytest.mark.long
 def test_two_commands_at_once_in_one_folder_give_one_training_and_one_refusal(tmp_path):
-    children = [Process(REAL, ["--out", str(tmp_path / "run")], tmp_path / f"said{k}") for k in range(2)]
-    assert sorted(child.wait() for child in children) == [0, 2]
-    assert sum("writes there" in child.said.read_text() for child in children) == 1
+    children = [start(REAL, tmp_path / "run") for _ in range(2)]
+    told = [child.communicate()[1] for child in children]
+    assert sorted(child.returncode for child in children) == [0, 2]
+    assert sum("writes there" in text for text in told) == 1

@@ -6,21 +6,20 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
 import tiny_steps
-from test_chaos_training import SIGNALS, Process, finished
+from test_chaos_training import SIGNALS, finished, started
 
 from whill_mjx.io import steps
 from whill_mjx.io.steps import keep_steps, step
 
 pytestmark = pytest.mark.quick
 IDENTITY = {"data": "a", "seed": 0}
-TINY = partial(Process, [sys.executable, str(Path(__file__).with_name("tiny_steps.py"))])
+TINY = [sys.executable, str(Path(__file__).with_name("tiny_steps.py"))]
 
 
 class Stop(BaseException):
@@ -152,11 +151,10 @@ def test_a_command_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_p
     straight, broken, random = tmp_path / "straight", tmp_path / "broken", Random(7)
     assert finished(TINY, straight, "--pause", "0")[0] == 0
     for number in SIGNALS * 3:
-        child = TINY(["--out", str(broken)], tmp_path / "said")
+        child = started(TINY, broken)
         time.sleep(random.uniform(0.0, 0.4))
         child.send_signal(number)
-        child.wait()
-        told = child.said.read_text()
+        told = child.communicate()[1]
         if child.returncode == 0:
             break
         assert child.returncode == (-number if number == signal.SIGKILL else 130)
