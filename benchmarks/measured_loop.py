@@ -34,7 +34,7 @@ from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
 from benchmarks.measured_laws import STARTS, ablate, make_bench
-from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
+from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, fit_published, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
 from sysid.logs.lost_pose import lost, without_lost
@@ -301,6 +301,8 @@ def peers(settings: Benchmark) -> None:
         base, predicted = fit_kinematic(training, count)
         print(f"{count} numbers: {', '.join(f'{name} {value:.3g}' for name, value in base.items())}", flush=True)
         figures |= mean_errors(f"peer_{count}_numbers", errors(held, as_predictions(held, judged, predicted(judged))))
+    published = fit_published(log.training, training)(judged)
+    figures |= mean_errors("peer_published", errors(held, as_predictions(held, judged, published)))
     predicted = fit_network(training, base)
     figures |= mean_errors("peer_network", errors(held, as_predictions(held, judged, predicted(judged))))
     figures |= mean_errors("peer_ideal", errors(held, [ideal_replay(trial) for trial in held]))
