@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import tables
 from benchmarks.claims import Claim
+from benchmarks.claims.fits import _ladder
 from benchmarks.harness import RESULTS, figure, record
 from benchmarks.merge import merge
 from benchmarks.tables import MARKS, headlines, page, put_between_marks, shown
@@ -64,6 +65,13 @@ def test_every_claim_and_headline_names_figures_that_were_recorded():
                 figures.fill(cell, claim.stem) for cell in row[1:]), (claim.title, row)
     for stem, what, value in tables.HEADLINES:
         assert figures.fill(value, stem), what
+
+
+def test_the_ladder_has_a_row_for_each_rung_whatever_was_named():
+    rungs = ("ideal", "base", "with_1_pose_delay", "with_2_supply_sag_quadratic_drag")
+    rows = _ladder({"figures": {f"ladder_all_position_{rung}": {} for rung in rungs}})
+    assert [row[0] for row in rows[:-1]] == [
+        "ideal replay", "fitted base", "with `pose_delay`", "with `supply_sag`, `quadratic_drag`"]
 
 
 def test_readme_has_at_most_ten_figures_and_both_pages_agree_with_the_result_files():

@@ -157,6 +157,8 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert sanity(log_of(good)) == []
     flipped = replace(good, odometry=replace(good.odometry, omega=-good.odometry.omega))
     assert any("odometry: omega" in one and "sign is reversed" in one for one in sanity(log_of(flipped)))
+    backwards = replace(good, ground_truth=replace(good.ground_truth, yaw=good.ground_truth.yaw + np.pi))
+    assert any("moves against its own yaw" in one for one in sanity(log_of(backwards)))
     degrees = replace(good, odometry=replace(good.odometry, omega=np.rad2deg(good.odometry.omega)))
     assert any("check its unit (rad/s)" in one for one in sanity(log_of(degrees)))
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
