@@ -41,7 +41,6 @@ PEERS = (
     ("and a limit of the wheels' speed (5)", "peer_5_numbers"),
     ("and a late pose, sideways slip (7)", "peer_7_numbers"),
     ("and a lag of turning (8)", "peer_8_numbers"),
-    ("the publishers' powertrain and slip model", "peer_published"),
     ("a network beside the 8 numbers", "peer_network"),
 )
 
@@ -241,8 +240,8 @@ CLAIMS = (
         MEASURED,
         "DRIVE: what models of the commands alone predict",
         "measured",
-        "The same steps, predicted by models that know nothing of the vehicle. The publishers' model and the network "
-        "are written anew from their descriptions.",
+        "The same steps, predicted by models that know nothing of the vehicle. All are written anew from "
+        "their descriptions.",
         ("model", "position [m]", "yaw [rad]"),
         tuple((label, f"{{{stem}_position}}", f"{{{stem}_yaw}}") for label, stem in PEERS),
     ),

@@ -148,8 +148,8 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
                 seen.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
             elif gain < 0 and channel == "ground_truth" and name == "v":
-                seen.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add pi to yaw, "
-                            "or negate the commands' v, whichever is wrong.")
+                seen.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add pi to "
+                            "yaw, or negate the commands' v, whichever is wrong.")
             elif gain < 0:
                 seen.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
