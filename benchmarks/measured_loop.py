@@ -96,7 +96,7 @@ class Benchmark:
     """Windows of 15 s of each of them."""
     cuts: tuple[int, ...] = tuple(range(TENTHS))
     """Cuts of the asphalt run into halves: each begins at one of its tenths."""
-    rounds: Annotated[int, COUNT] = 3
+    rounds: Annotated[int, COUNT] = 5
     """Loops at most, one after the other."""
     floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "acceleration_limit", "pose_delay")
     """Effects that the base model of `change` has besides the physical preset."""
