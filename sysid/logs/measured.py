@@ -565,8 +565,8 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     """
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
-        log: Log = with_own_timeout(_without_held(load_log(path)))
-        return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
+        log: Log = in_windows(with_own_timeout(_without_held(load_log(path))))
+        return without_standing(split(log, train, held_out) if train else log, str(path))
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
                          + ("warthog_sand_1" if form == "drive_norlab" else "robot1 robot2 robot3")
