@@ -131,5 +131,5 @@ def test_a_gyro_alone_is_refused_with_the_reason(tmp_path):
 def test_windows_of_a_long_drive_can_be_held_out(tmp_path):
     trial = drive("whole", seconds=130.0)
     pose = "ground_truth", "t,x,y,yaw", np.column_stack([trial.ground_truth.t, trial.ground_truth.values])
-    log = load_any(write(tmp_path, "", trial, pose), train=("whole:0-0.667",), held_out=("whole:0.667-1",))
+    log = load_any(write(tmp_path, "", trial, pose), train=("whole:0-0.6",), held_out=("whole:0.6-1",))
     assert len(log.training) == 4 and [one.name for one in log.held_out] == ["whole/004", "whole/005"]
