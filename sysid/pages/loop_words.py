@@ -17,7 +17,8 @@ FAR = 2.0  # day-to-day spreads, beyond which a refit went further than days do
 def title(report: Mapping[str, Any]) -> str:
     """What was found, in one line: `Missing: command delay 0.152 s (0.113 to 0.190)`."""
     if report["verdict"] == "none":
-        return "Nothing is missing that these drives show"
+        return "No known effect stands out in these drives" if untold(report) else (
+            "Nothing is missing that these drives show")
     if report["verdict"] != "named":
         return "Something is missing that no known effect explains"
     changed = [one for one in report["effects"] if is_change(one)]
@@ -25,6 +26,12 @@ def title(report: Mapping[str, Any]) -> str:
     parts = [f"{what}: {'; '.join(map(sized, those))}" for what, those in (("Missing", missing), ("Changed", changed))
              if those]
     return "; ".join(parts)
+
+
+def untold(report: Mapping[str, Any]) -> bool:
+    """Whether neither other days nor repeats show how large the noise of the drives is."""
+    errors = [one for part in report["before"].values() for one in part.values()]
+    return not report.get("known", True) and not any(one.get("noise_floor") for one in errors)
 
 
 def lead(report: Mapping[str, Any]) -> list[str]:
@@ -72,7 +79,7 @@ def spoken(name: str) -> str:
 
 def prediction(report: Mapping[str, Any]) -> str:
     """How far off the vehicles are on drives that were not fitted."""
-    part = "held_out" if report["before"]["held_out"] else "training"
+    part = "held_out" if any(report["before"]["held_out"].values()) else "training"
     channel = next((name for name in ("ground_truth", "odometry")
                     if "trajectory" in report["before"][part].get(name, {})), None)
     if channel is None:
@@ -160,6 +167,9 @@ def not_determined(parameters: Mapping[str, Any]) -> list[str]:
 
 
 def _found(report: Mapping[str, Any]) -> str:
+    if report["verdict"] == "none" and untold(report):
+        return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. Whether "
+                "anything without a name is missing is unknown.")
     if report["verdict"] == "none":
         return ("The vehicle drives as it did on its other days; differences are within its noise and its day-to-day "
                 "spread." if report.get("known", True) else "The model describes these drives to within their noise.")

@@ -41,6 +41,16 @@ def test_the_title_says_what_was_found_with_its_size_and_interval():
     assert title(report(verdict="unexplained")).startswith("Something is missing")
 
 
+def test_drives_that_stand_alone_are_not_said_to_be_described_to_within_their_noise():
+    alone = report(verdict="none", known=False, before={
+        "training": {"ground_truth": {"trajectory": 2.7}}, "held_out": {"ground_truth": {}, "odometry": {}}},
+        refitted={"training": {"ground_truth": {"trajectory": 2.8}}})
+    assert title(alone) == "No known effect stands out in these drives"
+    what, change, _ = lead(alone)
+    assert "no drive was repeated" in what
+    assert change.startswith("On the drives that were fitted") and "270.0 cm" in change
+
+
 def test_an_effect_that_was_there_before_has_changed():
     had = effect("command_delay", {"command_delay.delay": parameter(0.152, 0.113, 0.190, was=0.02)})
     assert title(report(had)) == "Missing: command delay 0.152 s (0.113 to 0.190)"  # no more than it is unsure by
