@@ -168,8 +168,8 @@ def not_determined(parameters: Mapping[str, Any]) -> list[str]:
 
 def _found(report: Mapping[str, Any]) -> str:
     if report["verdict"] == "none" and untold(report):
-        return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. Whether "
-                "anything without a name is missing is unknown.")
+        return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. "
+                "Whether anything without a name is missing is unknown.")
     if report["verdict"] == "none":
         return ("The vehicle drives as it did on its other days; differences are within its noise and its day-to-day "
                 "spread." if report.get("known", True) else "The model describes these drives to within their noise.")

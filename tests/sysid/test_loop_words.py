@@ -42,9 +42,8 @@ def test_the_title_says_what_was_found_with_its_size_and_interval():
 
 
 def test_drives_that_stand_alone_are_not_said_to_be_described_to_within_their_noise():
-    alone = report(verdict="none", known=False, before={
-        "training": {"ground_truth": {"trajectory": 2.7}}, "held_out": {"ground_truth": {}, "odometry": {}}},
-        refitted={"training": {"ground_truth": {"trajectory": 2.8}}})
+    errors = {"training": {"ground_truth": {"trajectory": 2.7}}, "held_out": {"ground_truth": {}, "odometry": {}}}
+    alone = report(verdict="none", known=False) | dict.fromkeys(("before", "refitted", "after"), errors)
     assert title(alone) == "No known effect stands out in these drives"
     what, change, _ = lead(alone)
     assert "no drive was repeated" in what
