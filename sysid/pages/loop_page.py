@@ -10,7 +10,17 @@ import numpy as np
 from sysid.logs.metrics import METRICS, UNITS, integrate
 from sysid.logs.records import Start
 from sysid.pages.before_after import drive_pictures, drive_table
-from sysid.pages.loop_words import command_of, describe_unnamed, lead, not_determined, sentence, spoken, title, vehicles
+from sysid.pages.loop_words import (
+    another_floor,
+    command_of,
+    describe_unnamed,
+    lead,
+    not_determined,
+    sentence,
+    spoken,
+    title,
+    vehicles,
+)
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
 from whill_mjx.io.svg import PALETTE, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
@@ -48,6 +58,11 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
 def found(report: dict[str, Any]) -> str:
     """Three sentences, what to do about doubts, and one drive before and after."""
     parts = [paragraph(" ".join(lead(report)[1:]))]
+    if another_floor(report):
+        rows = [[one["quantity"], "" if one["unit"] == "-" else one["unit"], one["before"], one["value"],
+                 *one["interval"]] for one in report["floor"]["members"]]
+        parts += [heading("Another floor"), table(["measured without the model", "unit", "reference", "these drives",
+                                                   "95 % from", "to"], rows)]
     if report["advice"]:
         parts += [heading("Before you rely on it"), bullets(report["advice"])]
     if text := report["noise_sentence"]:

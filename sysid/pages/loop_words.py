@@ -16,16 +16,21 @@ FAR = 2.0  # day-to-day spreads, beyond which a refit went further than days do
 
 def title(report: Mapping[str, Any]) -> str:
     """What was found, in one line: `Missing: command delay 0.152 s (0.113 to 0.190)`."""
-    if report["verdict"] == "none":
+    floor = ["another floor"] if another_floor(report) else []
+    if report["verdict"] == "none" and not floor:
         return "No known effect stands out in these drives" if untold(report) else (
             "Nothing is missing that these drives show")
-    if report["verdict"] != "named":
-        return "Something is missing that no known effect explains"
+    if report["verdict"] == "unexplained":
+        return "; ".join(["Something is missing that no known effect explains", *(f"changed: {one}" for one in floor)])
     changed = [one for one in report["effects"] if is_change(one)]
-    missing = [one for one in report["effects"] if one not in changed]
-    parts = [f"{what}: {'; '.join(map(sized, those))}" for what, those in (("Missing", missing), ("Changed", changed))
-             if those]
-    return "; ".join(parts)
+    missing = [sized(one) for one in report["effects"] if one not in changed]
+    parts = [("Missing", missing), ("Changed", [*map(sized, changed), *floor])]
+    return "; ".join(f"{what}: {'; '.join(those)}" for what, those in parts if those)
+
+
+def another_floor(report: Mapping[str, Any]) -> bool:
+    """Whether gyro and wheels show another floor than that of the reference."""
+    return bool((report.get("floor") or {}).get("name"))
 
 
 def untold(report: Mapping[str, Any]) -> bool:
@@ -170,6 +175,13 @@ def _found(report: Mapping[str, Any]) -> str:
     if report["verdict"] == "none" and untold(report):
         return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. "
                 "Whether anything without a name is missing is unknown.")
+    far = sorted((row for row in report.get("base", ()) if abs(row["away"]) > FAR), key=lambda row: -abs(row["away"]))
+    if report["verdict"] == "none" and another_floor(report):
+        return "These drives differ from the reference as on another floor; no effect stands out beside that."
+    if report["verdict"] == "none" and report.get("known", True) and far:
+        more = f", and {len(far) - 1} more" if len(far) > 1 else ""
+        return ("No effect stands out, but the vehicle differs from its other days by more than they do: "
+                f"{spoken(far[0]['name'].partition('.')[2])} by {abs(far[0]['away']):.0f} day-to-day spreads{more}.")
     if report["verdict"] == "none":
         return ("The vehicle drives as it did on its other days; differences are within its noise and its day-to-day "
                 "spread." if report.get("known", True) else "The model describes these drives to within their noise.")
