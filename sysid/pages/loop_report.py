@@ -128,9 +128,11 @@ def make_report(result: Result) -> dict[str, Any]:
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
+    base = base_table(result)
+    same = found.verdict == "none" and not shifts(base) and not (result.floor and result.floor.named)
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
-        "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
+        "noise": noise, "noise_sentence": said(noise, same) or None,
         "warnings": warnings(result),
         "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
         "remark": result.reference.remark,
@@ -162,7 +164,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
-        "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
+        "next_manoeuvre": next_manoeuvre(result), "base": base, "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
 
