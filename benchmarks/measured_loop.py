@@ -367,7 +367,8 @@ def halves(settings: Benchmark) -> None:
     named = [loop["verdict"] == "named" or bool(loop["floor"] and loop["floor"]["name"]) for loop in loops]
     figures = {"half_false": figure([float(sum(named))], f"of {len(named)} halves of the asphalt run"),
                "half_unexplained": figure([float(sum(loop["verdict"] == "unexplained" for loop in loops))],
-                                          f"of {len(named)} halves of the asphalt run")}
+                                          f"of {len(named)} halves of the asphalt run"),
+               "half_cuts": figure([float(len(named))], "halves of the asphalt run")}
     show(figures)
     record("measured", CLAIM, figures)
 

@@ -41,6 +41,7 @@ PEERS = (
     ("and a limit of the wheels' speed (5)", "peer_5_numbers"),
     ("and a late pose, sideways slip (7)", "peer_7_numbers"),
     ("and a lag of turning (8)", "peer_8_numbers"),
+    ("the publishers' powertrain and slip model", "peer_published"),
     ("a network beside the 8 numbers", "peer_network"),
 )
 
@@ -254,6 +255,18 @@ CLAIMS = (
         "Gyro and wheels named the change in all three runs.",
         ("run", "as on asphalt", "on its floor", "gain, position", "gain, yaw"),
         tuple(_changed(run) for run in ("gravel", "sand_1", "sand_2")),
+    ),
+    Claim(
+        MEASURED,
+        "DRIVE: halves of one run",
+        "measured",
+        "Halves of the asphalt run against one another, of which nothing differs: how often something is named all the "
+        "same. Each cut begins at another tenth of the run.",
+        ("asked", "false names", "cuts"),
+        (
+            ("gyro and wheels, whether the floor is another one", "{floor_false_asphalt}", "10"),
+            ("the whole loop, what is missing", "{half_false}", "{half_cuts}"),
+        ),
     ),
     Claim(
         MEASURED,
