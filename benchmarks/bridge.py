@@ -308,9 +308,9 @@ class SteadyRun:
             shown = sum(t < end - 0.01 for t in results["image_times"])
             figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
         else:
-            for name, share in (("p50", 50), ("p99", 99), ("max", 100)):
+            for name, share, more in (("p50", 50, (histogram(delays),)), ("p99", 99, ()), ("max", 100, ())):
                 figures[f"frame_to_command_{name}{suffix}_ms"] = (
-                    [float(np.percentile(delays, share))], f"ms, of {len(delays)} frames", histogram(delays))
+                    [float(np.percentile(delays, share))], f"ms, of {len(delays)} frames", *more)
             figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(error, 99))], "ms")
             figures[f"drive_processor{suffix}_share"] = ([self._taken / seconds], "of a core, by the policy node")
         return figures, stops(drive), int((intervals > 150).sum())
