@@ -13,6 +13,7 @@ the first zero that the base hears.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -24,13 +25,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.bridge_faults import FAULTS, Figures, measure_faults
+from benchmarks.bridge_faults import FAULTS, Figures, fault_rows, measure_faults
 from bridge.options import Parser, in_range, whole
 from bridge.simulated import Frame
 from whill_mjx.io.command_line import guarded
@@ -201,19 +201,25 @@ def burners(count: int, cores: Sequence[int] = ()) -> Iterator[None]:
             one.wait()
 
 
-def fuzz(count: int) -> int:
-    """Return how many commands of a supervisor left the limits, of so many outputs of any bits."""
+def fuzz(count: int) -> tuple[int, int]:
+    """Return how many commands of a supervisor left its limits, and its slew limits, of so many outputs of any bits."""
     from bridge.safety import SafetyConfig, Supervisor
 
-    config = SafetyConfig((-0.5, -1.0), (1.0, 1.0))
-    supervisor, rng, now, wrong = Supervisor(config), np.random.default_rng(0), 0.0, 0
+    low, high, slew = np.array([-0.5, -1.0]), np.array([1.0, 1.0]), np.array([0.5, 1.0])
+    plain = SafetyConfig((-0.5, -1.0), (1.0, 1.0))
+    supervisors = [Supervisor(plain), Supervisor(dataclasses.replace(plain, slew=(0.5, 1.0)))]
+    rng, now, wrong, jumps, before = np.random.default_rng(0), 0.0, 0, 0, np.zeros(2)
     for number, bits in enumerate(rng.integers(0, 2**64, (count, 2), np.uint64)):
         now += 0.1
-        supervisor.frame(now, now, number)
-        command = supervisor.action(now, bits.view(np.float64))
-        wrong += not (-0.5 <= command.v <= 1.0 and -1.0 <= command.omega <= 1.0)
-        supervisor.arm()
-    return wrong
+        for supervisor in supervisors:
+            supervisor.frame(now, now, number)
+            command = supervisor.action(now, bits.view(np.float64))
+            sent = np.array([command.v, command.omega])
+            wrong += not (np.all(low <= sent) and np.all(sent <= high))
+            supervisor.arm()
+        jumps += bool(sent.any() and np.any(np.abs(sent - before) > 0.1 * slew + 1e-9))
+        before = sent
+    return wrong, jumps
 
 
 def policy_times(policy_path: Path, steps: int) -> np.ndarray:
@@ -243,7 +249,7 @@ def cold_start(policy_path: Path) -> float:
     return time.perf_counter() - start
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Steady:
     """An undisturbed drive of some kind."""
 
@@ -451,9 +457,14 @@ def main() -> None:
             figures |= measure_episodes(policy, stand_in, folder, domain, options.resets)
         if "faults" in options.parts:
             figures |= measure_faults(stand_in, domain, options.repeats, options.faults)
+            rows = fault_rows()
+            figures["faults_untested"] = ([float(sum(not checks for _, checks in rows))],
+                                          f"of {len(rows)} rows of the fault table, without figure or test")
             figures["faults_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the faults")
         if "fuzz" in options.parts:
-            figures["fuzz_outside_limits"] = ([float(fuzz(1_000_000))], "of 1,000,000 outputs of any 64 bits")
+            of = "of 1,000,000 outputs of any 64 bits"
+            for name, found in zip(("fuzz_outside_limits", "fuzz_outside_slew"), fuzz(1_000_000), strict=True):
+                figures[name] = ([float(found)], of)
         if "policy" in options.parts:
             figures |= measure_policy(policy, options.seconds)
 

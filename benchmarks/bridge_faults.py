@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ USUAL, DARK, PALE = 120, 40, 200
 """Shades of the camera's image: at DARK the policy is slow, at PALE it is surprised."""
 SLOW_STEP = 0.09
 """Seconds of a policy step at DARK; more than 0.08 is an overrun, more than 0.15 a dead node."""
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "bridge.md"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 
 
@@ -150,10 +152,24 @@ def measure_faults(policy: Path, domain: int, repeats: int, names: Sequence[str]
                 reactions.extend(reaction_times(bridge, name, inject, end, repeats if end else 1, len(reactions)))
             finally:
                 bridge.close()
-        title = "e_stop_ms" if name == "e_stop" else f"stop_{name}_ms"
+        title = title_of(name)
         found[title] = (reactions, "ms from the fault to the first zero")
         print(f"{title:28s} {np.median(reactions):8.1f} ms", flush=True)
     return found
+
+
+def title_of(name: str) -> str:
+    """Return the name of the figure of a fault."""
+    if name == FOREIGN:
+        return f"yield_{name}_ms"
+    return "e_stop_ms" if name == "e_stop" else f"stop_{name}_ms"
+
+
+def fault_rows() -> list[tuple[str, list[str]]]:
+    """Return each row of the documented fault table, with the figures and tests that it names."""
+    _, _, page = PAGE.read_text(encoding="utf-8").partition("## What stops the vehicle")
+    cells = [line.split(" | ") for line in page.partition("\n## ")[0].splitlines() if line.startswith("| ")]
+    return [(row[0].lstrip("| "), re.findall(r"`(\w+)`", row[-1])) for row in cells[1:]]
 
 
 def reaction_times(bridge: Bridge, name: str, inject: Any, end: Any, repeats: int, phase: int) -> list[float]:
@@ -200,7 +216,7 @@ def measure_yield(policy: Path, domain: int, repeats: int) -> Figures:
             robot.arm()
     finally:
         bridge.close()
-    return {"yield_foreign_command_ms": (found, "ms from a foreign command to the bridge's last one")}
+    return {title_of(FOREIGN): (found, "ms from a foreign command to the bridge's last one")}
 
 
 def drive_slowly() -> int:

@@ -113,7 +113,7 @@ class DriveNode(VehicleNode):
         now, simulated = time.monotonic(), self.node.get_clock().now().nanoseconds
         if simulated != self._simulated:
             self._ticked, self._simulated = now, simulated
-        self.supervisor.block(CLOCK_STANDS, now - self._ticked > self.options.frame_age)
+        self.supervisor.block(CLOCK_STANDS, now + WATCH_PERIOD - self._ticked > self.options.frame_age)
 
     def causes(self) -> list[str]:
         """Return what is wrong with camera, base and guard now, each with its remedy."""
