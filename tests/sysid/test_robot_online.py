@@ -16,14 +16,14 @@ def robot(tmp_path_factory):
 
 
 def test_it_is_placed_drives_straight_and_turns_to_the_left_as_it_reports(robot):
-    robot.place(1.0, -2.0, 2.5)
-    np.testing.assert_allclose(robot.motion, [1.0, -2.0, 2.5, 0, 0], atol=1e-9)
+    robot.place(1.0, -2.0, 1.5)
+    np.testing.assert_allclose(robot.motion, [1.0, -2.0, 1.5, 0, 0], atol=1e-9)
     robot.advance(0.2, 0.0, 2.0)
-    ahead = (robot.motion[:2] - [1.0, -2.0]) @ [np.cos(2.5), np.sin(2.5)]
+    ahead = (robot.motion[:2] - [1.0, -2.0]) @ [np.cos(1.5), np.sin(1.5)]
     assert ahead == pytest.approx(0.4, abs=0.02) and robot.odometry[0] == pytest.approx(ahead, abs=0.005)
     assert robot.motion[3] == pytest.approx(0.2, abs=0.005)
     robot.advance(0.0, 0.5, 2.0)
-    assert robot.motion[2] - 2.5 == pytest.approx(1.0, abs=0.1) and robot.motion[4] == pytest.approx(0.5, abs=0.03)
+    assert robot.motion[2] - 1.5 == pytest.approx(1.0, abs=0.1) and robot.motion[4] == pytest.approx(0.5, abs=0.03)
 
 
 def test_one_drive_after_another_begins_at_rest_and_is_the_same(robot):
