@@ -52,9 +52,10 @@ class ChairSimulator:
         import jax
 
         from whill_mjx import env as environment
-        from whill_mjx.sensors.lidar import distances
         from whill_mjx.tasks.tasks import make_task
         from whill_mjx.vehicle.kinematics import reference_pose
+        from whill_mjx.world.lidar import first_hits
+        from whill_mjx.world.people.contact import scene_without_people
         from whill_mjx.world.render import pinhole
 
         fields = {**changes, "action_repeat": 1}
@@ -71,10 +72,10 @@ class ChairSimulator:
 
         def scan(state: Any) -> Any:
             x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
-            return distances(x, y, yaw + angles, state.scene.boxes, SCAN_RANGE, SCAN_HEIGHT, SCAN_HEIGHT)
+            return jax.numpy.minimum(first_hits(state.scene, x, y, yaw + angles, SCAN_HEIGHT), SCAN_RANGE)
 
         self._scan = jax.jit(scan)
-        self._occupied = jax.jit(lambda scene, x, y: _touched(scene, x, y))
+        self._occupied = jax.jit(lambda scene, x, y: _touched(scene_without_people(scene), x, y))
         self._key = jax.random.key
         self._reset = jax.jit(lambda key: environment.reset(env, params, key))
         self._step = jax.jit(lambda state, action: environment.step(env, params, state, action))
@@ -148,13 +149,26 @@ class MovedSimulator(ChairSimulator):
 
         from whill_mjx.env import endings_of, moment_of, observe
         from whill_mjx.vehicle.dynamics import place
+        from whill_mjx.vehicle.kinematics import reference_pose
+        from whill_mjx.world.people.contact import poses_among_people, walk_around
+        from whill_mjx.world.scene import footprint
 
-        env, params = self.env, self.params
+        env, params, spec, task = self.env, self.params, self.env.model.spec, self.env.task
+        fastest = max(abs(task.v_min), abs(task.v_max))
+        poses = poses_among_people(fastest, task.omega_max, self.period, spec.body_length / 2, spec.body_width / 2)
 
         def look(state: Any, motion: Any, command: Any) -> Any:
             vehicle = place(env.model, params, *motion)
             count = state.step_count + 1
+            ran_into = jnp.asarray(False)
+            if state.scene.people is not None:
+                before, now = (footprint(spec, *reference_pose(env.model, one.qpos))
+                               for one in (state.vehicle, vehicle))
+                scene, ran_into, _ = walk_around(state.scene, before, now, self.period, poses)
+                state = dataclasses.replace(state, scene=scene)
             moment = moment_of(env, state, vehicle, command, count)
+            moment = dataclasses.replace(moment, collided=moment.collided | ran_into,
+                                         reached=moment.reached & ~ran_into)
             ends = endings_of(env.task, moment)
             after = dataclasses.replace(state, vehicle=vehicle, command=jnp.asarray(command), step_count=count,
                                         goal_distance=moment.goal_distance)
