@@ -110,17 +110,29 @@ def export_stand_in(folder: Path) -> Path:
     return export_policy(folder, step, carry, weights, contract, check_steps=1000)
 
 
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where two nodes run."""
+
+    domain: int
+    """ROS domain."""
+    cores: Sequence[int] = ()
+    """That they have for themselves; none takes all."""
+    realtime: bool = False
+    """Under SCHED_FIFO."""
+
+
 class Run:
     """One simulator and one policy node, and what they report."""
 
-    def __init__(self, folder: Path, policy: Path, robot: str, domain: int, *options: str, realtime: bool = False,
-                 cores: Sequence[int] = ()) -> None:
+    def __init__(self, folder: Path, policy: Path, robot: str, place: Place, *options: str) -> None:
+        domain = place.domain
         self.results, self.drive_results = folder / f"simulate_{domain}.json", folder / f"drive_{domain}.json"
         for path in (self.results, self.drive_results):
             path.unlink(missing_ok=True)
-        self._cores = cores
+        self._cores = place.cores
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        scheduling = ("--realtime", "20") if realtime else ()
+        scheduling = ("--realtime", "20") if place.realtime else ()
         self.drive = self._start("bridge.drive", str(policy), "--results", str(self.drive_results), *scheduling)
         self.simulate = self._start("bridge.simulate", "--simulator", f"benchmarks.bridge:{robot}", "--results",
                                     str(self.results), *scheduling, *options)
@@ -288,7 +300,7 @@ class SteadyRun:
         self.kind = kind
         self._stack = contextlib.ExitStack()
         self._stack.enter_context(burners(kind.burners, cores))
-        self._run = Run(folder, policy, "EndlessRobot", domain, *kind.options, realtime=kind.realtime, cores=cores)
+        self._run = Run(folder, policy, "EndlessRobot", Place(domain, cores, kind.realtime), *kind.options)
         self.memory: list[float] = []
         self._taken = 0.0
 
@@ -373,7 +385,7 @@ def measure_steady(policy: Path, folder: Path, domain: int, seconds: float, kind
 
 def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, resets: int) -> Figures:
     """Return the reactions to a camera that falls silent, at resets, and to an action that is not a number."""
-    run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
+    run = Run(folder, policy, "ShortRobot", Place(domain), "--episodes", str(resets))
     run.simulate.wait(30 + 4 * resets)
     results, _ = run.finish()
     moved = [t for t, v, omega in results["commands"] if v or omega]
@@ -381,7 +393,7 @@ def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, re
     episodes = [episode for episode in results["episodes"] if any(0 <= episode["ended"] - t < 0.2 for t in moved)]
     stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
                 for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
-    run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
+    run = Run(folder, stand_in, "WhiteRobot", Place(domain + 1), "--episodes", "4")
     run.simulate.wait(90)
     white_results, _ = run.finish()
     whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in white_results["episodes"]]

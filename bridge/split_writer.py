@@ -48,9 +48,10 @@ class SplitWriter:
         """Add a command."""
         self._take("command", (t, v, omega), bool(v or omega))
 
-    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float, stamp: float = 0.0) -> None:
-        """Add what the odometry reports."""
-        self._take("odometry", (t, x, y, yaw, v, omega, stamp), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
+    def odometry(self, t: float, *values: float) -> None:
+        """Add what the odometry reports: x, y [m], yaw [rad], v [m/s], omega [rad/s] and, where it has one, a stamp."""
+        v, omega = values[3:5]
+        self._take("odometry", (t, *values), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement."""
