@@ -105,7 +105,7 @@ CLAIMS = (
             ("steps per second in lock-step, 64x64, of a point", "{ros_env_steps_per_s}"),
             ("reset over TCP with its image, 99 % [ms]", "{tcp_p99_ms}"),
             ("calls not served between 100,000 damaged messages", "{tcp_fuzz_failures}"),
-            ("loop: hidden effect named, of ten draws", "{loop_named_of_10}"),
+            ("loop: hidden effect named", "{loop_named} of {loop_named|.count}"),
             ("loop: held-out error removed", "{loop_heldout_removed|%} ({loop_heldout_removed|range %})"),
         ),
     ),
