@@ -12,7 +12,7 @@ import pytest
 
 from sysid import command_line as commands
 from whill_mjx.io import command_line
-from whill_mjx.processor import FLAG, OPTION, as_one_function, share_results, shares_results
+from whill_mjx.processor import FLAG, OPTION, WIDE, as_one_function, share_results, shares_results
 
 pytestmark = pytest.mark.quick
 
@@ -149,14 +149,14 @@ def test_commands_of_the_simulator_share_results(monkeypatch):
 
 
 def test_options_that_were_given_are_kept(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_cpu_max_isa=AVX2 {WIDE}=128")
     share_results()
-    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {FLAG}={OPTION}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {WIDE}=128 {FLAG}={OPTION}"
     share_results()
     assert os.environ["XLA_FLAGS"].count(OPTION) == 1
-    monkeypatch.setenv("XLA_FLAGS", f"{FLAG}=xla_another_option")
+    monkeypatch.setenv("XLA_FLAGS", f"{FLAG}=xla_another_option {WIDE}=128")
     share_results()
-    assert os.environ["XLA_FLAGS"] == f"{FLAG}=xla_another_option"
+    assert os.environ["XLA_FLAGS"] == f"{FLAG}=xla_another_option {WIDE}=128"
 
 
 def swinging(x, pushes):
