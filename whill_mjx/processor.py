@@ -16,6 +16,7 @@ than their arithmetic. `as_one_function` has a part of a program compiled as a s
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -44,6 +45,19 @@ def _has_wide_vectors() -> bool:
         return " avx512f " in Path("/proc/cpuinfo").read_text()
     except OSError:
         return False
+
+
+def device_per_core() -> tuple:
+    """A JAX device for each core, among which a batch can be split (`make_batch(devices=...)`): each steps its share.
+
+    A program of small arrays runs on one core, however many there are. Call it before JAX starts; afterwards, and with
+    an accelerator, the devices are those that there are.
+    """
+    import jax
+
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    return tuple(jax.devices())
 
 
 def shares_results() -> bool:

@@ -57,9 +57,10 @@ def _assembled(block: Callable[[jax.Array], jax.Array], count: int, size: int) -
         return jax.lax.dynamic_update_slice_in_dim(whole, part, first(number), 0)
 
     def one_round(number: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return write(*carry, number - 1), block(first(number))
+        return write(carry[0], carry[1], number - 1), block(first(number))
 
     like = jax.eval_shape(block, jnp.zeros((), jnp.int32))
     empty = (jnp.zeros((count, *like.shape[1:]), like.dtype), jnp.zeros(like.shape, like.dtype))
     rounds = -(-count // size)
-    return write(*jax.lax.fori_loop(0, rounds, one_round, empty), rounds - 1)
+    whole, last = jax.lax.fori_loop(0, rounds, one_round, empty)
+    return write(whole, last, rounds - 1)
