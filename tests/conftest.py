@@ -1,10 +1,11 @@
 """Most of the suite's time is XLA compiling small programs: none is compiled twice, most with few optimisations."""
 
+import ctypes
 import gc
 import os
 import signal
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import jax
@@ -29,6 +30,8 @@ if jaxlib.__version__.startswith("0.10."):
     # Half the time to compile; later versions of XLA do not know this flag, and end over one that they do not know.
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS]).strip()
+MOST_BYTES = 2_000_000_000
+"""Memory of a worker beyond which it forgets what it has compiled."""
 IN_REAL_TIME = ("bridge",)
 """Folders whose tests start nodes that must keep their pace."""
 
@@ -88,3 +91,15 @@ def few_optimisations(request):
     """Programs of most tests take far longer to compile than to run: XLA compiles them in a third of the time."""
     with options(jax_disable_most_optimizations=request.path.parent.name not in IN_REAL_TIME):
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def less_memory():
+    """Compiling leaves much memory free that the C library keeps: a worker grew to 6 GB. It is given back."""
+    yield
+    with suppress(OSError, AttributeError):
+        trim = ctypes.CDLL("libc.so.6").malloc_trim
+        trim(0)
+        if int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_BYTES:
+            jax.clear_caches()
+            trim(0)
