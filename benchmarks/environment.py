@@ -70,7 +70,7 @@ class Options:
     @property
     def devices(self) -> tuple:
         """Devices among which the instances are split."""
-        return tuple(jax.devices()) if self.split and on_cpu() and self.count % jax.device_count() == 0 else ()
+        return device_per_core(self.count) if self.split and on_cpu() else ()
 
 
 def on_cpu() -> bool:
@@ -217,7 +217,7 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
 def main(options: Options) -> None:
     """Measure the parts and record each."""
     if options.split:
-        device_per_core()
+        device_per_core(1)  # before JAX starts
     for part in options.parts:
         if part not in PARTS:
             raise OptionError(f"--parts: unknown part {part!r} (known: {', '.join(PARTS)}). Correct it.")

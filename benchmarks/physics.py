@@ -249,7 +249,7 @@ def main() -> None:
     parser = Parser(
         prog="python -m benchmarks.physics", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    on_cpu = device_per_core()[0].platform == "cpu"
+    on_cpu = device_per_core(1)[0].platform == "cpu"
     counts = [512, 1024, 2048] if on_cpu else [1024, 32768, 131072]
     parser.add_argument("--instances", type=whole(), nargs="+", default=counts)
     parser.add_argument("--vehicles", nargs="+", default=["loaded", BASE, "whill_cr_paper"])

@@ -47,17 +47,18 @@ def _has_wide_vectors() -> bool:
         return False
 
 
-def device_per_core() -> tuple:
-    """A JAX device for each core, among which a batch can be split (`make_batch(devices=...)`): each steps its share.
+def device_per_core(instances: int) -> tuple:
+    """JAX devices, one for each core, among which `instances` can be split evenly: `make_batch(devices=...)`.
 
     A program of small arrays runs on one core, however many there are. Call it before JAX starts; afterwards, and with
-    an accelerator, the devices are those that there are.
+    an accelerator, the devices are some of those that there are.
     """
     import jax
 
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
-    return tuple(jax.devices())
+    found = jax.devices()
+    return tuple(found[: max(many for many in range(1, len(found) + 1) if instances % many == 0)])
 
 
 def shares_results() -> bool:

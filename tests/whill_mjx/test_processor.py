@@ -96,12 +96,26 @@ def printed(program, flags):
     return float(done.stdout.split()[-1])
 
 
+CORES = """
+import os
+from whill_mjx import device_per_core
+many = len(os.sched_getaffinity(0))
+every, some, one = device_per_core(6 * many), device_per_core(7 * many + 1), device_per_core(1)
+assert (7 * many + 1) % len(some) == 0 and len(one) == 1
+print("devices", len(every))
+"""
+
+
 def run(flags):
     return printed(PROGRAM, flags)
 
 
 def test_twenty_results_of_one_chain_do_not_compute_it_twenty_times():
     assert run("") < 2 * (60 + 20)
+
+
+def test_each_core_is_a_device_where_the_instances_can_be_split_evenly():
+    assert printed(CORES, "") == len(os.sched_getaffinity(0))
 
 
 def test_without_the_option_they_do():
