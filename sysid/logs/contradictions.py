@@ -186,7 +186,7 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
     explains what nothing else does; None otherwise.
 
-    Rates of turning are compared, or of motion where there is no turn: no frame changes them.
+    Rates of turning and of motion are compared: no frame changes them.
 
     Args:
         beside: compare with the commands, though there are measured speeds.
@@ -209,9 +209,10 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
              if min(ours.std(), theirs.std()) > VARIED]
     if not pairs:
         return None
-    ours, theirs = pairs[0]
     most = min(round(REACH / LAG_DT), len(t) - 1)
-    alike = np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)])
+    # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
+    alike = max((np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)]) for ours, theirs in pairs),
+                key=np.max)
     now, k = float(alike[most]), int(np.argmax(alike))
     bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
     late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
