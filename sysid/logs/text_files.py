@@ -444,11 +444,12 @@ def _stream(
         rounded = ": is its time rounded, as to whole seconds?" if later.mean() < 0.5 else ""
         notes.append(f"{file}: {counted(int((~later).sum()), 'row')} of {len(later)} of {stream} at the time of the "
                      f"row before left out{rounded}")
-    if {"qx", "qy", "qz", "qw"} <= set(found):
+    if {"qz", "qw"} <= set(found):
         from sysid.logs.rosbag import yaw_of
 
+        level = np.zeros(len(found["t"]))  # of a vehicle on a floor qx and qy are often left out
         found["yaw"] = np.array([yaw_of(*one) for one in zip(
-            found["qw"], found["qx"], found["qy"], found["qz"], strict=True)])
+            found["qw"], found.get("qx", level), found.get("qy", level), found["qz"], strict=True)])
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found, notes
@@ -496,7 +497,8 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
         if not {"v", "omega"} <= set(odometry):
             raise ValueError("the odometry has no heading. Name its yaw or its quaternion with --columns.")
         return _dead_reckoned(np.column_stack([t, odometry["v"], odometry["omega"]])), (
-            "the odometry has speeds only: its pose is dead reckoned from them")
+            f"the odometry has {'no heading' if 'x' in odometry else 'speeds only'}: its pose is dead reckoned from "
+            "its speeds")
     x, y, yaw = odometry["x"], odometry["y"], odometry["yaw"]
     if {"v", "omega"} <= set(odometry):
         v, omega = odometry["v"], odometry["omega"]
