@@ -55,6 +55,10 @@ class Direction:
     error: float
     explained: float
     """Share of the motion that this explains."""
+    gain: float = 1.0
+    """Speed of the pose over the one it should have."""
+    gain_error: float = 0.0
+    """Infinite where the tracked point would be too far off."""
 
 
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
@@ -152,7 +156,8 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
     along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
     design = np.column_stack([motion.v, motion.omega])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
-    if abs(gains[1]) > reach:
+    too_far = abs(gains[1]) > reach
+    if too_far:
         gains[1] *= reach / abs(gains[1])
         gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
     left = along - design @ gains
@@ -161,8 +166,10 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
     # What v alone shows: on a circle a turned axis and a point before the axle move alike.
     alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
     independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
-    error = np.sqrt(np.mean(np.square(left.imag)) / independent / max(np.mean(np.square(alone)), 1e-12))
-    return Direction(float(np.angle(gains[0])), float(error / max(abs(gains[0]), 1e-9)), explained)
+    power_alone, size = independent * max(float(np.mean(np.square(alone))), 1e-12), float(abs(gains[0]))
+    across, ahead = (float(np.sqrt(np.mean(np.square(one)) / power_alone)) for one in (left.imag, left.real))
+    return Direction(float(np.angle(gains[0])), across / max(size, 1e-9), explained, size,
+                     float("inf") if too_far else ahead)
 
 
 def _in_fixed_frame(motions: Sequence[Motion]) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.coverage import CHECK
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
@@ -114,8 +115,8 @@ def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[
 
 
 def _is_limit(note: str) -> bool:
-    """Whether a note says what the log does not determine."""
-    return note.startswith(("not fitted", "the log has no commands"))
+    """Whether a note says what the log does not determine, or what is wrong with it."""
+    return note.startswith(("not fitted", "the log has no commands", CHECK))
 
 
 def _spoken(name: str) -> str:
