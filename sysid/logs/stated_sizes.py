@@ -81,4 +81,5 @@ def _pooled(found: Sequence[Gain | None]) -> Gain | None:
     gain = float((weights * gains).sum() / weights.sum())
     scatter = float((weights * (gains - gain) ** 2).sum() / weights.sum() / max(len(known) - 1, 1))
     error = float(np.sqrt(max(1 / weights.sum(), scatter)))
-    return (gain, error) if abs(np.log(max(gain, 1e-3))) > max(USUAL, SURE * error / gain) else None
+    sure = gain > SURE * error and abs(np.log(gain)) > max(USUAL, SURE * error / gain)
+    return (gain, error) if sure else None

@@ -86,11 +86,13 @@ def lead(report: dict[str, Any]) -> list[str]:
     """Three sentences: how good the fit is, what it changed, and what it does not know."""
     known = [one for one in report["parameters"] if one["identifiable"]]
     unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
-    moved = sorted(known, key=_change, reverse=True)[:2]
+    inside = [one for one in known if not one["remark"] and _change(one) > 1]  # not at the end of its range
+    moved = sorted(inside, key=_change, reverse=True)[:2]
     changed = "; ".join(f"{_spoken(one['name'])} from {number(one['initial'])} to {number(one['value'])}"
                         + ("" if one["unit"] == "-" else f" {one['unit']}") for one in moved)
-    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; most surely changed: "
-              f"{changed}." if known else "This log determines none of the parameters.")
+    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; "
+              f"{f'most surely changed: {changed}' if moved else 'none is surely other than it was'}."
+              if known else "This log determines none of the parameters.")
     if not report["summary"]["held_out"]:
         third = "Nothing was held out, so how well the vehicle predicts other drives is not known."
     elif unknown:
