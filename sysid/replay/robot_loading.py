@@ -172,7 +172,8 @@ def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> t
         mujoco.mj_resetData(host, data)
         settle(path, host, data, speed, turning, radius)
     for geom in {*supports, *sliding(host, data, root, swivelling=True)}:
-        friction = min(draft.stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
+        name = host.body(host.geom_bodyid[geom]).name
+        friction = min(draft.stated.get(name, 0.0) or SLIDING, 1.0)  # authors write 0 for a caster that rolls
         host.geom_friction[geom, 0] = friction
         spec.geom(host.geom(geom).name).friction[0] = friction
     return sliding(host, data, root)

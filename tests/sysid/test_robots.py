@@ -178,6 +178,12 @@ def test_a_ball_slides_with_the_friction_that_is_stated_for_gazebo(tmp_path):
         assert "geom.ball.friction" in mjcf_model(path, calibrate=True).params.values
 
 
+def test_a_caster_without_friction_gets_some_that_can_be_fitted(tmp_path):
+    rest = wheel("left_wheel", 0, 0.2), wheel("right_wheel", 0, -0.2), '<gazebo reference="ball"><mu1>0.0</mu1></gazebo>'
+    path = robot_file(tmp_path, *rest, link("ball", BALL, 0.1, 1e-4) + joint("ball_joint", "ball", "-0.25 0 -0.05"))
+    assert "geom.ball.friction" in mjcf_model(path, calibrate=True).params.values
+
+
 def test_wheels_on_springs_that_the_file_lacks_are_held_with_a_note(tmp_path):
     parts = []
     for name, y in (("left", 0.25), ("right", -0.25)):
