@@ -12,7 +12,7 @@ from sysid.logs.records import Trial
 from sysid.logs.streams import GRID_DT, clock_shift
 from whill_mjx.vehicle.specs import VehicleSpec
 
-USUAL = 0.05  # share by which data sheets, worn tyres and creeping wheels make a size differ
+USUAL = 0.06  # share by which data sheets, worn tyres and creeping wheels make a size differ
 
 Gain = tuple[float, float]
 """Outside motion over that of the odometry, and its standard error."""
