@@ -36,7 +36,7 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     for one in list(spec.actuators):
         on_tendon = one.trntype == mujoco.mjtTrn.mjTRN_TENDON
         motor = one.biastype == mujoco.mjtBias.mjBIAS_NONE
-        speed = one.biasprm[1] == 0 and one.biasprm[2] < 0
+        speed = one.biasprm[1] == 0 and one.biasprm[2] < 0 or one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
         if on_tendon or (one.target in joints and not motor and not speed):
             what = f"acts on tendon {one.target}" if on_tendon else f"holds an angle of {one.target}"
             notes.append(f"{path.name}: actuator {one.name} {what}: servos on the wheels stand in for it")
