@@ -85,7 +85,7 @@ def expand_xacro(path: Path) -> tuple[str, list[str]]:
     except subprocess.TimeoutExpired:
         reason = f"it is not done after {LONGEST} s"
     raise ValueError(f"{path}: xacro cannot expand it: {reason}. Correct the file, or expand it where you have ROS: "
-                     "xacro FILE > robot.urdf.")
+                     "xacro FILE ARGUMENT:=VALUE > robot.urdf.")
 
 
 def find_mesh(folder: Path, name: str) -> Path | None:

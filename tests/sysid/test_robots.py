@@ -354,3 +354,8 @@ def test_actuators_that_take_no_speed_are_replaced_and_gears_may_turn_back(tmp_p
     motors = ROBOT.replace("<velocity", '<motor gear="30"').replace(' kv="1"', "")
     path.write_text(motors.replace('gear="30"', 'gear="-30"', 1))
     assert drives(load_robot(path))[0]
+
+
+def test_a_robot_on_two_wheels_alone_is_said_to_tip(tmp_path):
+    robot = load_robot(robot_file(tmp_path, *TWO))
+    assert any("two driven wheels alone" in line for line in describe_robot(robot, check_robot(robot)))
