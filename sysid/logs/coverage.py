@@ -10,7 +10,7 @@ import numpy as np
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.records import Log, Trial, command_in_force
+from sysid.logs.records import Command, Log, Trial, command_in_force
 from sysid.logs.standing import said, stood
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
@@ -19,6 +19,7 @@ from sysid.logs.time_faults import pauses, time_faults, uncommanded
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
+ALIKE = 0.7  # correlation of a speed with a command that it follows
 SHORTEST = 6.0  # s of a trial in which clocks can be compared
 CHECK = "Check the log: "
 """Begins what a fit says of a fault."""
@@ -174,8 +175,8 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
             elif odd:
                 seen.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
-        late = another_clock(channel, trials, "commands") if seen else ""
-        found += [late] if late else seen  # such a log shows neither sign nor unit
+        other = (another_clock(channel, trials, "commands") or _exchanged(channel, trials)) if seen else ""
+        found += [other] if other else seen  # such a log shows neither sign nor unit
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
         ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:
@@ -218,6 +219,17 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
     measured = rates[index] - rates[index].mean()
     norm = np.sqrt((centred @ centred) * (measured @ measured))
     return float(centred @ measured / (centred @ centred)), float(centred @ measured / norm) if norm > 1e-12 else 0.0
+
+
+def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
+    """A sentence where the measured speed follows the commanded yaw rate and the other way round; else empty."""
+    other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
+    for index in (1, 2):
+        follows = [gain[1] for one in other if (gain := _gain(one, channel, index)) is not None]
+        if not follows or np.median(follows) < ALIKE:
+            return ""
+    return (f"command: the speed that {channel} shows follows omega, and its yaw rate follows v: the two columns are "
+            "exchanged.")
 
 
 def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:

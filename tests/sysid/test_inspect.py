@@ -159,6 +159,8 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert any("odometry: omega" in one and "sign is reversed" in one for one in sanity(log_of(flipped)))
     degrees = replace(good, odometry=replace(good.odometry, omega=np.rad2deg(good.odometry.omega)))
     assert any("check its unit (rad/s)" in one for one in sanity(log_of(degrees)))
+    swapped = replace(good, command=Command(good.command.t, good.command.omega, good.command.v))
+    assert any("the two columns are exchanged" in one for one in sanity(log_of(swapped)))
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
                                                      y=1e3 * good.ground_truth.y))
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
