@@ -180,7 +180,8 @@ def test_a_clock_that_was_set_back_is_refused_and_rows_out_of_order_are_not(tmp_
     check(log.trials[0], pose=False)
 
 
-@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f"])
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f",
+                                  "%M:%S.%f"])
 def test_dates_and_times_of_day_are_times_also_past_midnight(tmp_path, form):
     c = columns()
     path = write(tmp_path / "drive.csv", clocked(c, c["t"]))
