@@ -48,8 +48,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
 def found(report: dict[str, Any]) -> str:
     """Three sentences, what to do about doubts, and one drive before and after."""
     parts = [paragraph(" ".join(lead(report)[1:]))]
-    if report["advice"]:
-        parts += [heading("Before you rely on it"), bullets(report["advice"])]
+    if advice := [*report["log_doubts"], *report["advice"]]:
+        parts += [heading("Before you rely on it"), bullets(advice)]
     if text := report["noise_sentence"]:
         parts.append(paragraph(f"{text[0].upper()}{text[1:]}."))
     if report["contradicted"]:

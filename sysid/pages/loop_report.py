@@ -36,6 +36,7 @@
     operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
                       of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
                       the share of simulated days on which it would be noticed, at factors on its size
+    log_doubts        what is wrong with the log itself, in sentences
     contradicted      what speaks against an effect that would else have been named, in sentences
     pairs             of the scan: the pairs of effects that explain most together
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
@@ -81,6 +82,7 @@ from sysid.follow_up.trust import (
     warnings,
 )
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.logs.coverage import doubts
 from sysid.logs.metrics import METRICS, own_floor
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
@@ -145,7 +147,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
-        "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
         "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
                     "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
                     "excess_before": found.excess[0],
@@ -397,7 +399,7 @@ def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
 
 def summary(report: dict[str, Any], width: int = 100) -> str:
     """What a person reads first, in lines of at most `width` characters."""
-    lines = [title(report), *lead(report), *report["advice"]]
+    lines = [title(report), *lead(report), *report["log_doubts"], *report["advice"]]
     if report["noise_sentence"] is not None:
         lines.append(f"noise: {report['noise_sentence']}")
     lines += ["", f"verdict: {report['verdict']} - {report['reason']}",
