@@ -49,7 +49,7 @@ from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.floor import floor_change
-from sysid.verdict.found import Thresholds
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import reference_for

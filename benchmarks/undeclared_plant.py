@@ -31,6 +31,7 @@ from sysid.pages.loop_report import effects as named_effects
 from sysid.pages.loop_report import make_report, write_run
 from sysid.pages.report import write_report
 from sysid.verdict.pipeline import find_missing
+from sysid.verdict.posterior import as_json
 from sysid.verdict.result import LoopConfig, Prepared, Result
 
 RECORDED = RESULTS / "undeclared.json"
@@ -321,6 +322,6 @@ def brief(result: Result) -> dict[str, Any]:
                        "scatter_least": one.agreement.least,
                        "predictions": [[each.falsifier.by, each.outcome, each.power] for each in one.falsifiers]}
                       for one in result.stood],
-            "steps": found.steps,
+            "weights": found.weights, "findings": None if found.findings is None else as_json(found.findings),
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
                            for each in found.rounds]}

@@ -1,4 +1,4 @@
-"""A further effect beside other forms of those before it.
+"""Effects beside other forms of each other.
 
 No vehicle follows the catalogue's laws exactly. What such a law leaves is again the effect's own signature, only larger
 or smaller with speed, turning, time or manoeuvre, or earlier or later. Every effect may therefore have another form,
@@ -21,47 +21,60 @@ RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class Beside:
-    """The last effect of a joint fit beside other forms of those before it."""
+class Forms:
+    """A joint fit of M effects whose forms may be others. Base parameters and sizes move linearly around the fit."""
 
-    gain: float
-    """By how much it lowers the cost there."""
-    residual: np.ndarray  # (B, n) what is left where every effect may have another form
+    target: np.ndarray  # (n,) white residual, and what base parameters moved by
+    base: np.ndarray  # (n, P) columns of the base parameters
+    sizes: tuple[np.ndarray, ...]  # per effect (n, k): columns of its coordinates
+    changes: tuple[np.ndarray, ...]  # per effect (n,): what it changes altogether
+    bent: tuple[np.ndarray, ...]  # per effect (n, m): the same in other forms, together as large as it is
+    precision: np.ndarray  # (P, P) of the base parameters
+    shape: tuple[int, ...]  # (B, n / B) of the residual
+
+    def left(self, form: float, without: int | None = None, free: int | None = None) -> tuple[float, np.ndarray]:
+        """Least cost where all effects may have other forms, and the residual (B, n / B) there.
+
+        Args:
+            form: root mean square of all forms of an effect together, as a share of what it changes.
+            without: an effect that is taken away whole: columns around its size say little of a dead zone without it.
+            free: an effect that is there as a whole, in the form of its law, of any size.
+        """
+        target, columns = self.target, [self.base]
+        special = without if without is not None else free
+        if special is not None:
+            target = target + self.changes[special]
+        columns += [one for i, one in enumerate(self.sizes) if i != special]
+        columns += [self.changes[free][:, None]] if free is not None else []
+        plain = sum(one.shape[1] for one in columns)
+        columns += [one for i, one in enumerate(self.bent) if i != special]
+        design = np.concatenate(columns, axis=1)
+        prior = np.diag(np.repeat([0.0, form**-2], [plain, design.shape[1] - plain]))
+        prior[: len(self.precision), : len(self.precision)] = self.precision
+        matrix = design.T @ design + prior
+        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
+        right = design.T @ target
+        solution = np.linalg.solve(matrix, right)
+        return float(target @ target - right @ solution), (target - design @ solution).reshape(self.shape)
+
+    def gain(self, form: float, number: int) -> float:
+        """By how much one of the effects lowers the cost beside other forms of the others."""
+        return max(self.left(form, without=number)[0] - self.left(form, free=number)[0], 0.0)
 
 
-def beside_forms(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
-    """Let the effects of a joint fit have other forms. Base parameters and sizes move linearly around the fit; the last
-    effect is taken away whole, since its columns say little of a dead zone or a limit without it.
-
-    Args:
-        groups: trials of each manoeuvre.
-        form: root mean square of all forms of an effect together, as a share of what it changes.
-    """
+def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
+    """Other forms of the effects of a joint fit; `groups` has the trials of each manoeuvre."""
     whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
     changes = [refitter.white(whole - one) for one in less]
     bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
     bent = [one * (np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5
             for one, change in zip(bent, changes, strict=True)]
-    size, last = len(fit.u), len(fit.u) + fit.parts[-1].start
-    columns, mine = fit.jacobian.reshape(-1, fit.jacobian.shape[-1]), changes[-1].reshape(-1, 1)
-    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u) + mine[:, 0]
-    forms = np.concatenate([one.reshape(len(columns), -1) for one in bent], axis=1)
-    before = forms[:, : sum(one.shape[-1] for one in bent[:-1])]
-    columns = np.concatenate([columns, mine], axis=1)
-
-    def ridge(effects: np.ndarray, others: np.ndarray) -> tuple[float, np.ndarray]:
-        """Least cost of the target, and what is then left (n,)."""
-        design = np.concatenate([effects, others], axis=1)
-        prior = np.diag(np.repeat([0.0, form**-2], [effects.shape[1], others.shape[1]]))
-        prior[:size, :size] = refitter.precision
-        matrix = design.T @ design + prior
-        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
-        right = design.T @ target
-        solution = np.linalg.solve(matrix, right)
-        return float(target @ target - right @ solution), target - design @ solution
-
-    gain = ridge(columns[:, :last], before)[0] - ridge(columns, before)[0]
-    return Beside(max(gain, 0.0), ridge(columns, forms)[1].reshape(fit.residual.shape))
+    size, count = len(fit.u), fit.residual.size
+    columns = fit.jacobian.reshape(count, -1)
+    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u)
+    return Forms(target, columns[:, :size], tuple(columns[:, size + one.start : size + one.stop] for one in fit.parts),
+                 tuple(one.reshape(-1) for one in changes), tuple(one.reshape(count, -1) for one in bent),
+                 refitter.precision, fit.residual.shape)
 
 
 def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:

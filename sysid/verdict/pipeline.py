@@ -82,7 +82,7 @@ def find_missing(
     outcome = judge(asked, pairs)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(replace(asked, wander=usual.wander, steps=[]), judge, pairs, config.refit_nulls,
+        nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
                                 config.seed, progress)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
@@ -91,6 +91,9 @@ def find_missing(
         p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
         stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
+    if outcome.findings is not None and noise is not None:
+        other = tuple(name for name, one in noise.report().items() if one["changed"])
+        outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)
