@@ -32,6 +32,8 @@ def main(options: Options) -> None:
     """Print the verdict on each file, and the posterior weights."""
     priors = Thresholds(options.alpha, share=options.share, doubt=options.doubt)
     with refusing():
+        if not options.files:
+            raise ValueError("FILE: none given. Give evidence.json of a run of sysid.close_loop.")
         found = [(path, posterior(read(path), priors)) for path in options.files]
     for path, one in found:
         print(f"{path}: {one.verdict} - {one.reason}")
